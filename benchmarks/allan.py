@@ -31,7 +31,8 @@ import os
 from pathlib import Path
 import time
 
-from gyro_calibration.allan import allan_deviation, averaging_sizes, fit_noise
+from gyro_calibration.allan.deviation import allan_deviation, averaging_sizes
+from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.logs.log import read_log
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np

@@ -47,7 +47,7 @@ def knows_errors_and_rests(drive: Drive) -> Array:
 
 
 def _true_rate(drive: Drive) -> Array:
-    return (drive.output - drive.bias) / (1.0 + drive.gyro.true_values[0])
+    return (drive.output - drive.bias) / (1.0 + drive.gyro.scale_factor_error)
 
 
 def knows_rests(drive: Drive) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

@@ -175,7 +175,7 @@ def simulate(gyro: Preset, course: Course, generator: np.random.Generator) -> Dr
     begin = of_motion(CALIBRATION_MOTION)
     rate = np.concatenate([begin.rate[:-1], way.rate])[::every]
     count, first = len(rate), round(CALIBRATION_MOTION.duration / gyro.interval)
-    noise, (s, b) = gyro.model.noise, gyro.true_values
+    noise, s, b = gyro.model.noise, gyro.scale_factor_error, gyro.bias * DEGREE
     white = simulate_noise(Noise(noise.angle_random_walk), count, gyro.interval, generator)
     slow = Noise(0.0, noise.bias_instability, noise.rate_random_walk)
     bias = b + simulate_noise(slow, before + count, gyro.interval, generator)[before:]

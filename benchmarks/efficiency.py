@@ -164,7 +164,7 @@ def compare_methods(runs: int = 200, lag: float = 0.2) -> str:
             fits = [method(TIME, output, reference(run)) for run, output in enumerate(outputs)]
             s, b = np.sqrt(np.mean(np.square(
                 [(fit.scale_factor_error, fit.bias) for fit in fits]
-                - np.array(XV3500.true_values)), axis=0))
+                - np.array([XV3500.scale_factor_error, XV3500.bias * DEGREE])), axis=0))
             lines.append(f'| {case} | `{name}` | {100 * s:.3f} % | {b / DEGREE:.4f} deg/s |')
     return '\n'.join(lines)
 

@@ -94,7 +94,7 @@ def simulate(gyro: Preset, interval: float, duration: float,
     coarse = np.concatenate([begin.rate[:-1], way.rate])
     time = np.arange(round((len(coarse) - 1) * STEP / interval) + 1) * interval
     true = np.interp(time, np.arange(len(coarse)) * STEP, coarse)
-    s, b = gyro.true_values
+    s, b = gyro.scale_factor_error, gyro.bias * DEGREE
     first = round(CALIBRATION_MOTION.duration / interval)
     while True:
         output = (1.0 + s) * true + b + simulate_noise(gyro.model.noise, len(true), interval,

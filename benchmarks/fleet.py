@@ -320,8 +320,7 @@ def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]
     """Give how often a ramp is found by one log and by ten, and none where it is wander."""
     ramp = 'rate_ramp'
     level = 0.01
-    usual = [fit_slow_effects(_log(generator, 0.0), names=[ramp])[ramp]['deviation']
-             for _ in range(10)]
+    usual = [fit_slow_effects(_log(generator, 0.0))[ramp]['deviation'] for _ in range(10)]
     size = 1.2 * 4.8 * float(np.median(usual))
     yield f'A ramp of 1.2 times 4.8 deviations of a usual log, {size:.2g} rad/s².'
     yield ''
@@ -331,8 +330,7 @@ def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]
                        ('a quarter', 0.25 * size), ('none: wander', 0.0)):
         single, pooled_found = 0, 0
         for _ in range(fleets):
-            found = [fit_slow_effects(_log(generator, each), names=[ramp])[ramp]
-                     for _ in range(logs)]
+            found = [fit_slow_effects(_log(generator, each))[ramp] for _ in range(logs)]
             value, sigma = (np.array([one[what] for one in found])
                             for what in ('value', 'deviation'))
             single += int(np.sum(np.abs(value) > 2.576 * sigma))

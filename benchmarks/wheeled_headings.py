@@ -73,7 +73,7 @@ def headings(time: Array, output: Array) -> tuple[dict[str, Array], Array, float
         known) else UNKNOWN
     model = GyroModel(noise=NOISE, self_calibration=SelfCalibration(
         0.0, bias, ((SCALE ** 2, 0.0), (0.0, deviation ** 2))))
-    follower = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), 10.0, NOW)
+    follower = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
     follower.use_calibration(model, NOW)
     found = follower.follow(time, output, NOW)
     drive = SimpleNamespace(time=time, gyro=SimpleNamespace(

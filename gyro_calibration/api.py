@@ -23,16 +23,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
+import math
 from pathlib import Path
+import reprlib
 from typing import Any
 
-from gyro_calibration.allan import (
-    allan_deviation,
-    AllanChart,
-    build_rest_record,
-    fit_noise,
-    NoiseFit,
-)
+from gyro_calibration.allan.deviation import allan_deviation, AllanChart, build_rest_record
+from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
 from gyro_calibration.calibration.encoder import EncoderCalibration
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
@@ -51,6 +48,7 @@ from gyro_calibration.cli.fit import calibrate, draw_headings, dwell_lines, head
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
+from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
@@ -66,7 +64,6 @@ from gyro_calibration.model.motion import (
     Motion,
     motion_by_name,
     motion_from_log,
-    motion_from_rates,
 )
 from gyro_calibration.model.motion import simulate as simulate_motion
 import numpy as np
@@ -147,29 +144,23 @@ def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: flo
     temperature : degC, of all samples or of each, shape (n,)
 
     """
+    _require_model(model)
+    if not (isinstance(sample_rate, (int, float)) and 0.0 < sample_rate < math.inf):
+        raise InputError(f'sample_rate is {sample_rate!r}; wanted a number of Hz above 0')
     generator = None if seed is None else np.random.default_rng(seed)
     return simulate_motion(model, _to_motion(motion)[0], sample_rate, generator, temperature)
 
 
 @dataclass(frozen=True)
 class Headings(_PrintedResult):
-    """
-    Rates and heading of a log, corrected by a model; nan where the output was not plausible.
+    """Rates and heading of a log, corrected by a model; nan where the output was not plausible."""
 
-    Attributes
-    ----------
-    log : that was corrected
-    rate, rate_std : rad/s, shape (n,)
-    heading, heading_std : from 0 on, rad, shape (n,); None for a log without time
-    columns : all columns that `gyro_calibration compensate` adds, by name
-
-    """
-
-    log: Log
-    rate: Array
-    rate_std: Array
-    heading: Array | None
-    heading_std: Array | None
+    log: Log  # that was corrected
+    rate: Array  # rad/s, shape (n,)
+    rate_std: Array  # rad/s, shape (n,)
+    heading: Array | None  # from 0 on, rad, shape (n,); None for a log without time
+    heading_std: Array | None  # rad, shape (n,)
+    #: All columns that `gyro_calibration compensate` adds, by name.
     columns: Mapping[str, Array] = field(repr=False)
 
     def __str__(self) -> str:
@@ -202,6 +193,8 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     `ValueError` says that no row of the log is plausible.
 
     """
+    _require_logs(log)
+    _require_model(model)
     return _make_headings(log, integrate_log([log], model, Threshold(0.0)))
 
 
@@ -216,6 +209,8 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     hindsight : smooth the heading by all later samples
 
     """
+    _require_time(log)
+    _require_model(model)
     if not model.noise.angle_random_walk:
         raise InputError('the model has no angle random walk, by which rests are found; '
                          'allan finds it in a log at rest')
@@ -231,24 +226,14 @@ def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
 
 @dataclass(frozen=True)
 class Run(_PrintedResult):
-    """
-    A self-calibration.
+    """A self-calibration."""
 
-    Attributes
-    ----------
-    model : the given model with the new self-calibration
-    scale_factor_error, bias : 1 and rad/s
-    scale_factor_error_std, bias_std : 1 and rad/s
-    fit : all results of the fit, with the delay of the gyro and the goodness of fit
-
-    """
-
-    model: GyroModel
+    model: GyroModel  # the given model with the new self-calibration
     scale_factor_error: float
-    bias: float
+    bias: float  # rad/s
     scale_factor_error_std: float
-    bias_std: float
-    fit: RunFit = field(repr=False)
+    bias_std: float  # rad/s
+    fit: RunFit = field(repr=False)  # with the delay of the gyro and the goodness of fit
     _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
@@ -273,7 +258,9 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
     method : likelihood, heading or rate
 
     """
-    model, begin = model or GyroModel(), _require_time(log)[0][0]
+    model = GyroModel() if model is None else model
+    _require_model(model)
+    begin = _require_time(log)[0][0]
     _require_choice('method', method, ('likelihood', 'heading', 'rate'))
     driven, reference_begin = _to_motion(log if motion is None else motion)
     run = (calibrate_run(log, model, driven, reference_begin, method, ReferenceErrors())
@@ -286,17 +273,10 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
 
 @dataclass(frozen=True)
 class Fitted(_PrintedResult):
-    """
-    A calibration by a rate table, a turntable or a reference heading.
+    """A calibration by a rate table, a turntable or a reference heading."""
 
-    Attributes
-    ----------
-    model : with the fitted effects and their covariance
-    found : effects, dwells and residuals; or the fit of a reference heading
-
-    """
-
-    model: GyroModel
+    model: GyroModel  # with the fitted effects and their covariance
+    #: Effects, dwells and residuals; or the fit of a reference heading.
     found: Selection | EncoderCalibration = field(repr=False)
 
     def __str__(self) -> str:
@@ -322,6 +302,7 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
     method : dwells, likelihood, course or rate; None takes what the logs hold
 
     """
+    _require_logs(*logs)
     for name in effects or ():
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
@@ -382,6 +363,15 @@ class Diagnosed(_PrintedResult):
     def __str__(self) -> str:
         return '\n'.join(terminal_lines(self.found))
 
+    def _repr_html_(self) -> str:
+        """Return the report in a frame, which keeps its style to itself."""
+        return (f'<iframe srcdoc="{escape(render_report(self.found))}" '
+                'style="width: 100%; height: 45em; border: 0"></iframe>')
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the residual along the variables of the causes, before and after."""
+        return plots.draw_diagnosis(path, self.found)
+
     def write(self, folder: str | Path) -> None:
         """Write diagnosis.json, report.html and model.yaml into a folder."""
         write_diagnosis(folder, self.found)
@@ -401,6 +391,9 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
         None takes what the log shows
 
     """
+    _require_logs(*logs)
+    if model is not None:
+        _require_model(model)
     _require_choice('kind', kind, REFERENCE_KINDS)
     found = diagnose_logs(logs, model, seed, kind)
     return Diagnosed(found.model, found)
@@ -411,10 +404,24 @@ def _require_choice(argument: str, value: str | None, choices: Collection[str]) 
         raise InputError(f'{argument} is {value!r}, but must be of {", ".join(choices)}')
 
 
+def _require_logs(*logs: Log) -> None:
+    for log in logs or (None,):
+        if not isinstance(log, Log):
+            raise InputError(f'{reprlib.repr(log)} is no log; read_log(path) reads one, and '
+                             'Log(time, output) makes one')
+        if log.output is None or not len(log):
+            raise InputError('the log has no output of the gyro; Log(time, output) has one')
+
+
+def _require_model(model: GyroModel) -> None:
+    if not isinstance(model, GyroModel):
+        raise InputError(f'{reprlib.repr(model)} is no model; read_model(path) reads one')
+
+
 def _require_time(log: Log) -> tuple[Array, Array]:
+    _require_logs(log)
     if log.time is None or log.output is None:
-        raise InputError('the log has no time or no output, which this needs; '
-                         'Log(time, output) has both')
+        raise InputError('the log has no time, which this needs; Log(time, output) has one')
     return log.time, log.output
 
 
@@ -422,7 +429,11 @@ def _to_motion(motion: MotionLike) -> tuple[Motion, float]:
     """Return a motion, and the time of its beginning in a log, s."""
     if isinstance(motion, Motion):
         return motion, 0.0
-    if isinstance(motion, tuple):
-        time, rate = (np.asarray(values, float) for values in motion)
-        return motion_from_rates(time, rate), 0.0
-    return motion_from_log(motion) if isinstance(motion, Log) else (motion_by_name(motion), 0.0)
+    if isinstance(motion, (str, Path)):
+        return motion_by_name(motion), 0.0
+    if isinstance(motion, tuple) and len(motion) == 2:
+        return motion_from_log(Log(motion[0], reference_rate=motion[1]))[0], 0.0
+    if not isinstance(motion, Log):
+        raise InputError(f'{reprlib.repr(motion)} is no motion; wanted calibration, robot or '
+                         'rest, a profile file, (time, rate), or a log with a reference')
+    return motion_from_log(motion)

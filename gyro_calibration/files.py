@@ -66,14 +66,10 @@ class InputError(ValueError):
 
 
 def to_printable(text: object, allowed: str = '') -> str:
-    r"""
-    Return a text that is safe to show in a terminal, a ROS log or a page.
-
-    Characters that cannot be printed (terminal escapes, line ends, marks of writing direction,
-    undecodable bytes of a file name) are replaced by their Python escape, such as \\x1b, except
-    the characters to be kept.
-
-    """
+    """Return a text that is safe to show in a terminal, a ROS log or a page."""
+    # Characters that cannot be printed (terminal escapes, line ends, marks of writing direction,
+    # undecodable bytes of a file name) are replaced by their Python escape, such as \\x1b, except
+    # the characters to be kept.
     return ''.join(each if each.isprintable() or each in allowed else
                    each.encode('unicode_escape').decode() for each in str(text))
 
@@ -106,12 +102,7 @@ def describe_os_error(error: OSError) -> str:
 
 
 def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.BufferedReader:
-    """
-    Open a regular file for reading; on request also a pipe that has a writer.
-
-    Raise `OSError` for other types, which might never end.
-
-    """
+    """Open a regular file, on request also a pipe with a writer; others raise `OSError`."""
     # Opening a device may already have an effect; and the file may be replaced between the checks.
     _require_regular_file(path, os.stat(path).st_mode, allow_pipes)
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -168,12 +159,7 @@ def read_bytes(path: str | Path, max_size: int) -> bytes:
 
 
 def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
-    """
-    Replace a file by new content, as `open_replacement`, and return the version that was written.
-
-    As long as no other program writes, it is that of `file_version`.
-
-    """
+    """Replace a file by new content, as `open_replacement`; return its `file_version`."""
     with open_replacement(path) as file:
         file.write(data)
         file.flush()

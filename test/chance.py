@@ -22,6 +22,7 @@ import secrets
 import zlib
 
 import numpy as np
+import pytest
 from scipy.stats import binom, chi2
 from scipy.stats import t as student
 
@@ -54,6 +55,16 @@ def mean_bound(values):
     count = len(values)
     return (student.isf(0.5 * RARE, count - 1)
             * np.std(values, axis=0, ddof=1) / math.sqrt(count))
+
+
+def evidence(*case):
+    """Return a case of a test that runs as evidence alone."""
+    return pytest.param(*case, marks=pytest.mark.evidence)
+
+
+def seeds(count):
+    """Return so many seeds of a test: the first in each run, the others as evidence."""
+    return [0, *map(evidence, range(1, count))]
 
 
 def seeded(name, fresh=False):

@@ -12,6 +12,7 @@
 
 import contextlib
 import fcntl
+from functools import cache
 from importlib import metadata
 import os
 from pathlib import Path
@@ -24,6 +25,7 @@ import sys
 import tempfile
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -161,15 +163,51 @@ def data():
 @pytest.fixture
 def run(capsys):
     """Return a function that runs the program and gives exit code, output and error output."""
-    from gyro_calibration.cli.main import main  # not before the environment is prepared
+    from gyro_calibration.cli import main as program  # not before the environment is prepared
+    if not hasattr(program.find_verbs, 'cache_info'):  # takes 40 ms
+        program.find_verbs = cache(program.find_verbs)
 
     def run(*words):
         try:
-            code = main([str(word) for word in words])
+            code = program.main([str(word) for word in words])
         except SystemExit as end:  # argparse
             code = end.code
         return code, *capsys.readouterr()
     return run
+
+
+@pytest.fixture
+def compensate(run, tmp_path):
+    """
+    Return a function that compensates a log by a model, which are paths or are written to files.
+
+    It gives ``code``, ``text`` and ``error`` of the program, and of the log that it wrote ``log``
+    and the columns that are new in it as numbers, ``columns``.
+
+    """
+    from gyro_calibration.logs.log import read_log, write_log
+    from gyro_calibration.model.model_file import write_model
+    import numpy as np
+
+    def compensate(log, model, *words):
+        if not isinstance(log, Path):
+            write_log(tmp_path / 'log.csv', log)
+            log = tmp_path / 'log.csv'
+        if not isinstance(model, Path):
+            if isinstance(model, str):
+                (tmp_path / 'model.yaml').write_text(model)
+            else:
+                write_model(tmp_path / 'model.yaml', model)
+            model = tmp_path / 'model.yaml'
+        out = tmp_path / 'out.csv'
+        code, text, error = run('compensate', log, '--model', model, '--out', out, *words)
+        done = SimpleNamespace(code=code, text=text, error=error, log=None)
+        if out.exists():
+            done.log = read_log(out)
+            done.columns = {name: np.array(values, float)
+                            for name, values in done.log.others.items()}
+        return done
+    return compensate
 
 
 @pytest.fixture

@@ -137,7 +137,7 @@ ABSURD = st.one_of(
 def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(absurd):
     model = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (1e-3,)),), noise=NOISE,
                       self_calibration=SelfCalibration(0.0, 0.0, ((1e-8, 0.0), (0.0, 1e-8))))
-    live = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), 10.0, NOW)
+    live = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
     places = {place: rest for place, *rest in absurd}
     rate = 0.5 * np.sin(np.arange(1500) * INTERVAL) + REST
     for place, output in enumerate((rate + 1e-3 * rate ** 3).tolist()):

@@ -26,29 +26,9 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from gyro_calibration.allan.deviation import (
-    allan_deviation,
-    AllanChart,
-    averaging_sizes,
-    build_rest_record,
-    Floor,
-    RestRecord,
-)
-from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
-from gyro_calibration.model.noise import NOISE_TERMS, NoiseTerm
-
-__all__ = ['NOISE_TERMS', 'AllanChart', 'NoiseFigure', 'Floor', 'NoiseFit', 'NoiseTerm',
-           'RestRecord', 'allan_deviation', 'averaging_sizes', 'build_rest_record', 'fit_noise']
-
 
 class _CallableModule(ModuleType):
-    """
-    This package, which can be called as `gyro_calibration.api.allan`.
-
-    An imported subpackage shadows the public function of the same name. So the subpackage is
-    callable too.
-
-    """
+    """This package, callable as `api.allan`: once imported, it shadows that function."""
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         return import_module('gyro_calibration.api').allan(*arguments, **named)

@@ -28,12 +28,7 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    find_runs,
-    mask_outliers,
-    robust_deviation,
-)
+from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
     ANGLE_RANDOM_WALK,
@@ -62,38 +57,21 @@ _MAX_LOST_SHARE = 0.3
 
 @dataclass(frozen=True)
 class RestRecord:
-    """
-    Samples of a gyro at rest at even intervals.
+    """Samples of a gyro at rest at even intervals."""
 
-    Attributes
-    ----------
-    rate : rad/s, shape (n,); nan where a sample is lost or left out
-    interval : s
-    remarks : on bursts, lost samples and outliers, one sentence each
-
-    """
-
-    rate: Array
-    interval: float
-    remarks: tuple[str, ...] = ()
+    rate: Array  # rad/s, shape (n,); nan where a sample is lost or left out
+    interval: float  # s
+    remarks: tuple[str, ...] = ()  # on bursts, lost samples and outliers, one sentence each
 
 
 def build_rest_record(time: Array, output: Array, moving: Array | None = None,
                       heading: Array | None = None) -> RestRecord:
     """
-    Put samples on an even grid; lost ones are nan.
+    Put samples with increasing stamps, s and rad/s, shape (n,), on an even grid; lost are nan.
 
-    Parameters
-    ----------
-    time : stamps, s, increasing, shape (n,)
-    output : rad/s, shape (n,); nan counts as lost
-    moving : 1 where the gyro was moved, by the log; counts as lost
-    heading : by a reference, rad; tested for motion where `moving` is absent
-
-    Raises
-    ------
-    DataRefused : too few samples, a dead gyro, stamps without an even interval, too many losses,
-        or motion
+    An output that is nan counts as lost, as does one with `moving` 1; without `moving` the heading
+    by a reference, rad, is tested for motion. Raise `DataRefused` for too few samples, a dead
+    gyro, stamps without an even interval, too many losses, or motion.
 
     """
     _refuse_few(len(output))
@@ -166,12 +144,8 @@ def _refuse_dead(time: Array, output: Array) -> None:
 
 
 def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
-    """
-    Remove single samples far beyond the noise, and return a remark on them.
-
-    A motion or a jolt lasts longer than two samples and is not removed.
-
-    """
+    """Remove single samples far beyond the noise, and return a remark on them."""
+    # A motion or a jolt lasts longer than two samples and is not removed.
     outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS))
     if not outliers.size or outliers.size > 0.001 * len(rate):
         return []
@@ -223,13 +197,9 @@ def integrate_angle(rate: Array) -> Array:
 
 
 def _fill_gaps(rate: Array) -> Array:
-    """
-    Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side.
-
-    A line between the samples at both ends would integrate their noise over the whole gap, which
-    passes for a random walk.
-
-    """
+    """Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side."""
+    # A line between the samples at both ends would integrate their noise over the whole gap, which
+    # passes for a random walk.
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
     if known.all():
@@ -251,12 +221,7 @@ def _count_lost_before(rate: Array) -> Integers | None:
 
 
 def mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
-    """
-    Return which second differences over `size` samples, from `begin` to `end`, have few losses.
-
-    `lost` is the result of `_count_lost_before`.
-
-    """
+    """Return which second differences over `size` samples have few of the samples lost before."""
     return np.asarray(lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
                       <= _MAX_LOST_PER_WINDOW * 2 * size)
 
@@ -275,53 +240,31 @@ _SHORT_MEMORY_INDICES = [
 
 @dataclass(frozen=True)
 class Floor:
-    """
-    The point of a chart with the lowest upper bound.
+    """The point of a chart with the lowest upper bound."""
 
-    The lowest deviation is not used: at the end of the chart single points are low by chance.
-
-    Attributes
-    ----------
-    time : averaging time, s
-    deviation, lower, upper : Allan deviation there and its 95 % bounds, rad/s
-
-    """
-
-    time: float
-    deviation: float
-    lower: float
+    time: float  # averaging time, s
+    deviation: float  # Allan deviation, rad/s
+    lower: float  # its 95 % bounds, rad/s
     upper: float
 
 
 @dataclass(frozen=True)
 class AllanChart:
-    """
-    The overlapping Allan deviation, each array of shape (n,).
+    """The overlapping Allan deviation, each array of shape (n,)."""
 
-    Attributes
-    ----------
-    interval : between samples, s
-    samples : number in the record, lost ones included
-    size : averaging times in samples
-    deviation : rad/s
-    difference_count : number of second differences in the mean square
-    degrees_of_freedom : equivalent degrees of freedom of the mean square
-    lower, upper : bounds of the deviation with 95 % confidence, rad/s
-
-    """
-
-    interval: float
-    samples: int
-    size: Integers
-    deviation: Array
-    difference_count: Integers
-    degrees_of_freedom: Array
-    lower: Array
+    interval: float  # between samples, s
+    samples: int  # in the record, lost ones included
+    size: Integers  # averaging times in samples
+    deviation: Array  # rad/s
+    difference_count: Integers  # number of second differences in the mean square
+    degrees_of_freedom: Array  # equivalent ones of the mean square
+    lower: Array  # bounds of the deviation with 95 % confidence, rad/s
     upper: Array
 
     @property
     def floor(self) -> Floor:
         """Return the lowest point."""
+        # not the lowest deviation: at the end of the chart single points are low by chance
         lowest = int(np.argmin(self.upper))
         return Floor(*(float(values[lowest])
                        for values in (self.time, self.deviation, self.lower, self.upper)))
@@ -332,11 +275,10 @@ class AllanChart:
         return self.size * self.interval
 
 
-def averaging_sizes(samples: int, per_decade: int = 10) -> Integers:
-    """Return averaging times in samples, evenly spaced in log, up to a third of the record."""
+def averaging_sizes(samples: int) -> Integers:
+    """Return averaging times in samples, ten a decade, up to a third of the record."""
     decades = math.log10(max(samples // 3, 1))
-    return np.unique(
-        np.round(np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
+    return np.unique(np.round(np.logspace(0.0, decades, round(10 * decades) + 1)).astype(np.int64))
 
 
 def allan_deviation(rate: Array, interval: float,
@@ -344,16 +286,10 @@ def allan_deviation(rate: Array, interval: float,
     """
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
-    Parameters
-    ----------
-    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
-    interval : s
-    times : averaging times, s, taken to the nearest whole number of intervals; default: ten a
-        decade, up to a third of the record
-
-    Raises
-    ------
-    DataRefused : too few samples, or an averaging time that does not fit twice into the record
+    The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Averaging
+    times, s, are taken to the nearest whole number of intervals; by default they are ten a decade,
+    up to a third of the record. Raise `DataRefused` for too few samples, or a time that does not
+    fit twice into the record.
 
     """
     _refuse_few(int(np.isfinite(rate).sum()))
@@ -430,13 +366,9 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
 
 
 def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
-    """
-    Return the random term that fits the slope of each Allan variance best.
-
-    The slope of the logarithm is that from half to twice each time, -1 for a single one.
-    Quantization is assumed at the short end only; a steep slope elsewhere is chance.
-
-    """
+    """Return the random term that fits the slope of each Allan variance best."""
+    # The slope of the logarithm is that from half to twice each time, -1 for a single one.
+    # Quantization is assumed at the short end only; a steep slope elsewhere is chance.
     low = np.searchsorted(sizes, sizes / 2.0)
     high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
     rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
@@ -450,15 +382,10 @@ def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
 
 # covariance of second differences of the angle, and of Allan variances
 
-def _lag_covariance(covariance: Callable[[Integers], Array], first: int, second: int,
+def _lag_covariance(angle_covariance: Callable[[Integers], Array], first: int, second: int,
                     lags: Integers) -> Array:
-    """
-    Return the covariance of second differences over `first` and `second` samples at lags.
-
-    `covariance` is that of the angle.
-
-    """
-    return np.sum([a * b * covariance(lags + (j * second - i * first))
+    """Return the covariance of second differences over `first` and `second` samples at lags."""
+    return np.sum([a * b * angle_covariance(lags + (j * second - i * first))
                    for i, a in enumerate((1.0, -2.0, 1.0))
                    for j, b in enumerate((1.0, -2.0, 1.0))], axis=0)
 

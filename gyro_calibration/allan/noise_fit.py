@@ -64,29 +64,17 @@ _COMBINATIONS = [combination for count in range(len(NOISE_TERMS))
 
 @dataclass(frozen=True)
 class OctaveVariances:
-    """
-    Allan variances at octaves and the terms of their covariance, all in samples.
+    """Allan variances at octaves and the terms of their covariance, all in samples."""
 
-    Attributes
-    ----------
-    samples : of the record
-    size : averaging times, shape (n,)
-    loss_factor : factor of the scatter of an Allan deviation by lost windows, shape (n,)
-    variance : shape (n,)
-    columns : of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
-    forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or (n,
-        n, 6, 6) with a process
-    process : a process of 1 rad/s, or None
-
-    """
-
-    samples: int
-    size: Integers
-    loss_factor: Array
-    variance: Array
-    columns: Array
+    samples: int  # of the record
+    size: Integers  # averaging times, shape (n,)
+    loss_factor: Array  # of the scatter of an Allan deviation by lost windows, shape (n,)
+    variance: Array  # shape (n,)
+    columns: Array  # of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
+    #: The covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or
+    #: (n, n, 6, 6) with a process.
     forms: Array
-    process: GaussMarkov | None = None
+    process: GaussMarkov | None = None  # of 1 rad/s
 
     @classmethod
     def from_chart(cls, chart: AllanChart) -> OctaveVariances:
@@ -139,20 +127,11 @@ def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
 
 @dataclass(frozen=True)
 class CombinationFit:
-    """
-    A combination of terms, fitted to octaves.
-
-    Attributes
-    ----------
-    octaves : the fitted Allan variances
-    squares : squared coefficients, shape (6,)
-    cholesky_factor : Cholesky factor of the covariance of the variances
-
-    """
+    """A combination of terms, fitted to octaves."""
 
     octaves: OctaveVariances
-    squares: Array
-    cholesky_factor: Array
+    squares: Array  # of the coefficients, shape (7,)
+    cholesky_factor: Array  # of the covariance of the variances
 
     @property
     def active_terms(self) -> list[int]:
@@ -160,12 +139,8 @@ class CombinationFit:
         return np.nonzero(self.squares)[0].tolist()
 
     def _normal_scores(self) -> tuple[Array, float]:
-        """
-        Return standard normal scores, and -2 ln of the normalization of their density.
-
-        The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
-
-        """
+        """Return standard normal scores, and -2 ln of the normalization of their density."""
+        # The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
         model = self.octaves.model_variance(self.squares)
         deviation = np.sqrt((self.cholesky_factor ** 2).sum(axis=1))
         ninth = (deviation / model) ** 2 / 9.0
@@ -182,13 +157,9 @@ class CombinationFit:
         return float(normal @ normal) + density
 
     def penalized_deviance(self) -> float:
-        """
-        Return -2 ln likelihood plus a penalty for each term.
-
-        The penalty of a ramp is larger, since in a single record a random walk looks like one. A
-        Gauss-Markov process counts as two terms.
-
-        """
+        """Return -2 ln likelihood plus a penalty for each term."""
+        # The penalty of a ramp is larger, since in a single record a random walk looks like one. A
+        # Gauss-Markov process counts as two terms.
         return (self.deviance
                 + _TERM_PENALTY * (len(self.active_terms) + (_PROCESS in self.active_terms))
                 + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
@@ -257,22 +228,13 @@ def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: 
 
 @dataclass(frozen=True)
 class Ranking:
-    """
-    All combinations of terms, fitted to the same octaves.
+    """All combinations of terms, fitted to the same octaves."""
 
-    Attributes
-    ----------
-    first_octave : the first octave that is fitted
-    misfit : see `NoiseFit`
-    fits : the likeliest first
-    process_fits : the best with a Gauss-Markov process in place of its flicker and rate random
-        walk, and in place of the walk alone
-
-    """
-
-    first_octave: int
-    misfit: float
-    fits: tuple[CombinationFit, ...]
+    first_octave: int  # that is fitted
+    misfit: float  # see `NoiseFit`
+    fits: tuple[CombinationFit, ...]  # the likeliest first
+    #: The best with a Gauss-Markov process in place of its flicker and rate random walk, and in
+    #: place of the walk alone.
     process_fits: tuple[CombinationFit, ...] = ()
 
     @property
@@ -288,13 +250,9 @@ class Ranking:
                 if found and found.penalized_deviance() < self.best.penalized_deviance() else None)
 
     def is_replaceable(self, index: int) -> bool:
-        """
-        Tell whether a process may replace a term.
-
-        A random walk is a process with an infinite correlation time, so the likelihoods are
-        compared. In place of flicker, the penalized likelihoods are compared.
-
-        """
+        """Tell whether a process may replace a term."""
+        # A random walk is a process with an infinite correlation time, so the likelihoods are
+        # compared. In place of flicker, the penalized likelihoods are compared.
         best = self.best
         return any(index not in each.active_terms
                    and (each.deviance - best.deviance if index == _K
@@ -330,10 +288,7 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
 
     The first octave is the earliest one from which the residuals are within chance; if there is
     none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
-
-    Raises
-    ------
-    DataRefused : no combination fits the octaves
+    Raise `DataRefused` where no combination fits.
 
     """
     last = max(len(octaves.variance) // 2 - 1, 0)
@@ -361,15 +316,12 @@ def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ra
 
 def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
                       misfit: float) -> CombinationFit | None:
-    """
-    Return the best fit of some terms and a Gauss-Markov process, or None without one.
-
-    The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the chart:
-    a process with a longer correlation time is a random walk. It must make less than half of the
-    first Allan variance: white noise after a first-order lag is such a process too. The
-    correlation time is found with the covariance of the best fit, scaled by the Allan deviations.
-
-    """
+    """Return the best fit of some terms and a Gauss-Markov process, or None without one."""
+    # The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the
+    # chart: a process with a longer correlation time is a random walk. It must make less than half
+    # of the first Allan variance: white noise after a first-order lag is such a process too. The
+    # correlation time is found with the covariance of the best fit, scaled by the Allan
+    # deviations.
     octaves, places = best.octaves, (*kept_terms, _PROCESS)
     longest, known = octaves.size[-1] / 1.9, octaves.model_variance(best.squares)
 
@@ -393,23 +345,13 @@ def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
 
 @dataclass(frozen=True)
 class NoiseFigure:
-    """
-    The coefficient of one noise term.
-
-    Attributes
-    ----------
-    term : the term
-    value : its coefficient, in the unit of the term; 0 where it is not detected
-    standard_deviation : of the coefficient, if only the detected terms are present; nan where it
-        is not detected
-    lower, upper : bounds with 95 % confidence, which allow for undetected terms; where it is not
-        detected, 0 and the largest undetectable coefficient
-
-    """
+    """The coefficient of one noise term, in the unit of the term."""
 
     term: NoiseTerm
-    value: float
-    standard_deviation: float
+    value: float  # 0 where it is not detected
+    standard_deviation: float  # if only the detected terms are present; nan where not detected
+    #: Bounds with 95 % confidence, which allow for undetected terms; where it is not detected, 0
+    #: and the largest undetectable coefficient.
     lower: float
     upper: float
 
@@ -420,28 +362,16 @@ class NoiseFigure:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """
-    The noise figures of a record.
+    """The noise figures of a record."""
 
-    Attributes
-    ----------
-    figures : by symbol: N, B, K, Q, R
-    chart : the Allan deviations that were fitted, at octaves
-    min_time, max_time : the range of averaging times of the fit, s
-    misfit : relative difference between the Allan deviations and the sum of the terms, beyond
-        chance
-    alternatives : the symbols of other combinations of terms that fit the record nearly as well
-    process : a Gauss-Markov process in place of flicker and rate random walk, where it fits
-        better; these two then approximate it at the averaging times of the chart
-
-    """
-
-    figures: dict[str, NoiseFigure]
-    chart: AllanChart
-    min_time: float
-    max_time: float
-    misfit: float
-    alternatives: tuple[str, ...] = ()
+    figures: dict[str, NoiseFigure]  # by symbol: N, B, K, Q, R
+    chart: AllanChart  # the Allan deviations that were fitted, at octaves
+    min_time: float  # shortest averaging time of the fit, s
+    max_time: float  # s
+    misfit: float  # relative difference of Allan deviations and sum of terms, beyond chance
+    alternatives: tuple[str, ...] = ()  # symbols of combinations that fit nearly as well
+    #: In place of flicker and rate random walk, where it fits better; these two then approximate
+    #: it at the averaging times of the chart.
     process: GaussMarkov | None = None
 
     @property
@@ -478,14 +408,8 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     penalized likelihood is used. The shortest averaging times, which the filters of a gyro bend,
     are left out until the sum of the terms fits the rest.
 
-    Parameters
-    ----------
-    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
-    interval : s
-
-    Raises
-    ------
-    DataRefused : too few samples, or no sum of terms fits them
+    The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Raise
+    `DataRefused` for too few samples, or where no sum of terms fits them.
 
     """
     chart = allan_deviation(
@@ -532,13 +456,9 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
 
 
 def _likelihood_bounds(ranking: Ranking, best: CombinationFit, index: int) -> tuple[float, float]:
-    """
-    Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum.
-
-    At each coefficient the other terms are fitted anew (profile likelihood): those of the best
-    fits, N, B and K, detected or not, and a process where it is fitted with the term.
-
-    """
+    """Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum."""
+    # At each coefficient the other terms are fitted anew (profile likelihood): those of the best
+    # fits, N, B and K, detected or not, and a process where it is fitted with the term.
     held = {_N, _B, _K, *(each for one in (best, *ranking.plausible_fits, *ranking.alternatives)
                           for each in one.active_terms)}
     others = tuple(sorted(held - {index}))

@@ -19,8 +19,8 @@ The error of an encoder is constant while its reading is, and known where the re
 step; so readings are used at their steps. An error of step / sqrt(12) at each sample would give
 rests too much weight: with 0.088 deg and a gyro of low noise the variance of the scale was 58
 times the Cramer-Rao bound. The interval of the scale is the scatter between pieces of the log,
-since the error that repeats in each period of a swing is no noise of the fit; that of the bias is
-its wander between pieces.
+since the error that repeats in each period of a swing is no noise of the fit, and at least that
+between places of the shaft; that of the bias is its wander between pieces.
 
 """
 
@@ -97,6 +97,8 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 #: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
 _WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
+#: Places of a shaft in a revolution whose errors are independent.
+_PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
 #: Share of the largest differences that show their tail, and the probability that noise alone
@@ -175,6 +177,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
 
     """
     refuse_wrapped(log)
+    time, output, motion = _extract_motion(log)
     if method is None:
         method = 'likelihood'
         if log.reference_heading is not None and log.time is not None:
@@ -184,7 +187,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps = _bridge_jumps(log)
-    time, output, motion = _extract_motion(log)
+        time, output, motion = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
@@ -231,7 +234,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
         raise DataRefused(f'the log shows a bias of {drift.bias / DEGREE:.3f} +- '
                           f'{drift.deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
                           'heading: turn more slowly, with rests, or for longer')
-    fit = _apply_drift(fit, drift)
+    fit = _apply_drift(fit, drift, motion)
     deviation = math.sqrt(fit.covariance[0, 0])
     if deviation > limits.max_scale_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
@@ -259,14 +262,11 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     1975). Two in a row are an outlier, or a motion that the gyro does not measure.
 
     """
-    if (log.time is None or log.output is None or log.reference_heading is None
-            or not np.isfinite(log.output).any()):
+    if log.time is None or log.output is None or log.reference_heading is None:
         return log, []
     time, output = log.time, bridge_gaps(log.output)
     heading = np.asarray(drop_held_values(log).reference_heading)
     known = np.flatnonzero(np.isfinite(heading))
-    if len(known) < 2:
-        return log, []
     apart, turned = np.diff(time[known]), np.diff(heading[known])
     difference = turned - np.diff(integrate(time, output)[known])
     late = COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))
@@ -435,25 +435,32 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
                    math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))
 
 
-def _apply_drift(fit: ScaleBiasFit, drift: _Drift) -> ScaleBiasFit:
+def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasFit:
     """
     Return the fit with the mean bias of the drift, and covariances by the scatter between pieces.
 
     What repeats itself with the motion is not noise of the fit, and what is slower than a piece
-    shows in part only.
+    shows in part only. What repeats itself at a place of the shaft shows between the places.
 
     """
-    piece = _number_pieces(fit.influence[:, 2])
-    sums = np.array([np.bincount(piece, values) for values in fit.influence[:, :2].T])
-    student = (stats.t.ppf(0.975, np.count_nonzero(np.bincount(piece)) - 1)
-               / stats.norm.ppf(0.975)) ** 2
-    scatter = student * sums @ sums.T
+    scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence)
     slope = scatter[0, 1] / scatter[1, 1]
     widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation)
                          / math.sqrt(scatter[1, 1])])
+    covariance = scatter * np.outer(widening, widening)
+    turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
+    place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
+    if len(np.unique(place)) > 7:  # fewer do not determine a variance
+        covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
-                   + float(slope) * (drift.bias - fit.bias),
-                   covariance=scatter * np.outer(widening, widening))
+                   + float(slope) * (drift.bias - fit.bias), covariance=covariance)
+
+
+def _scatter_between(group: NDArray[np.intp], influence: Array) -> Array:
+    """Return the covariance of (s, b) by sums over groups of blocks, with Student's factor."""
+    sums = np.array([np.bincount(group, values) for values in influence[:, :2].T])
+    dof = max(np.count_nonzero(np.bincount(group)) - 1, 1)
+    return (stats.t.ppf(0.975, dof) / stats.norm.ppf(0.975)) ** 2 * sums @ sums.T
 
 
 def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidual:

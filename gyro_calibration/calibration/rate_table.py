@@ -389,7 +389,8 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
     whitened = whitener.whiten(unexplained_error(used, terms))
     left_out, deviation = np.full((2, len(dwells)), np.nan)
-    left_out[scatter.inliers] = _left_out_residuals(orthogonal, whitened, whitener)
+    left_out[scatter.inliers] = _left_out_residuals(orthogonal, whitened, whitener,
+                                                    cross_validation_parts(used))
     deviation[scatter.inliers] = whitener.deviation
     return Calibration(terms, dwells, given, scatter, unexplained_error(rest, terms), left_out,
                        deviation, float(np.linalg.cond(triangle)), len(used) - len(lengths),
@@ -498,18 +499,26 @@ def _orthonormal_columns(columns: Array, tolerance: float) -> Array:
     return left[:, sizes > tolerance]
 
 
-def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
-    """Return each dwell's residual of a fit without its sweep: the deleted residuals."""
-    parts = whitener.parts
-    remaining_gram = np.eye(orthogonal.shape[1]) - sum_by_part(
-        orthogonal[:, :, None] * orthogonal[:, None, :], parts)
-    # only this sweep shows some value
-    is_sole_source = np.linalg.eigvalsh(remaining_gram)[:, 0] < 1e-9
-    remaining_gram[is_sole_source] = np.eye(len(remaining_gram[0]))
-    changes = np.linalg.solve(
-        remaining_gram, sum_by_part(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
-    left_out = whitened + np.einsum('nm,nm->n', orthogonal, changes[parts])
-    return np.where(is_sole_source[parts], math.inf, whitener.restore(left_out))
+def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
+                        parts: Numbers) -> Array:
+    """
+    Return each dwell's residual of a fit without its part: the deleted residuals.
+
+    They are those of a fit with an error of its own for each dwell of the part. Where the part is
+    not a whole sweep, the others of its sweep show the bias and scale that they share.
+
+    """
+    left_out = np.full(len(whitened), math.inf)
+    for part in range(parts.max() + 1):
+        rows = np.flatnonzero(parts == part)
+        sweep, own = whitener.whiten_errors_of(rows)
+        own = own / (lengths := np.linalg.norm(own, axis=0))
+        shown = orthogonal[sweep].T @ own
+        remaining_gram = own.T @ own - shown.T @ shown
+        # else only this part shows some value
+        if np.linalg.eigvalsh(remaining_gram)[0] > 1e-9:
+            left_out[rows] = np.linalg.solve(remaining_gram, own.T @ whitened[sweep]) / lengths
+    return left_out
 
 
 # refusals

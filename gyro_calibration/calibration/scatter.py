@@ -48,7 +48,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
-#: With fewer, errors common to the dwells of a sweep are not distinguishable from random errors.
+#: With fewer, the others do not determine a model without one of them.
 MIN_SWEEPS = 4
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _MIN_DWELLS = 12
@@ -104,7 +104,7 @@ class Scatter:
         """Return the standard deviation of the mean error of some dwells, rad/s."""
         # errors common to a sweep do not average out within it
         shared = sum_by_part(self.sweep_columns(dwells) * np.broadcast_to(
-            sign, len(dwells))[:, None], np.unique(dwells.sweep, return_inverse=True)[1])
+            sign, len(dwells))[:, None], sweep_numbers(dwells))
         return math.sqrt(float(np.sum(self.deviation(dwells) ** 2) + np.sum(shared ** 2))) / len(
             dwells)
 
@@ -120,12 +120,19 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
 
     It is the sweep, since errors that its dwells have in common do not predict other sweeps. Fewer
     than four sweeps do not determine a model without one of them, nor do two temperatures the
-    slope between them: then parts are 60 blocks of time, or the dwells.
+    slope between them: then parts are about 60 blocks of time within sweeps, or the dwells.
 
     """
-    parts = np.unique(dwells.sweep, return_inverse=True)[1]
-    return (parts if parts.max() + 1 >= MIN_SWEEPS
-            else np.arange(len(dwells)) * min(len(dwells), 60) // len(dwells))
+    sweeps, count = sweep_numbers(dwells), min(len(dwells), 60)
+    if sweeps.max() + 1 >= MIN_SWEEPS:
+        return sweeps
+    return np.unique(sweeps * count + np.arange(len(dwells)) * count // len(dwells),
+                     return_inverse=True)[1]
+
+
+def sweep_numbers(dwells: Dwells) -> Numbers:
+    """Return the number of the sweep of each dwell, from 0 on without gaps, shape (n,)."""
+    return np.unique(dwells.sweep, return_inverse=True)[1]
 
 
 def sum_by_part(values: Array, parts: Numbers) -> Array:
@@ -138,12 +145,14 @@ class Whitener:
     """The covariance of the errors of dwells: independent sweeps, by their Cholesky factors."""
 
     def __init__(self, dwells: Dwells, scatter: Scatter):
-        self.parts = cross_validation_parts(dwells)
         self.deviation = scatter.deviation(dwells)
         shared = scatter.sweep_columns(dwells)
-        rows = (np.flatnonzero(self.parts == part) for part in range(self.parts.max() + 1))
-        self._factors = [(own, np.linalg.cholesky(
-            np.diag(self.deviation[own] ** 2) + shared[own] @ shared[own].T)) for own in rows]
+        # without errors in common, all dwells are independent
+        parts = (sweep_numbers if shared.any() else cross_validation_parts)(dwells)
+        rows = (np.flatnonzero(parts == part) for part in range(parts.max() + 1))
+        # by the factors of the covariance: exact dwells would be lost in it beside their sweep
+        self._factors = [(own, np.asarray(np.linalg.qr(np.vstack(
+            [np.diag(self.deviation[own]), shared[own].T]), mode='r')).T) for own in rows]
 
     def whiten(self, values: Array) -> Array:
         """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
@@ -151,6 +160,11 @@ class Whitener:
         for own, factor in self._factors:
             whitened[own] = solve_triangular(factor, values[own], lower=True)
         return whitened
+
+    def whiten_errors_of(self, rows: Numbers) -> tuple[Numbers, Array]:
+        """Return the m rows of a sweep, and whitened errors of k of them, each 1 rad/s, (m, k)."""
+        own, factor = next(each for each in self._factors if np.isin(rows[0], each[0]))
+        return own, solve_triangular(factor, (own[:, None] == rows).astype(float), lower=True)
 
     def restore(self, whitened: Array) -> Array:
         """Return what `whiten` was given."""
@@ -170,8 +184,11 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
     # The likelihood does not depend on the part that the surface explains; without its removal,
     # small errors would be lost in rounding.
     error = error - surface @ (surface.T @ error)
-    size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
-    relative = size / max(float(np.abs(used.rate).max()), 1e-9)
+    fastest = max(float(np.abs(used.rate).max()), 1e-9)
+    # of exact values above their rounding, or what is rounded would be explained
+    size = (rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1))
+            + 1e-12 * fastest)
+    relative = size / fastest
     units = np.array([size, relative, size, relative])[:_count_scatter_terms(used)]
 
     def scatter(logarithms: Array) -> Scatter:
@@ -197,7 +214,7 @@ def _count_scatter_terms(dwells: Dwells) -> int:
     """Return how many of the four scatters the dwells and sweeps determine."""
     if len(dwells) < _MIN_DWELLS:
         return 1
-    return 4 if len(np.unique(dwells.sweep)) >= MIN_SWEEPS else 2
+    return 4 if len(np.unique(dwells.sweep)) > 1 else 2
 
 
 def find_inliers(dwells: Dwells) -> Mask:
@@ -210,7 +227,7 @@ def find_inliers(dwells: Dwells) -> Mask:
     """
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
-        parts = cross_validation_parts(dwells)
+        parts = sweep_numbers(dwells)
         own = (parts[:, None] == np.arange(parts.max() + 1)).astype(float)
         turning = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
         extended = _orthonormal_basis(np.column_stack([columns, own, own * turning[:, None]]))
@@ -270,7 +287,7 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
     inner, outer = (sum_by_part(shared[:, :, None] * each[:, None, :],
-                                cross_validation_parts(dwells)) for each in (shared, columns))
+                                sweep_numbers(dwells)) for each in (shared, columns))
     # Woodbury: the covariance is diagonal plus two shared columns for each sweep
     inner = np.eye(2) + sizes[:, None, :, None] * inner * sizes[:, None, None, :]
     outer = sizes[:, None, :, None] * outer
@@ -384,7 +401,7 @@ class Uncertainty:
 def _sweep_variances(dwells: Dwells, deviation: Array) -> Array:
     """Return the variance of bias and scale of each sweep by its dwells, shape (2, sweeps)."""
     weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
-    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, cross_validation_parts(dwells)).T
+    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, sweep_numbers(dwells)).T
 
 
 def _scatter_grid(size: float, variances: Array) -> tuple[Array, Array]:

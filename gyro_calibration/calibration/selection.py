@@ -136,13 +136,8 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     DataRefused : too few dwells for anything
 
     """
-    best = find_supported_effects(dwells, FALSE_ALARM_RATE)
-    for slope, typical_deviation in ((BIAS_TEMPERATURE, BIAS_SLOPE_DEVIATION),
-                                     (SCALE_FACTOR_TEMPERATURE, SCALE_SLOPE_DEVIATION)):
-        extended = None if slope in best.effects else try_fit(best, (*best.effects, slope))
-        if (extended is not None and extended.dof
-                and extended.effect_deviation(slope) < typical_deviation):
-            best = extended
+    base = _add_slopes(_fit_base(dwells, None))
+    best = _add_slopes(find_supported_effects(dwells, FALSE_ALARM_RATE, base=base))
     best, confounders = resolve_confounders(
         best, technology, None if technology else SINE_RESPONSE)
     tried = len(STATIC_EFFECTS) - len({*BASIC_EFFECTS} & {*best.effects})
@@ -151,16 +146,28 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
                                  for effect in STATIC_EFFECTS.values()), confounders)
 
 
+def _add_slopes(fit: Calibration) -> Calibration:
+    """Add the slopes over temperature that the dwells determine better than a data sheet does."""
+    for slope, typical_deviation in ((BIAS_TEMPERATURE, BIAS_SLOPE_DEVIATION),
+                                     (SCALE_FACTOR_TEMPERATURE, SCALE_SLOPE_DEVIATION)):
+        extended = None if slope in fit.effects else try_fit(fit, (*fit.effects, slope))
+        if (extended is not None and extended.dof
+                and extended.effect_deviation(slope) < typical_deviation):
+            fit = extended
+    return fit
+
+
 def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
-                           given: GyroModel | None = None) -> Calibration:
+                           given: GyroModel | None = None,
+                           base: Calibration | None = None) -> Calibration:
     """
     Fit the effects that predict left-out sweeps better, at a false alarm rate.
 
     The best one is added until none is supported, then those that later ones made superfluous are
-    removed. With a given model they are changes of it.
+    removed. With a given model they are changes of it. The effects of a `base` are in the fit.
 
     """
-    best = base = _fit_base(dwells, given)
+    best = base = base or _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
     limit = false_alarm_rate / len(candidates)
     while True:

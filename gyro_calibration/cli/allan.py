@@ -22,15 +22,13 @@ import argparse
 from dataclasses import replace
 from typing import Any
 
-from gyro_calibration.allan import (
+from gyro_calibration.allan.deviation import (
     allan_deviation,
     AllanChart,
     build_rest_record,
-    fit_noise,
-    NoiseFigure,
-    NoiseFit,
     RestRecord,
 )
+from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError

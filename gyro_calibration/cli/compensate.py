@@ -28,17 +28,8 @@ from typing import Any
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.heading_estimator import (
-    Assumptions,
-    HeadingEstimator,
-    TEMPERATURE_TIMEOUT,
-)
-from gyro_calibration.heading.integration import (
-    BlockIntegrator,
-    Intervals,
-    MAX_GAP,
-    Threshold,
-)
+from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
+from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX_GAP, Threshold
 from gyro_calibration.heading.log_compensation import (
     LogCompensation,
     no_plausible_row_message,
@@ -250,12 +241,8 @@ def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> Compens
 
 def _make_estimator(model: GyroModel, log: Log,
                     keeps_history: bool) -> tuple[HeadingEstimator, float]:
-    """
-    Return the estimator of the log, and the date of time 0, s since 1970.
-
-    Where stamps are no dates, the age of a calibration is unknown and assumed to be 0.
-
-    """
+    """Return the estimator of the log, and the date of time 0, s since 1970."""
+    # Where stamps are no dates, the age of a calibration is unknown and assumed to be 0.
     assert log.time is not None
     # stamps beyond 1e9 are s since 1970
     has_dates, calibration = log.time[0] > 1e9, model.self_calibration
@@ -266,8 +253,8 @@ def _make_estimator(model: GyroModel, log: Log,
                  else log.temperature[np.isfinite(log.temperature)])
         if len(known):
             model = with_self_calibration(model, replace(calibration, temperature=float(known[0])))
-    estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(),
-                                 TEMPERATURE_TIMEOUT, now, keeps_history)
+    estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), now,
+                                 keeps_history)
     if not has_dates and calibration is not None:
         when = datetime.fromtimestamp(now, timezone.utc).isoformat()
         estimator.use_calibration(with_self_calibration(model, replace(

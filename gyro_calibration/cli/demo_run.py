@@ -56,10 +56,9 @@ from tqdm import tqdm
 
 PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
-SAMPLE_INTERVAL = 0.01  # s between samples
 MAX_ATTEMPTS = 3  # to calibrate
-DRIVE_MOTION = constant_rate_motion([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20),
-                                     (4, 0), (5, -20), (4, 0), (1, 0)])
+DRIVE_MOTION = constant_rate_motion([
+    *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
 
 class CallRefused(OSError):
@@ -68,13 +67,7 @@ class CallRefused(OSError):
 
 @dataclass
 class SimulatedRobot:
-    """
-    A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model.
-
-    Where this process is delayed, the samples are late, but the robot has turned meanwhile as
-    commanded.
-
-    """
+    """A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model."""
 
     model: GyroModel
     noise: Array  # of each sample, rad/s
@@ -85,19 +78,20 @@ class SimulatedRobot:
 
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
+        # where this process is delayed they are late, but the robot has turned meanwhile
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
         for number, noise in enumerate(self.noise):
-            due = begin + number * SAMPLE_INTERVAL
+            due = begin + number * XV3500.interval
             time.sleep(max(0.0, due - time.monotonic()))
             while self.commands and self.commands[0][0] <= due:
                 command = self.commands.popleft()[1]
-            largest = 3.0 * SAMPLE_INTERVAL
+            largest = 3.0 * XV3500.interval
             change = min(max(command - rate, -largest), largest)
-            heading += SAMPLE_INTERVAL * (rate + 0.5 * change)
+            heading += XV3500.interval * (rate + 0.5 * change)
             rate += change
             self.true_headings.append((time.time() - (time.monotonic() - due), heading))
             yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
-                         time=number * SAMPLE_INTERVAL)
+                         time=number * XV3500.interval)
 
 
 class DemoClient:
@@ -204,7 +198,7 @@ def run_demo(out: Path, seed: int) -> Answer:
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
     robot = SimulatedRobot(XV3500.model, simulate_noise(
-        XV3500.noise, 30000, SAMPLE_INTERVAL, np.random.default_rng(seed)))
+        XV3500.noise, 30000, XV3500.interval, np.random.default_rng(seed)))
     with ExitStack() as stack:
         stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))

@@ -329,16 +329,16 @@ def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
-    scatter, has_sweeps = fit.scatter, len(np.unique(fit.dwells.sweep)) >= MIN_SWEEPS
-    part = 'sweeps' if has_sweeps else 'blocks of time'
+    scatter, sweeps = fit.scatter, len(np.unique(fit.dwells.sweep))
+    part = 'sweeps' if sweeps >= MIN_SWEEPS else 'blocks of time'
     yield (f'Error {fit.uncorrected_rms / DEGREE:.4f} deg/s rms before, '
            f'{fit.residual_rms / DEGREE:.4f} after; '
            + (f'{fit.left_out_rms / DEGREE:.4f} in {part} left out of the fit.'
               if math.isfinite(fit.left_out_rms)
               else f'no cross-validation, since some values depend on one of the {part} only.'))
     sweep_scatter = (f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s '
-                     f'and {100.0 * scatter.sweep_scale:.3f} %' if has_sweeps
-                     else f'the scatter of sweeps needs at least {MIN_SWEEPS} sweeps')
+                     f'and {100.0 * scatter.sweep_scale:.3f} %' if sweeps > 1
+                     else 'the scatter of sweeps needs a second sweep')
     yield wrap_line(f'Dwells scatter by {scatter.dwell_bias / DEGREE:.4f} deg/s '
                     f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {sweep_scatter}. '
                     f'Condition number {fit.condition_number:.1f}.')

@@ -41,13 +41,7 @@ from gyro_calibration.fleet.logs import (
     NO_EVIDENCE,
     process_log,
 )
-from gyro_calibration.fleet.run import (
-    cluster_executors,
-    count_cores,
-    process_executors,
-    run_tasks,
-    WorkerLost,
-)
+from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
     build_models,
     COMPONENT_LABELS,
@@ -179,7 +173,7 @@ def _process_logs(given: argparse.Namespace, tasks: Sequence[LogTask]) -> list[d
 @contextmanager
 def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
     """Give the number of workers, and the function that makes executors of them."""
-    workers = given.workers or count_cores()
+    workers = given.workers or len(os.sched_getaffinity(0))
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
         memory = 1e9 * given.memory if given.memory else 0.8 * machine / workers

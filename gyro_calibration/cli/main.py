@@ -78,12 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _load_effects(path: str) -> None:
-    """
-    Run a Python file and add the effects of its list EFFECTS to the catalogue.
-
-    Only the command line names such a file; models and logs cannot.
-
-    """
+    """Run a Python file and add the effects of its list EFFECTS to the catalogue."""
+    # Only the command line names such a file; models and logs cannot.
     spec = spec_from_file_location('effects_of_the_user', path)
     if spec is None or spec.loader is None or not Path(path).is_file():
         raise UsageError(f'{path} is not a Python file; wanted one, .py, with a list EFFECTS')

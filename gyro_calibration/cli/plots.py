@@ -20,11 +20,14 @@ value for each sample or dwell, shape (n,).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import itertools
+import math
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from gyro_calibration.allan import AllanChart, NoiseFit
+from gyro_calibration.allan.deviation import AllanChart
+from gyro_calibration.allan.noise_fit import NoiseFit
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
@@ -34,6 +37,9 @@ from gyro_calibration.logs.log import Array, DEGREE, Mask
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import Motion
 import numpy as np
+
+if TYPE_CHECKING:
+    from gyro_calibration.diagnosis.findings import Diagnosis
 
 #: Lines that are distinguished without colour.
 _LINE_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
@@ -154,12 +160,8 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
 def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
                        temperature_range: tuple[float, float],
                        dwells: Dwells | None = None) -> Any:
-    """
-    Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
-
-    Without a range of temperatures it is that at the reference temperature. Dwells are dots.
-
-    """
+    """Draw the error that a model removes, over output and temperature (Ojeda et al., fig. 6)."""
+    # without a range of temperatures at the reference temperature; dwells are dots
     output = np.linspace(*rate_range, 161)
     has_temperature = bool(np.isfinite(temperature_range).all()
                            and temperature_range[0] < temperature_range[1])
@@ -254,12 +256,8 @@ def _draw_errors(axes: Any, across: Array, error: Array, is_inlier: Mask,
 
 
 def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:
-    """
-    Draw the errors of full turns with a static bias only and with the model.
-
-    They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
-
-    """
+    """Draw the errors of full turns with a static bias only and with the model."""
+    # They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
     figure, panels = _panels(2, 1, (8.5, 8))
     temperature = errors.turns.temperature
     for axes, error, words in zip(panels[:, 0], (errors.static, errors.modelled),
@@ -281,6 +279,21 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
                         'scale factor error; a curve: nonlinearity; growth towards '
                         'slow turns: bias or noise. Hatched: slower than '
                         f'{min_rate / DEGREE:g} deg/s, left out. Scales differ.')
+
+
+def draw_diagnosis(path: str | Path | None, diagnosis: Diagnosis) -> Any:
+    """Draw the charts of a diagnosis, two in a row."""
+    from gyro_calibration.diagnosis.report import draw_axes, main_charts  # only for this one
+    charts = main_charts(diagnosis)
+    rows = math.ceil(len(charts) / 2) or 1
+    figure, panels = _panels(rows, 2, (10, 3.6 * rows))
+    for axes, chart in itertools.zip_longest(panels.flat, charts):
+        if chart is None:
+            axes.remove()
+        else:
+            draw_axes(axes, chart)
+    return _save_figure(figure, path, 'Measured less simulated output; bands are of noise alone, '
+                        '95 %. Where a curve leaves its band, the model lacks something.')
 
 
 def _panels(rows: int, columns: int, inches: tuple[float, float],

@@ -34,7 +34,7 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.driver.connection import Connection, ConnectionState
+from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
@@ -52,7 +52,6 @@ _EXISTS = '{}: exists already, and recordings are never overwritten; give a new 
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
-_MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
 #: Time, s, for which the header of a log waits for values that come seldom: with and without a
@@ -106,13 +105,9 @@ def run(given: argparse.Namespace) -> Answer:
 
 @contextmanager
 def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
-    """
-    Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets.
-
-    A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where it
-    is ignored already (nohup).
-
-    """
+    """Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets."""
+    # A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where
+    # it is ignored already (nohup).
     stop = threading.Event()
     previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
                          for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -137,16 +132,13 @@ class DiskFull(OSError):
 
 
 class _Recorder:
-    """
-    A new file that grows by complete pieces, and is removed at the end if it has none.
-
-    `size` is that of the complete pieces, bytes; `is_full` tells that one could not be written.
-
-    """
+    """A new file that grows by complete pieces, and is removed at the end if it has none."""
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
-        self.path, self.size, self.is_full, self._notes = path, 0, False, notes
+        # size of the complete pieces, bytes, and whether one could not be written
+        self.size, self.is_full = 0, False
+        self.path, self._notes = path, notes
         try:
             self._file = io.FileIO(path, 'xb')
         except FileExistsError:
@@ -237,8 +229,7 @@ class CsvRecorder(_Recorder):
     Samples as rows of the log format.
 
     The columns are fixed with the first piece. Values that come less often than samples, such as
-    the temperature, are repeated until the next one. `late_columns` are those that came after the
-    first piece, and are not in the file.
+    the temperature, are repeated until the next one.
 
     """
 
@@ -248,7 +239,7 @@ class CsvRecorder(_Recorder):
         self._held_values: dict[str, float] = {}
         self._columns: list[str] = []
         self._start_stamp = 0
-        self.late_columns: set[str] = set()
+        self.late_columns: set[str] = set()  # came after the first piece, and are not in the file
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample; the stamp is in ns."""
@@ -350,8 +341,8 @@ class _PortSession:
         if given.topic or given.temperature_topic or given.reference_topic or given.all:
             raise UsageError('--port and topics were both given; record one of them, '
                              'or the topics of a driver on that port')
-        if not 0 <= given.baud <= _MAX_BAUD:
-            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_MAX_BAUD}; '
+        if not 0 <= given.baud <= MAX_BAUD:
+            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}; '
                              'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:
@@ -479,8 +470,9 @@ class _TopicSession:
             if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
                 self._is_waiting = False
                 if missing := node.missing_topics:
+                    known = sorted(name for name, _ in node.get_topic_names_and_types())
                     verb.print_message(f'no publisher so far of {", ".join(missing)}; '
-                                       f'there are {", ".join(node.known_topics()) or "none"}')
+                                       f'there are {", ".join(known) or "none"}')
 
         # prints of the middleware go to standard error; standard output is the answer
         sys.stdout.flush()

@@ -49,11 +49,7 @@ from gyro_calibration.heading.log_compensation import (
     plausible_rows,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.model.gyro_model import (
-    GyroModel,
-    SelfCalibration,
-    with_self_calibration,
-)
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import Motion, motion_from_log, read_motion
 import numpy as np

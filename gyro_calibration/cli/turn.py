@@ -24,12 +24,7 @@ import io
 import math
 from typing import Any
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    extract_dwells,
-    format_list,
-    select_dwells,
-)
+from gyro_calibration.calibration.dwells import Dwells, extract_dwells, format_list, select_dwells
 from gyro_calibration.calibration.rate_table import (
     compute_turn_errors,
     equal_bins,

@@ -379,7 +379,7 @@ def _log_problems(log: Log) -> Iterator[str]:
                    f'{MIN_SAMPLES} and a tenth are needed: record again, and repair the line if '
                    'it loses samples')
         if duration < MIN_DURATION:
-            yield (f'the log lasts {duration:.1f} s; a diagnosis needs at least '
+            yield (f'the log lasts {duration:.4g} s; a diagnosis needs at least '
                    f'{MIN_DURATION:g} s: record longer')
         if duration > MAX_DURATION:
             yield (f'the log lasts {duration:.3g} s by its stamps; check that time_s is in s, or '
@@ -640,14 +640,20 @@ def _regress_changes(gyro: Array, steps: Array, change: Array) -> Agreement:
     """Return the agreement without outlying spans."""
     scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
+    turned = np.abs(gyro), np.abs(change)
     kept = np.ones(len(change), dtype=bool)
     for _ in range(3):
         values = np.linalg.lstsq(columns[kept], change[kept], rcond=None)[0]
         off = change - columns @ values
         kept = np.abs(off) <= 6.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-15
-        if kept.sum() < max(_MIN_SPANS, len(change) // 2):
+        # Beside long rests, all turns of the gyro are outlying if the reference makes others.
+        if kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum():
             kept[:] = True
     variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
+    if (left >= (1.0 - _MIN_MOTION_COHERENCE) * variance
+            and turned[1][kept].sum() < 0.5 * turned[1].sum()):
+        # those of the reference are outlying, and the rest agrees no better
+        variance, left = float(np.var(change)), float(np.var(off))
     coherence = max(1.0 - left / variance, 0.0) if variance > 0.0 else 0.0
     deviation = math.sqrt(
         left / max(kept.sum() - 2, 1) / max(float(np.var(columns[kept, 0])), 1e-300))

@@ -281,14 +281,18 @@ def _settled_dwells(log: Log, fit: RegressionFit,
 
     The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
     with dynamics that no cause describes. The mean squares of the whitened residual are compared
-    stretch by stretch (Mann and Whitney), and have to be twice as large between dwells.
+    stretch by stretch (Mann and Whitney), and have to be twice as large between dwells. Dwells of
+    less than half the range of rates, such as rests alone, do not show what the motion does.
 
     """
     try:
         dwells = find_dwells(log)
     except DataRefused:
         return None
-    time = fit.problem.replays[0].channels.time
+    channels = fit.problem.replays[0].channels
+    if np.ptp(dwells.rate) < 0.5 * np.ptp(np.asarray(channels.rate)):
+        return None
+    time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
     white, valid = fit.whitened_series()[0], fit.problem.replays[0].valid
     at = time[valid][0] + fit.problem.replays[0].point_interval * np.arange(len(white))

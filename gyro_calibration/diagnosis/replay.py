@@ -180,9 +180,9 @@ class Replay:
         assert self.channels.lagged is not None
         return np.asarray(self.channels.lagged(channel, time_constant))
 
-    def resample(self, values: Array, fill_deviation: float = 0.0) -> Array:
+    def resample(self, values: Array, fill_deviation: float = 0.0, least_reach: int = 1) -> Array:
         """Return samples on the even grid; interpolated ones get white noise, if any is given."""
-        whole = _bridge_gaps(values[self.valid], self.grid_index)
+        whole = _bridge_gaps(values[self.valid], self.grid_index, least_reach)
         if fill_deviation and len(whole) > len(self.grid_index):
             lost = np.ones(len(whole), dtype=bool)
             lost[self.grid_index] = False
@@ -190,13 +190,24 @@ class Replay:
         whole = whole[:self.point_count * self.decimation]
         return whole.reshape(-1, self.decimation).mean(axis=1)
 
+    @property
+    def _least_reach(self) -> int:
+        """
+        Return the least number of samples on each side of a gap whose mean bridges it.
+
+        It repeats their noise: with a sixteenth of the log, in 16 coefficients only.
+
+        """
+        return len(self.grid_index) // 16
+
     def transform_residual(self, values: Array) -> Array:
         """Return the cosine transform of a residual; interpolated points get white noise."""
-        return cosine_transform(self.resample(values, white_noise_deviation(values[self.valid])))
+        return cosine_transform(self.resample(values, white_noise_deviation(values[self.valid]),
+                                              self._least_reach))
 
     def transform_samples(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
-        return cosine_transform(self.resample(values))
+        return cosine_transform(self.resample(values, least_reach=self._least_reach))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
@@ -330,8 +341,8 @@ def _fast_transform_length(count: int) -> int:
     return count
 
 
-def _bridge_gaps(samples: Array, grid_index: NDArray[np.intp]) -> Array:
-    """Return samples on the whole grid, with lines over gaps between means as long as the gap."""
+def _bridge_gaps(samples: Array, grid_index: NDArray[np.intp], least_reach: int) -> Array:
+    """Return samples on the whole grid, with lines over gaps between means, as long or longer."""
     if len(samples) == grid_index[-1] + 1:
         return samples
     steps = np.diff(grid_index)
@@ -340,7 +351,8 @@ def _bridge_gaps(samples: Array, grid_index: NDArray[np.intp]) -> Array:
     whole[grid_index] = samples
     length = steps[before] - 1
     total = np.concatenate([[0.0], np.cumsum(samples)])
-    first, last = np.maximum(before + 1 - length, 0), np.minimum(before + 1 + length, len(samples))
+    reach = np.maximum(length, least_reach)
+    first, last = np.maximum(before + 1 - reach, 0), np.minimum(before + 1 + reach, len(samples))
     left, right = ((total[end] - total[begin]) / (end - begin)
                    for begin, end in ((first, before + 1), (before + 1, last)))
     number = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)

@@ -112,13 +112,27 @@ def _without_extension(diagnosis: Diagnosis) -> Diagnosis:
                    trace=None if trace is None else replace(trace, extended=trace.simulated))
 
 
-def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
-    """Give titles with their content."""
+def _divide_curves(diagnosis: Diagnosis) -> tuple[list[tuple[int, Curve]], ...]:
+    """Return the numbered curves along variables of what is found, and the others."""
     along = [*(found.along for found in diagnosis.findings),
              *(each.along for each in diagnosis.unexplained)]
     curves = sorted((each for each in enumerate(diagnosis.curves) if each[1].along in along),
                     key=lambda each: along.index(each[1].along))
-    others = [each for each in enumerate(diagnosis.curves) if each[1].along not in along]
+    return curves, [each for each in enumerate(diagnosis.curves) if each[1].along not in along]
+
+
+def main_charts(diagnosis: Diagnosis) -> list[Chart]:
+    """Return the residual along the variables of what is found, or along all, and the heading."""
+    if not is_model_extended(diagnosis):
+        diagnosis = _without_extension(diagnosis)
+    curves, others = _divide_curves(diagnosis)
+    return [*(_residual_chart(curve, place) for place, curve in curves or others),
+            *([] if diagnosis.heading is None else [_heading_chart(diagnosis.heading)])]
+
+
+def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
+    """Give titles with their content."""
+    curves, others = _divide_curves(diagnosis)
     yield 'Simulation and measurement', _misfit_charts(diagnosis.trace, curves or others)
     yield 'Causes', [element('article', element('h3', f'{place} {cause_title(found)}'),
                              *(element('p', text) for text in cause_paragraphs(found, diagnosis)))
@@ -371,23 +385,50 @@ _STYLES: dict[str, tuple[str, str, Any]] = {
 
 def draw_chart(chart: Chart) -> Markup:
     """Return a chart with the table of its values."""
-    known = [np.isfinite(chart.x) & np.isfinite(line.values) for line in chart.lines]
-    if chart.is_logarithmic:
-        known = [each & (chart.x > 0.0) & (line.values > 0.0)
-                 for each, line in zip(known, chart.lines)]
-    if not any(each.any() for each in known):
+    if not any(each.any() for each in _drawable(chart)):
         return element('p', f'{chart.title}: there is nothing to draw.', class_='quiet')
-    picture = (_draw_svg(chart, known) if find_spec('matplotlib')
+    picture = (_draw_svg(chart) if find_spec('matplotlib')
                else element('p', 'matplotlib is not installed: no picture', class_='quiet'))
     return element('figure', element('figcaption', chart.title), picture,
                    element('p', chart.description, class_='quiet'), _value_table(chart))
 
 
-def _draw_svg(chart: Chart, known: Sequence[Mask]) -> Markup:
+def _drawable(chart: Chart) -> list[Mask]:
+    """Tell which values of each line can be drawn."""
+    known = [np.isfinite(chart.x) & np.isfinite(line.values) for line in chart.lines]
+    if not chart.is_logarithmic:
+        return known
+    return [each & (chart.x > 0.0) & (line.values > 0.0) for each, line in zip(known, chart.lines)]
+
+
+def draw_axes(axes: Any, chart: Chart) -> None:
+    """Draw a chart into axes of matplotlib."""
+    from matplotlib.ticker import MaxNLocator  # not needed without a page, and slow to load
+    axes.set(xlabel=_plain(_with_unit(chart.x_label, chart.x_unit)),
+             ylabel=_plain(_with_unit(chart.y_label, chart.y_unit)))
+    axes.margins(x=0.0)
+    axes.grid(True)
+    if chart.is_logarithmic:
+        axes.set(xscale='log', yscale='log')
+    else:
+        axes.axhline(0.0, color=_STYLES['text'][0], linewidth=0.8)
+        axes.ticklabel_format(axis='y', useOffset=False)
+    for line, shown in zip(chart.lines, _drawable(chart)):
+        _draw_line(axes, line, np.where(shown, chart.x, np.nan))
+    if chart.x_names:
+        apart = math.ceil(sum(map(len, chart.x_names)) / 30) or 1
+        axes.set_xticks(range(1, len(chart.x_names) + 1, apart))
+        axes.set_xticklabels([_plain(name) for name in chart.x_names[::apart]])
+        axes.set_xlim(0.5, len(chart.x_names) + 0.5)
+    elif chart.x_unit == 'deg':
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 3, 4.5, 9, 10]))
+    axes.legend(loc='lower center', bbox_to_anchor=(0.5, 1.0), ncol=2)
+
+
+def _draw_svg(chart: Chart) -> Markup:
     """Return the picture, in the colours of the page."""
     import matplotlib  # not needed without a page, and slow to load
     from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
     text, grid = _STYLES['text'][0], _STYLES['grid'][0]
     style: dict[Any, Any] = {
         'svg.fonttype': 'none', 'svg.hashsalt': chart.name, 'font.size': 11,
@@ -399,25 +440,7 @@ def _draw_svg(chart: Chart, known: Sequence[Mask]) -> Markup:
         warnings.simplefilter('ignore')  # of letters that the font lacks
         # small, so that letters are readable on a phone
         figure = Figure(figsize=(5.0, 3.4), layout='constrained', facecolor='none')
-        axes = figure.add_subplot(facecolor='none', xmargin=0.0,
-                                  xlabel=_plain(_with_unit(chart.x_label, chart.x_unit)),
-                                  ylabel=_plain(_with_unit(chart.y_label, chart.y_unit)))
-        axes.grid(True)
-        if chart.is_logarithmic:
-            axes.set(xscale='log', yscale='log')
-        else:
-            axes.axhline(0.0, color=text, linewidth=0.8)
-            axes.ticklabel_format(axis='y', useOffset=False)
-        for line, shown in zip(chart.lines, known):
-            _draw_line(axes, line, np.where(shown, chart.x, np.nan))
-        if chart.x_names:
-            apart = math.ceil(sum(map(len, chart.x_names)) / 30) or 1
-            axes.set_xticks(range(1, len(chart.x_names) + 1, apart))
-            axes.set_xticklabels([_plain(name) for name in chart.x_names[::apart]])
-            axes.set_xlim(0.5, len(chart.x_names) + 0.5)
-        elif chart.x_unit == 'deg':
-            axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 3, 4.5, 9, 10]))
-        axes.legend(loc='lower center', bbox_to_anchor=(0.5, 1.0), ncol=2)
+        draw_axes(figure.add_subplot(facecolor='none'), chart)
         figure.savefig(file, format='svg', metadata=dict.fromkeys(
             ('Creator', 'Date', 'Format', 'Type')))
     # of the names, which other charts have too, only markers and clipping paths are used

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.allan import allan_deviation
+from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.regression import RegressionFit

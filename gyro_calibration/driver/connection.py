@@ -70,28 +70,25 @@ class SerialPort:
     Each method raises `PortError` where the device cannot do it or was disconnected; the port is
     then closed.
 
-    `timeout` is how long `read` waits for the first byte, s.
-
     """
 
-    def __init__(self, path: str, baud: int, timeout: float = 0.1):
-        self.path, self.baud, self._timeout = path, baud, timeout
+    def __init__(self, path: str, baud: int):
+        self.path, self.baud = path, baud
         self._port: serial.Serial | None = None
 
     def open(self) -> None:  # noqa: A003
         """Open the port exclusively, and discard earlier input."""
         self.close()
         try:
-            self._port = serial.Serial(self.path, self.baud, timeout=self._timeout,
-                                       write_timeout=1.0, exclusive=True)
+            self._port = serial.Serial(self.path, self.baud, write_timeout=1.0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             raise PortError(f'cannot open {self.path}: {_describe_error(error)}') from error
 
     def read(self) -> bytes:
-        """Return the available bytes; wait for the first one up to the timeout."""
+        """Return the available bytes; wait for the first one up to 0.1 s."""
         with self._open_port() as port:
             # read of pyserial returns the first byte alone, and needs two more calls for the rest
-            if not select.select([port], [], [], self._timeout)[0]:
+            if not select.select([port], [], [], 0.1)[0]:
                 return b''
             data = os.read(port.fileno(), 65536)
             if not data:
@@ -137,6 +134,7 @@ def _describe_error(error: BaseException) -> str:
     return f'{error}: set another port or baud'
 
 
+MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
 _SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
 #: Longest silence of a board that restarts when its port is opened, and longest delay before a
@@ -180,13 +178,7 @@ class ConnectionCounts:
 
 
 def resolve_port(port: str) -> str:
-    """
-    Return the port that matches a pattern such as ``/dev/serial/by-id/*A9003XYZ*``.
-
-    A path without wildcards is returned unchanged. `PortError` states that no port matches, or
-    several devices.
-
-    """
+    """Return the port that matches a pattern, or a path itself; none or several: `PortError`."""
     if os.path.exists(port) or not glob.has_magic(port):
         return port
     matches = sorted(glob.glob(port))
@@ -209,18 +201,10 @@ class Connection:
     first listens, at each baud in turn unless one is given, and sends nothing. The recognized
     protocol is kept after a loss of the port, as long as its samples come.
 
-    Parameters
-    ----------
-    port : path, or a pattern that finds it under any name
-    protocol : name of a protocol, or ``'auto'``
-    baud : bits per second; 0 for that of the protocol
-    on_change : is called with each new `ConnectionState`, in the thread that reads
-    clock : returns seconds of a steady clock
-    make_port : makes a `SerialPort` of a path and a baud
-
-    Raises
-    ------
-    ValueError : the protocol is unknown, or settings that it needs are missing
+    The port is a path, or a pattern that finds it under any name; the baud is in bit/s, 0 for that
+    of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` where the
+    protocol is unknown, or settings that it needs are missing. Tests have a clock of their own, s,
+    and ports in place of a `SerialPort`.
 
     """
 
@@ -265,12 +249,8 @@ class Connection:
                                 past.discarded_bytes + decoder.discarded_bytes)
 
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
-        """
-        Give samples as they arrive, until the event is set; the port is then closed.
-
-        While the port is missing, no chunk is given.
-
-        """
+        """Give samples as they arrive, until the event is set; the port is then closed."""
+        # While the port is missing, no chunk is given.
         try:
             while not stop.is_set():
                 try:
@@ -308,13 +288,9 @@ class Connection:
         return port
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
-        """
-        Find protocol and baud; they stay unknown only after a stop.
-
-        The port stays open, since opening it restarts many microcontrollers, which then need some
-        time until they send.
-
-        """
+        """Find protocol and baud; they stay unknown only after a stop."""
+        # The port stays open, since opening it restarts many microcontrollers, which then need
+        # some time until they send.
         self._set_state(ConnectionState('listening'))
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:

@@ -41,22 +41,14 @@ class Emulator:
 
     Use it as a context manager, which sends from a thread of its own, or call `emulate`, which
     sends until the samples end. Each sample is taken from the source after the one before it was
-    sent, so a source may be endless and may depend on commands. The first sample is sent at once.
-    Samples without a sequence are numbered from 0 on.
+    sent, so a source may be endless and may depend on commands. The first sample is sent at once,
+    or when a reader has opened the port. Samples have a time, s; those without a sequence are
+    numbered from 0 on.
 
-    Parameters
-    ----------
-    samples : each with its time, in seconds
-    speed : factor of real time; inf is the speed of the reader. Up to 1, bytes that are not read
-        are lost, as on a real line; above 1 the emulator waits for the reader.
-    link : path of a symbolic link to the pseudo-terminal, whose name differs from run to run; it
-        is removed at the end
-    wait_for_reader : whether to send the first sample only after a reader has opened the port
-
-    Raises
-    ------
-    ValueError : the speed is not above 0, or settings that the protocol needs are missing
-    FileExistsError : the path of the link exists and is not a link
+    The speed is a factor of real time; inf is the speed of the reader. Up to 1, bytes that are not
+    read are lost, as on a real line; above 1 the emulator waits for the reader. A symbolic link to
+    the pseudo-terminal, whose name differs from run to run, is removed at the end. Raise
+    `ValueError` where the speed is not above 0, or settings that the protocol needs are missing.
 
     """
 

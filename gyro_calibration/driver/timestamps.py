@@ -58,13 +58,7 @@ _CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, 
 
 
 class LowerLine:
-    """
-    The line below all points of the last 20 s with the least sum of distances.
-
-    Only the lowest point of each block of time is kept. The line is the edge of their lower hull
-    over their mean. With less than two points, the slope is the given one.
-
-    """
+    """The line below all points of the last 20 s with the least sum of distances."""
 
     def __init__(self, slope: float):
         self.slope = slope
@@ -84,6 +78,7 @@ class LowerLine:
         """Add a point that is not lower than the one before; x is larger than before."""
         if not self.points:
             self._begin, self._anchor = y, (x, y)
+        # only the lowest point of each block of time is kept
         if y - self._block_begin >= _LINE_WINDOW / _WINDOW_BLOCKS:
             self.points.append((x, y))
             self._block_begin = y
@@ -101,6 +96,7 @@ class LowerLine:
         self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
     def _fit(self) -> None:
+        # the edge of the lower hull over the mean; of a single point the given slope remains
         hull = _lower_hull(self.points)
         middle = sum(x for x, _ in self.points) / len(self.points)
         left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),
@@ -141,12 +137,8 @@ class _SampleCounter:
         self._outlier_time: float | None = None
 
     def advance(self, sample: Sample, max_advance: float) -> tuple[float, int]:
-        """
-        Return the advance to this sample, and the number of samples lost before it.
-
-        A time of the device beyond `max_advance` is wrong: the sample came too early.
-
-        """
+        """Return the advance to this sample, and the number of samples lost before it."""
+        # A time of the device beyond `max_advance` is wrong: the sample came too early.
         missing = sample.missing
         if self._modulus and sample.sequence is not None:
             last, self._sequence = self._sequence, sample.sequence
@@ -185,14 +177,7 @@ class _SampleCounter:
 
 
 class _LatenessTest:
-    """
-    Test whether samples have been late for so long that some must be lost.
-
-    Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly to a
-    period and falls to zero. So the step of the least lateness is tested; the lateness itself is
-    tested only after a longer time.
-
-    """
+    """Test whether samples have been late for so long that some must be lost."""
 
     def __init__(self) -> None:
         self.late_since: float | None = None
@@ -215,6 +200,8 @@ class _LatenessTest:
         if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
             self.late_since, self._first_number, self._least = arrival, number, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
+        # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
+        # to a period and falls to zero. So its step is tested, and itself after a longer time.
         self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
                                    else max(0.0, self._least_on_time))
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
@@ -234,9 +221,6 @@ class SampleClock:
     only: its clock is 2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0
     without one, and `min_stamp` the last stamp of another clock.
 
-    `lost_count` are the samples lost while the port was open: missing in the sequence or in the
-    time of the device, damaged, or shown by the lateness of all later samples.
-
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
@@ -247,6 +231,8 @@ class SampleClock:
         self._uncertain_losses, self._uncertain_since, self._newly_lost = 0, 0.0, 0
         self._last_stamp, self._last_arrival = min_stamp, -math.inf
         self._mean_squares = 0.0, 0.0
+        # while the port was open: missing in the sequence or in the time of the device, damaged,
+        # or shown by the lateness of all later samples
         self.lost_count = 0
 
     @property
@@ -388,15 +374,10 @@ def read_clock_pair(steady_clock: Callable[[], float],
 
 
 class ClockStepDetector:
-    """
-    Detects that a clock was set, by comparison with a steady one; all in s.
-
-    `count` is the number of steps, `last_step` the size of the last.
-
-    """
+    """Detects that a clock was set, by comparison with a steady one; all in s."""
 
     def __init__(self) -> None:
-        self.count, self.last_step = 0, 0.0
+        self.count = 0  # of steps
         self._steady_time = self._other_time = math.nan
 
     def update(self, steady_time: float, other_time: float) -> float:
@@ -406,17 +387,12 @@ class ClockStepDetector:
         self._steady_time, self._other_time = steady_time, other_time
         if not (abs(step) > _CLOCK_STEP_THRESHOLD or interval < -_CLOCK_STEP_THRESHOLD):
             return 0.0
-        self.count, self.last_step = self.count + 1, step
+        self.count += 1
         return step
 
 
 class NodeTimeConverter:
-    """
-    Conversion of a steady clock to that of a node, which may be set or simulated.
-
-    The difference is filtered, and taken at once where the clock was set.
-
-    """
+    """Conversion of a steady clock to that of a node, by a filtered difference of the two."""
 
     def __init__(self) -> None:
         self.steps = ClockStepDetector()
@@ -444,13 +420,7 @@ class NodeTimeConverter:
 
 
 class HostTimeConverter:
-    """
-    Conversion of stamps to a continuous time, s, also where the clock of the host is set.
-
-    A jump of the stamps is removed if the clock of the host has just made the same one against the
-    steady clock: one of `steps`.
-
-    """
+    """Conversion of stamps to a continuous time, s, less the jumps of the clock of the host."""
 
     def __init__(self) -> None:
         self.steps = ClockStepDetector()

@@ -21,7 +21,7 @@ repeats over many logs, wander does not.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import asdict, dataclass, replace
@@ -144,12 +144,8 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
 
     A log that is named several times is one entry. A table inside a folder is used as well; the
-    results of an earlier fleet, and of this one in `excluded_folder`, are not.
-
-    Raises
-    ------
-    InputError : there is none, or a table is wrong or contradicts another one
-    OSError : a table cannot be read
+    results of an earlier fleet, and of this one in `excluded_folder`, are not. Raise `InputError`
+    where there is none, or a table is wrong or contradicts another one.
 
     """
     found: dict[str, FleetLog] = {}
@@ -248,14 +244,7 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
 
 
 def compile_file_pattern(text: str) -> re.Pattern[str]:
-    """
-    Return the regular expression of a file name such as ``rc_car_{drive}_unit{unit}``.
-
-    Raises
-    ------
-    ValueError : it names no field, or an unknown one
-
-    """
+    """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `ValueError`."""
     parts = re.split(r'\{(\w*)\}', text)
     unknown = [name for name in parts[1::2] if name not in ENTRY_KEYS]
     if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
@@ -266,13 +255,8 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
 
 
 def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -> FleetLog:
-    """
-    Return an entry with its empty fields filled from file name, notes or metadata.
-
-    The order of precedence is: table, pattern of the user (by `compile_file_pattern`), notes and
-    metadata, usual file names.
-
-    """
+    """Return an entry with its empty fields filled from file name, notes or metadata."""
+    # in order of precedence: table, pattern of the user, notes and metadata, usual file names
     stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
@@ -364,15 +348,8 @@ def _duration(log: Log) -> float:
     return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
 
 
-def fit_slow_effects(log: Log, time_offset: float = 0.0,
-                     names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
-    """
-    Return the slow effects of a log in time, by name: value, standard deviation and unit.
-
-    The log has a reference, which the gyro lags by the time offset, s, or is at rest. `names` are
-    those of the effects; None for all.
-
-    """
+def fit_slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]]:
+    """Return the slow effects of a log in time, by name; the gyro lags its reference, if any."""
     assert log.time is not None
     heading = None
     if log.reference_heading is not None and np.isfinite(log.reference_heading).sum() > 1:
@@ -386,10 +363,9 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0,
     if len(spans.edges) < 10:
         return {}
     for name, unit, angle in _slow_effects(log, spans.edges):
-        if names is None or name in names:
-            value, deviation = spans.fit(np.diff(angle))
-            if math.isfinite(deviation) and deviation > 0.0:
-                found[name] = _value_record(value, deviation, unit)
+        value, deviation = spans.fit(np.diff(angle))
+        if math.isfinite(deviation) and deviation > 0.0:
+            found[name] = _value_record(value, deviation, unit)
     return found
 
 
@@ -434,12 +410,10 @@ def process_log(task: LogTask) -> dict[str, Any]:
     It is JSON data, and equal to the bit on all machines. A change of unit, type or drive in a
     table does not cause a new computation.
 
-    Returns
-    -------
     ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
     ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
     ``slow`` the same of effects that a single log does not distinguish from the wander of the
-    bias, each fitted alone; ``diagnosis`` a summary
+    bias, each fitted alone; ``diagnosis`` is a summary.
 
     """
     try:
@@ -527,11 +501,7 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
 
     A log in time with a reference heading is calibrated by `calibrate_encoder`, which finds the
     offset and its standard deviation, s; a log at rest gives the bias only, and any other one is
-    calibrated by dwells.
-
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
+    calibrated by dwells. Raise `DataRefused` with the reason and the remedy.
 
     """
     if log.output is None:

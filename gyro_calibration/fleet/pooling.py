@@ -86,10 +86,6 @@ class Observations:
         ones = np.ones((len(self.value), 1))
         return np.hstack([ones, self.columns]) if self.columns.size else ones
 
-    def add_column(self, column: Array) -> Observations:
-        """Return the same with one more fixed effect."""
-        return replace(self, columns=np.column_stack([self.fixed_effects[:, 1:], column]))
-
 
 @dataclass(frozen=True)
 class Interval:
@@ -225,11 +221,6 @@ class PooledValue:
     more : name of a variance -> its multiple that is added, for quantities that are not estimated,
         such as the next power-on
 
-    Attributes
-    ----------
-    observed : the values
-    variance_names : of the variances that the logs distinguish
-
     """
 
     def __init__(self, observed: Observations):
@@ -304,12 +295,8 @@ class PooledValue:
         return best
 
     def _sample_variances(self) -> tuple[Array, Array]:
-        """
-        Return points of the variances, shape (points, names), and their weights.
-
-        Each coordinate is drawn by a slice through the likeliest point.
-
-        """
+        """Return points of the variances, shape (points, names), and their weights."""
+        # Each coordinate is drawn by a slice through the likeliest point.
         if not self.variance_names:
             return np.empty((1, 0)), np.ones(1)
         uniform = qmc.Halton(len(self.variance_names), scramble=False).random(
@@ -401,9 +388,8 @@ class PooledValue:
         """
         Add the most significant one of several fixed effects.
 
-        Returns
-        -------
-        its place, the value pooled with it, its size, and the p-value of the largest of so many
+        Return its place, the value pooled with it, its size, and the p-value of the largest of so
+        many.
 
         """
         scores, none = [], np.array([-1])
@@ -415,7 +401,8 @@ class PooledValue:
                                             np.zeros(equations.parts))
             scores.append(abs(mean[0, 0]) / math.sqrt(variance[0, 0]))
         place = int(np.argmax(scores))
-        extended = PooledValue(self.observed.add_column(columns[place].astype(float)))
+        effects = np.column_stack([self.observed.fixed_effects[:, 1:], columns[place]])
+        extended = PooledValue(replace(self.observed, columns=effects))
         row = np.eye(len(extended._column_scales))[-1:]
         return (place, extended, float(extended.estimate(fixed=row).value[0]),
                 min(float(extended.p_value(fixed=row)[0]) * len(columns), 1.0))

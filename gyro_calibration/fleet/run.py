@@ -90,10 +90,8 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
     """
     Give a function that makes executors of a Dask cluster.
 
-    Raises
-    ------
-    ImportError : `distributed` is not installed
-    OSError, ValueError : no scheduler answers at the address, or it is no address
+    Raise `ImportError` where `distributed` is not installed, `OSError` or `ValueError` where no
+    scheduler answers at the address, or it is none.
 
     """
     from distributed import Client
@@ -153,8 +151,3 @@ def _describe_failure(error: Exception) -> str:
         return ('its worker was killed, perhaps since memory ran out; check the log, '
                 'or give --workers 1')
     return f'its worker failed ({type(error).__name__}: {str(error)[:200]})'
-
-
-def count_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return max(len(os.sched_getaffinity(0)), 1)

@@ -585,12 +585,8 @@ def _dates_chart(summary: TypeSummary, value: ValueSummary, key: str) -> Chart:
 
 def table_files(types: Sequence[TypeSummary],
                 records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
-    """
-    Return the content of files by name: values of logs, and of units, one row each, in SI.
-
-    They are CSV, and Parquet where pyarrow is installed.
-
-    """
+    """Return the content of files by name: values of logs, and of units, one row each, in SI."""
+    # They are CSV, and Parquet where pyarrow is installed.
     found = {}
     for name, rows in (('logs', list(map(_log_row, records))), ('units', list(_unit_rows(types)))):
         columns = list(dict.fromkeys(key for row in rows for key in row))

@@ -80,51 +80,25 @@ _SIZE_PROBABILITIES = np.array(
 
 @dataclass(frozen=True)
 class Prior:
-    """
-    Prior knowledge of a gyro.
+    """Prior knowledge of a gyro: standard deviations of the bias, and distances."""
 
-    Attributes
-    ----------
-    coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D
-        data sheet: 0.03 deg/s/K)
-    correlation_length : correlation length of the coefficient, K
-    compensated_share : share of the coefficient that remains inside the range of a model with
-        temperature effects, 1
-    turn_on : standard deviation of the bias from one run to the next, rad/s
-    ageing : standard deviation of the bias at one temperature in a year, beyond the model's noise,
-        rad/s
-    unknown_distance : assumed distance of an unknown temperature, K
-
-    """
-
-    coefficient: float = 0.03 * DEGREE
-    correlation_length: float = 15.0
-    compensated_share: float = 0.1
-    turn_on: float = 0.05 * DEGREE
-    ageing: float = 0.02 * DEGREE
-    unknown_distance: float = 15.0
+    coefficient: float = 0.03 * DEGREE  # with temperature, rad/s/K (data sheet of the L3G4200D)
+    correlation_length: float = 15.0  # of the coefficient, K
+    compensated_share: float = 0.1  # of the coefficient within the range of a compensating model
+    turn_on: float = 0.05 * DEGREE  # from one run to the next, rad/s
+    ageing: float = 0.02 * DEGREE  # at one temperature in a year, beyond the noise, rad/s
+    unknown_distance: float = 15.0  # assumed of an unknown temperature, K
 
 
 @dataclass(frozen=True)
 class Entry:
-    """
-    Mean bias at rest in one run and one temperature bin.
+    """Mean bias at rest in one run and one temperature bin."""
 
-    Attributes
-    ----------
-    temperature : degC
-    bias : rad/s, after the model and before the self-calibration
-    variance : of the bias as a mean around `time`, (rad/s)²
-    time : of the last of these rests, s since 1970
-    run : number of the run of the gyro; between whole numbers for a calibration between runs
-
-    """
-
-    temperature: float
-    bias: float
-    variance: float
-    time: float
-    run: float
+    temperature: float  # degC
+    bias: float  # rad/s, after the model and before the self-calibration
+    variance: float  # of the bias as a mean around `time`, (rad/s)²
+    time: float  # of the last of these rests, s since 1970
+    run: float  # number of the run; between whole numbers for a calibration between runs
 
 
 @dataclass(frozen=True)
@@ -140,17 +114,7 @@ _Dated = TypeVar('_Dated', Entry, Jump)
 
 
 class BiasTable:
-    """
-    Biases at rest over temperature, of one gyro behind one model.
-
-    Attributes
-    ----------
-    digest : of the model that it belongs to
-    entries, jumps : of all runs
-    run : number of the present run
-    held_back_count : number of estimates that were not used so far
-
-    """
+    """Biases at rest over temperature, of one gyro behind one model with a digest."""
 
     def __init__(self, model: GyroModel, prior: Prior | None = None,
                  entries: Sequence[Entry] = (), jumps: Sequence[Jump] = ()):
@@ -160,7 +124,7 @@ class BiasTable:
         self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
                             *(each.run for each in jumps)])
         self._first_run = self.run
-        self.held_back_count = 0
+        self.held_back_count = 0  # of estimates not used so far
         self._model, self._prior = model, prior or Prior()
         self._held_entries: list[Entry] = []
         self._written_entries, self._write_time = tuple(self.entries), -math.inf
@@ -181,18 +145,11 @@ class BiasTable:
 
     def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
         """
-        Add the bias of a rest.
+        Add the bias of a rest; return a sentence why it is not used, or that it jumped, or ''.
 
-        Parameters
-        ----------
-        temperature : degC
-        bias : mean of the rate after the model and before the self-calibration, rad/s
-        variance : of that mean by white noise, (rad/s)²; the wander of the bias is added here
-        time : s since 1970
-
-        Returns
-        -------
-        '', or a sentence why the bias is not used, or that it jumped
+        It is the mean of the rate after the model and before the self-calibration, rad/s, with its
+        variance by white noise, (rad/s)²; the wander of the bias is added here. The temperature is
+        in degC, the time in s since 1970.
 
         """
         given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
@@ -236,28 +193,24 @@ class BiasTable:
     def _add_entry(self, given: Entry) -> None:
         for place, entry in enumerate(self.entries):
             if entry.run == given.run and _bin_number(entry) == _bin_number(given):
-                self.entries[place] = self._merge_entries(entry, given)
+                # with the older aged until the newer
+                older = entry.variance + self._wander_variance(given.time - entry.time)
+                weight = float(older / (older + given.variance))
+                self.entries[place] = replace(
+                    given, bias=entry.bias + weight * (given.bias - entry.bias),
+                    variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
+                    temperature=(entry.temperature
+                                 + weight * (given.temperature - entry.temperature)))
                 return
         self.entries.append(given)
         if len(self.entries) > MAX_ENTRIES:
-            self._drop_oldest_entry()
-
-    def _merge_entries(self, entry: Entry, given: Entry) -> Entry:
-        """Return both as one entry at the time of the newer, with the older aged until then."""
-        older = entry.variance + self._wander_variance(given.time - entry.time)
-        weight = float(older / (older + given.variance))
-        return replace(
-            given, bias=entry.bias + weight * (given.bias - entry.bias),
-            variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
-            temperature=entry.temperature + weight * (given.temperature - entry.temperature))
-
-    def _drop_oldest_entry(self) -> None:
-        """Drop the oldest entry of the fullest bin, and the jumps that no entry precedes."""
-        (fullest, _), = Counter(map(_bin_number, self.entries)).most_common(1)
-        self.entries.remove(min((each for each in self.entries if _bin_number(each) == fullest),
-                                key=lambda each: (each.run, each.time)))
-        first = min(each.run for each in self.entries)
-        self.jumps = [each for each in self.jumps if each.run > first]
+            # the oldest of the fullest bin, and the jumps that no entry precedes
+            (fullest, _), = Counter(map(_bin_number, self.entries)).most_common(1)
+            self.entries.remove(min(
+                (each for each in self.entries if _bin_number(each) == fullest),
+                key=lambda each: (each.run, each.time)))
+            first = min(each.run for each in self.entries)
+            self.jumps = [each for each in self.jumps if each.run > first]
 
     def predict(self, temperature: float, time: float) -> tuple[float, float]:
         """Return the bias in this run, rad/s, and its variance, (rad/s)²; 0 and inf if unknown."""
@@ -304,20 +257,11 @@ class BiasTable:
         It is combined with the table as one more estimate of the bias, at its own temperature and
         time. It is for the start of a run, or the restart of a tracker; within a run a
         `TemperatureCorrection` continues from there. The result includes the age: it is to be used
-        as a calibration made at present.
+        as a calibration made at present, and not to be stored. A sentence for diagnostics, '' if
+        neither age nor temperature matters, is returned too.
 
-        Parameters
-        ----------
-        calibration : as it was stored, with a covariance
-        age : of the calibration, s
-        time : now, s since 1970
-        temperature : now, degC; None where it is not known
-        this_run : the calibration was made in this run
-
-        Returns
-        -------
-        the calibration with the present bias and covariance, to be used and not to be stored; and
-        a sentence for diagnostics if age or temperature matters, else ''
+        The age is in s, the present time in s since 1970, and the present temperature in degC,
+        None where it is not known; `this_run` tells that the calibration was made in this run.
 
         """
         assert calibration.covariance is not None
@@ -357,26 +301,17 @@ class BiasTable:
         return (float(_SIZE_PROBABILITIES @ _SIZES[:, 0] ** 2)
                 * (self._prior.coefficient * self._prior.unknown_distance) ** 2)
 
-    def _prior_coefficient(self) -> float:
-        """Return the prior temperature coefficient within the range of the model, rad/s/K."""
-        return self._prior.coefficient * (
-            self._prior.compensated_share if self._model.uses_channel('temperature') else 1.0)
-
     def _temperature_variance(self, here: Array | float, there: Array) -> Array:
         """Return the variance of the bias between temperatures, (rad/s)², shape (sizes, ...)."""
-        inside = (self._prior_coefficient() ** 2
-                  * _mean_square_change(there - here, self._prior.correlation_length))
-        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, inside)
-                          + self._out_of_range_variance(here, there))
-
-    def _out_of_range_variance(self, here: Array | float, there: Array) -> Array | float:
-        """Return the part of that variance from outside the temperature range of the model."""
-        if not self._model.uses_channel('temperature'):
-            return 0.0
-        low, high = self._model.temperature_range
-        below = np.minimum(there - low, 0.0) - np.minimum(here - low, 0.0)
-        above = np.maximum(there - high, 0.0) - np.maximum(here - high, 0.0)
-        return self._prior.coefficient ** 2 * (below ** 2 + above ** 2)
+        inside, outside, coefficient = self._prior.coefficient, 0.0, self._prior.coefficient
+        if self._model.uses_channel('temperature'):
+            inside = coefficient * self._prior.compensated_share
+            low, high = self._model.temperature_range
+            below = np.minimum(there - low, 0.0) - np.minimum(here - low, 0.0)
+            above = np.maximum(there - high, 0.0) - np.maximum(here - high, 0.0)
+            outside = coefficient ** 2 * (below ** 2 + above ** 2)
+        change = inside ** 2 * _mean_square_change(there - here, self._prior.correlation_length)
+        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, change) + outside)
 
     def _wander_variance(self, age: Array | float) -> Any:
         """Return the variance of the wander of the bias by the noise of the gyro, (rad/s)²."""
@@ -411,18 +346,12 @@ class BiasTable:
             -np.abs(_pairwise_differences(temperatures)) / self._prior.correlation_length)
         ageing = self._prior.ageing ** 2 / YEAR * alike * np.minimum(age[:, None], age)
         fixed = (_covariance_of_differences(self._wander_variance(age), wander)
-                 + np.diag(variances) + ageing + self._jump_covariance(runs))
+                 + np.diag(variances) + ageing)
+        for jump in self.jumps:  # shared by all entries before it
+            fixed += jump.variance * np.outer(runs < jump.run, runs < jump.run)
         by_run = (self._prior.turn_on ** 2
                   * _covariance_of_differences(2.0 * (runs != self.run), 2.0 * runs_apart))
         return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
-
-    def _jump_covariance(self, runs: Array) -> Array:
-        """Return the covariance by jumps, (rad/s)², shape (n, n), shared by all before a jump."""
-        total = np.zeros((len(runs), len(runs)))
-        for each in self.jumps:
-            before = runs < each.run
-            total += each.variance * np.outer(before, before)
-        return total
 
     def is_write_due(self, now: float, ending: bool = False) -> bool:
         """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
@@ -440,23 +369,13 @@ class BiasTable:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """
-    Estimates of the bias at one temperature, for each of the sizes.
+    """Estimates of the bias at one temperature, for each of the sizes."""
 
-    Attributes
-    ----------
-    probability : probability of each size, shape (sizes,)
-    mean : of the biases less that of the first entry, rad/s, shape (sizes,)
-    information : 1 over the variance of the mean, shape (sizes,)
-    inverse_times_ones, inverse_times_residual : the inverse covariance times ones, and times the
-        deviations of the entries from the mean, shape (sizes, n)
-    inverse : of the covariance, shape (sizes, n, n)
-
-    """
-
-    probability: Array
-    mean: Array
-    information: Array
+    probability: Array  # of each size, shape (sizes,)
+    mean: Array  # of the biases less that of the first entry, rad/s, shape (sizes,)
+    information: Array  # 1 over the variance of the mean, shape (sizes,)
+    #: The inverse covariance times ones, and times the deviations of the entries from the mean,
+    #: shape (sizes, n); and itself, shape (sizes, n, n).
     inverse_times_ones: Array
     inverse_times_residual: Array
     inverse: Array
@@ -469,24 +388,10 @@ def _mixture_moments(probability: Array, means: Array, variances: Array) -> tupl
 
 
 class TemperatureCorrection:
-    """
-    Change of the bias from one temperature to others, by a bias table as it is now.
-
-    Later entries of the table come from rests that the tracker has used itself. So they are not
-    used here until the tracker is restarted.
-
-    """
+    """Change of the bias from one temperature to others, by a bias table as it is now."""
 
     def __init__(self, table: BiasTable, begin: float, now: float, coefficient: float):
-        """
-        Begin at a temperature, degC.
-
-        Parameters
-        ----------
-        now : s since 1970
-        coefficient : standard deviation in which distances are counted, rad/s/K; above 0
-
-        """
+        """Begin at a temperature, degC, now, s since 1970, with a coefficient above 0, rad/s/K."""
         self.start_temperature = begin
         self._steps = begin + np.arange(-_MAX_DISTANCE, _MAX_DISTANCE + 0.5, 0.5)
         self._changes, variances = table.bias_difference(begin, self._steps, now)
@@ -499,13 +404,9 @@ class TemperatureCorrection:
 
 
 def _mean_square_change(distance: Array | float, length: float) -> Any:
-    """
-    Return the mean square, K², of the integral of a process of variance 1 over a distance.
-
-    Its covariance is (1 + |d|/length) exp(-|d|/length). Its paths have a slope, unlike those of a
-    Gauss-Markov process: the bias over temperature is as smooth.
-
-    """
+    """Return the mean square, K², of the integral of a process of variance 1 over a distance."""
+    # Its covariance is (1 + |d|/length) exp(-|d|/length). Its paths have a slope, unlike those of
+    # a Gauss-Markov process: the bias over temperature is as smooth.
     lengths = np.abs(distance) / length
     return 2.0 * length ** 2 * (2.0 * lengths - 3.0 + (3.0 + lengths) * np.exp(-lengths))
 
@@ -556,10 +457,8 @@ def read_bias_table(path: str | Path, model: GyroModel,
     """
     Read the table of earlier runs at the begin of a run.
 
-    Returns
-    -------
-    the table, and '' or a sentence why it is empty although there is a file; such a file is kept
-    under another name when a new one is written
+    A sentence says why it is empty although there is a file, which is kept under another name when
+    a new one is written; else it is ''.
 
     """
     try:
@@ -580,18 +479,10 @@ def read_bias_table(path: str | Path, model: GyroModel,
 def write_bias_table(path: str | Path, table: BiasTable,
                      now: float) -> tuple[str, tuple[int, int]]:
     """
-    Write a table completely or not at all.
+    Write a table completely or not at all, as `files.write_atomically`; return its version.
 
-    A file in its place that is unreadable or not of this model is kept under another name.
-
-    Returns
-    -------
-    '', or in a sentence under which name the old file is kept; and the version that was written,
-    as `files.write_atomically` does
-
-    Raises
-    ------
-    OSError : the folder cannot be written to; the old file is as it was, or has its other name
+    A file in its place that is unreadable or not of this model is kept under another name, in a
+    sentence that is returned first, else ''. Raise `OSError` where the folder is not writable.
 
     """
     message = _keep_aside(Path(path), table.digest)

@@ -20,7 +20,7 @@ robot drives, and adds the bias at rest to the table for the next run.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import math
@@ -64,22 +64,13 @@ MAX_SPECIFIC_FORCE = 1e5
 
 @dataclass(frozen=True)
 class Assumptions:
-    """
-    Standard deviations of uncalibrated values, and of the bias at temperatures without data.
+    """Standard deviations of uncalibrated values, and of the bias at temperatures without data."""
 
-    The variance of the tracker contains only the errors that it is given.
-
-    Attributes
-    ----------
-    bias : of an uncalibrated gyro, rad/s
-    scale_factor_error : of an uncalibrated gyro, 1
-    bias_temperature_coefficient : rad/s/K; 0 for a gyro with temperature compensation
-
-    """
-
-    bias: float = 0.5 * DEGREE
+    # the variance of the tracker contains only the errors that it is given
+    bias: float = 0.5 * DEGREE  # rad/s
     scale_factor_error: float = 0.03
-    bias_temperature_coefficient: float = 0.03 * DEGREE
+    #: rad/s/K; 0 for a gyro with temperature compensation.
+    bias_temperature_coefficient: float = Prior.coefficient
 
     @property
     def covariance(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -100,24 +91,13 @@ def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroM
 
 @dataclass
 class _RestStretch:
-    """
-    Samples at rest, as sums.
+    """Samples at rest, as sums."""
 
-    Attributes
-    ----------
-    start_time : stamp of the first, s
-    sensitivity : of the rate to each uncertain value at the end, shape (m,)
-    count, rate_sum, temperature_sum : number, and sums of rates after the model, rad/s, and of
-        temperatures, degC
-    has_ended : whether the rest has ended
-
-    """
-
-    start_time: float
-    sensitivity: Array
+    start_time: float  # stamp of the first, s
+    sensitivity: Array  # of the rate to each uncertain value at the end, shape (m,)
     count: int = 0
-    rate_sum: float = 0.0
-    temperature_sum: float = 0.0
+    rate_sum: float = 0.0  # after the model, rad/s
+    temperature_sum: float = 0.0  # degC
     has_ended: bool = False
 
 
@@ -125,42 +105,17 @@ class HeadingEstimator:
     """
     Estimate the heading of a robot.
 
-    Attributes
-    ----------
-    model : with the stored calibration
-    current_model : the model with the present calibration, by which samples are compensated
-    covariance : of the temperature coefficient of the bias and of the uncertain values of the
-        current model, shape (m, m)
-    tracker : of the heading
-    table : of biases at rest
-    is_calibrated_this_run : whether the calibration was made in this run
-    temperature : last temperature, degC; None before the first
-    rate : last rate, rad/s; zero at rest
-    corrected_rate : last rate before the tracker, rad/s
-    last_compensated : result of the compensation of the last sample
-    restart_count : number of starts of the tracker
-    refused_count : number of implausible samples, which are not used and count as lost
-    refused_temperature_count : number of implausible temperatures, which are not used
+    `model` has the stored calibration, `current_model` the present one, by which samples are
+    compensated. `covariance`, shape (m, m), is that of the temperature coefficient of the bias and
+    of the uncertain values of the current model. `rate` is the last one, rad/s, zero at rest, and
+    `corrected_rate` that before the tracker. `temperature`, degC, is None before the first.
 
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
-                 settings: Settings, temperature_timeout: float, now: float, keep: bool = False):
-        """
-        Begin at heading zero.
-
-        Parameters
-        ----------
-        model : with its stored self-calibration, if it has one
-        assumptions : of uncalibrated values
-        settings : of the tracker
-        temperature_timeout : an older temperature is held, and counts as less and less known, s
-        now : s since 1970
-        keep : the steps of the tracker, for `log_compensation.smooth_track`
-
-        """
-        self._assumptions, self._settings = assumptions, settings
-        self._temperature_timeout, self._keeps_steps = temperature_timeout, keep
+                 settings: Settings, now: float, keep: bool = False):
+        """Begin at heading zero, now, s since 1970; `keep` steps for `smooth_track`."""
+        self._assumptions, self._settings, self._keeps_steps = assumptions, settings, keep
         self.temperature: float | None = None
         self._temperature_time, self._follows_temperature = -math.inf, False
         self.is_calibrated_this_run = self._age_changed = False
@@ -173,15 +128,9 @@ class HeadingEstimator:
         self._pending_stretches: deque[_RestStretch] = deque(maxlen=8)
         self._table_message = ''
         self.model, self.table = model, table
-        self._tracker: HeadingTracker | None = None
         self._history = model.start_history()
+        self.tracker: HeadingTracker  # of the first start
         self._restart(now)
-
-    @property
-    def tracker(self) -> HeadingTracker:
-        """Return the tracker of the heading."""
-        assert self._tracker is not None
-        return self._tracker
 
     def use_calibration(self, model: GyroModel, now: float) -> None:
         """Use a self-calibration that was made just now; the heading does not jump."""
@@ -235,11 +184,11 @@ class HeadingEstimator:
         slope = None if self.current_model.needs_history else np.subtract(
             *(self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
               for rate in (DEGREE, 0.0))) / DEGREE
-        if self._tracker is None:
-            self._tracker = HeadingTracker(self.current_model.noise, self.covariance,
-                                           self._settings, age, self._keeps_steps, slope)
+        if self.restart_count:
+            self.tracker.use_calibration(self.current_model.noise, self.covariance, age, slope)
         else:
-            self._tracker.use_calibration(self.current_model.noise, self.covariance, age, slope)
+            self.tracker = HeadingTracker(self.current_model.noise, self.covariance,
+                                          self._settings, age, self._keeps_steps, slope)
         self._start_time = now
         self._start_correction(now)
         self._unknown_since = (self._time if is_fresh and not self._follows_temperature
@@ -260,13 +209,9 @@ class HeadingEstimator:
                             if here is not None and coefficient else None)
 
     def _resume_temperature(self, now: float, around: Channels | None) -> None:
-        """
-        Continue at the first temperature with a calibration of this run made without one.
-
-        It was made after the model at the temperature that was assumed up to the last sample. The
-        different output of the model at the present temperature is not a change of the rate.
-
-        """
+        """Continue at the first temperature with a calibration of this run made without one."""
+        # It was made after the model at the temperature that was assumed up to the last sample.
+        # The different output of the model at the present temperature is not a change of the rate.
         here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
         last = self.last_compensated.temperature
         before = None if around is None else replace(around, temperature=last)
@@ -368,21 +313,11 @@ class HeadingEstimator:
     def add(self, time: float, output: float, now: float, force: float | None = None,
             wheels: bool | None = None, supply: float | None = None) -> str:
         """
-        Take a sample.
+        Take a sample; return why the integration began anew with it, or ''.
 
-        Parameters
-        ----------
-        time : stamp, s
-        output : rad/s
-        now : s since 1970
-        force : specific force, m/s², if it came
-        wheels : whether wheels or commands move the robot; None where unknown
-        supply : voltage, V, if it came
-
-        Returns
-        -------
-        '', or why the integration began anew with this sample; where the sample is refused, only
-        `refused_count` grows
+        Stamp and present date are in s, the output in rad/s, the specific force in m/s² and the
+        supply in V, where they came; `wheels` tells whether wheels or commands move the robot,
+        None where unknown. Where the sample is refused, only `refused_count` grows.
 
         """
         if not self.is_plausible(time, output, force):
@@ -453,17 +388,13 @@ class HeadingEstimator:
     @property
     def _temperature_lateness(self) -> float:
         """Return the time since the temperature is too old, s."""
-        return abs(self._time - self._temperature_time) - self._temperature_timeout
+        return abs(self._time - self._temperature_time) - TEMPERATURE_TIMEOUT
 
     def _follow_channels(self, interval: float, force: float | None,
                          supply: float | None) -> Channels:
-        """
-        Return the channels of effects other than rate, output and temperature.
-
-        Time increases with the stamps, also over gaps, and is constant when they jump back. The
-        heading is that of the tracker without its resets, extrapolated to this sample.
-
-        """
+        """Return the channels of effects other than rate, output and temperature."""
+        # Time increases with the stamps, also over gaps, and is constant when they jump back. The
+        # heading is that of the tracker without its resets, extrapolated to this sample.
         interval = max(interval, 0.0) if interval < math.inf else 0.0
         self._elapsed += interval
         ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
@@ -479,18 +410,10 @@ class HeadingEstimator:
         """
         Take the samples of a log, with the same result as one by one.
 
-        Parameters
-        ----------
-        time, output : s and rad/s, shape (n,)
-        start_time : date of time 0, s since 1970
-        temperature : degC; nan where none came, and None for none at all
-        wheels, force, supply : as in `add`, n of them, or None
-
-        Returns
-        -------
-        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker,
-        and 1 where the temperature was clipped and where the output is beyond the range of the
-        model, shape (n, 8)
+        The arguments are arrays of those of `add`, or None; the start time is the date of time 0,
+        s since 1970, and a temperature that did not come is nan. The result, shape (n, 8), has
+        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker, and 1
+        where the temperature was clipped and where the output is beyond the range of the model.
 
         """
         found, place = np.empty((len(time), 8)), 0
@@ -606,14 +529,7 @@ class HeadingEstimator:
             self._stretch = None
 
     def update_table(self, now: float, ending: bool = False) -> str:
-        """
-        Add the bias of complete stretches of rest to the table; to be called regularly.
-
-        Returns
-        -------
-        '', or the message of the table since the last call
-
-        """
+        """Add the bias of complete rests to the table, regularly; return its message, or ''."""
         self._add_to_table(now, self.tracker.is_resting and not ending)
         message, self._table_message = self._table_message, ''
         return message
@@ -624,13 +540,9 @@ class HeadingEstimator:
             each.has_ended = True
 
     def _add_to_table(self, now: float, resting: bool) -> None:
-        """
-        Add the bias of complete stretches of rest to the table.
-
-        A stretch is pending until the next one is complete, or the rest or the run has ended: by
-        then the tracker has detected a slow turn.
-
-        """
+        """Add the bias of complete stretches of rest to the table."""
+        # A stretch is pending until the next one is complete, or the rest or the run has ended: by
+        # then the tracker has detected a slow turn.
         while len(self._pending_stretches) > resting:
             stretch = self._pending_stretches.popleft()
             bias, temperature = (total / stretch.count
@@ -646,24 +558,15 @@ class HeadingEstimator:
                 self._restart(now)
 
     def _expected_bias(self, temperature: float, seen: Array) -> tuple[float, float]:
-        """
-        Return bias at a temperature and its standard deviation by the tracker at present, rad/s.
-
-        It is the bias after the model and before the self-calibration. When a stretch is tested,
-        its rest may be over, and the temperature may have changed.
-
-        """
+        """Return bias at a temperature and its deviation by the tracker at present, rad/s."""
+        # It is the bias after the model and before the self-calibration. When a stretch is tested,
+        # its rest may be over, and the temperature may have changed.
         calibration = self.current_model.self_calibration or SelfCalibration()
         change = self._bias_shift
         if self._correction is not None:
             change += float(self._correction.change_at(temperature)[0])
         off, deviation = self.tracker.bias_for(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
-
-    def missing_channels(self, available: Collection[str]) -> list[str]:
-        """Return the channels that the model needs and that no message contains."""
-        return [channel for channel in ('supply', 'specific_force')
-                if self.current_model.uses_channel(channel) and channel not in available]
 
 
 def _lost_temperature_distance(delay: float) -> float:

@@ -31,7 +31,7 @@ from collections import deque
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -48,19 +48,11 @@ _SHORT_RATIO, _MIN_BURST_SHARE = 0.5, 0.1
 
 
 class Intervals:
-    """
-    The usual interval of stamps that may jitter or come in bursts, and the samples lost in others.
-
-    Attributes
-    ----------
-    usual_interval : s; inf while it is not known
-    lost_samples : samples lost so far
-    longest_gap : gap, s; 0 where there was none
-
-    """
+    """The usual interval of stamps, with jitter or bursts, and the samples lost in others."""
 
     def __init__(self) -> None:
         """Begin with nothing known."""
+        # usual interval, s, and longest gap, s; inf and 0 where there is none
         self.usual_interval, self.lost_samples, self.longest_gap = math.inf, 0, 0.0
         self._history: deque[float] = deque(maxlen=_MAX_INTERVALS)
         self._until_update, self._gap_limit = _MIN_INTERVALS, math.inf
@@ -76,11 +68,9 @@ class Intervals:
 
     def add_many(self, intervals: Array) -> tuple[Array, Array]:
         """
-        Take intervals, s, as `add` does one by one.
+        Take intervals, s, as `add` does one by one, and return two arrays of shape (n,).
 
-        Returns
-        -------
-        usual interval after each, s, and number of samples lost in it, shape (n,) each
+        They are the usual interval after each, s, and the number of samples lost in it.
 
         """
         taken, usual, lost = 0, np.empty(len(intervals)), np.zeros(len(intervals), int)
@@ -135,11 +125,8 @@ def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[in
     """
     Return the numbers of samples up to the ends of blocks of `length` s or slightly longer.
 
-    Parameters
-    ----------
-    intervals : before each sample, s
-    length : s
-    elapsed : elapsed duration of the first block, s
+    The intervals are those before each sample; `elapsed` is the duration of the first block so
+    far, s.
 
     """
     until, ends = np.cumsum(intervals).tolist(), list[int]()
@@ -156,11 +143,8 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
     """
     Return the variances of an integral over gaps by motion, and additional ones by noise, rad².
 
-    Parameters
-    ----------
-    usual : interval, s
-    lost : number of samples
-    interval, step : between the samples around a gap, s, and change of the rate, rad/s
+    Given are the usual interval, s, the number of lost samples, and the interval, s, and the step
+    of the rate, rad/s, between the samples around a gap.
 
     """
     ends = noise.angle_random_walk ** 2 / usual
@@ -181,12 +165,8 @@ def varied_variance(noise: Noise, usual: float, interval: float, time: Array,
     Return the variance of an integral over a gap, rad², where the rate varies as before it.
 
     The ends of a gap do not show a vibration. It is the mean square of the same error over all
-    intervals of this length without the gap, less that by noise.
-
-    Parameters
-    ----------
-    usual, interval : usual interval, and that between the samples around the gap, s
-    time, rate : in the seconds before the gap, s and rad/s, shape (n,)
+    intervals of this length without the gap, less that by noise. Given are the usual interval, and
+    that of the gap, s, and samples before it, s and rad/s, shape (n,).
 
     """
     ends = time[time >= time[0] + interval]
@@ -200,32 +180,17 @@ def varied_variance(noise: Noise, usual: float, interval: float, time: Array,
 
 @dataclass(frozen=True)
 class Threshold:
-    """
-    Settings of the threshold filter (Hong and Park, eq. 12).
+    """Settings of the threshold filter (Hong and Park, eq. 12)."""
 
-    Attributes
-    ----------
-    rate : rad/s; below it the robot is taken to be at rest; 0 disables the filter
-    window : s; the mean over it is compared with the rate. 0 compares single samples, as published
-    angle_random_walk : rad/√s; a window whose standard deviation exceeds three times that of this
-        noise is motion, whatever its mean; 0 disables this test
-
-    """
-
-    rate: float = 0.3 * DEGREE
-    window: float = 0.2
+    rate: float = 0.3 * DEGREE  # rad/s; below it the robot is at rest; 0 disables the filter
+    window: float = 0.2  # s, of the mean that is compared; 0: single samples, as published
+    #: rad/√s; a window whose standard deviation exceeds three times that of this noise is motion,
+    #: whatever its mean; 0 disables this test.
     angle_random_walk: float = 0.0
 
 
 class ThresholdFilter:
-    """
-    Set the rate to zero while the robot is at rest, sample by sample.
-
-    The published filter uses single samples. With the noise of a cheap gyro this has little effect
-    at rest, so the mean over a short window is used here. A turn slower than the threshold is
-    lost; the caller counts the deleted heading.
-
-    """
+    """Set the rate to zero at rest, sample by sample; the caller counts the deleted heading."""
 
     def __init__(self, settings: Threshold):
         """Begin with an empty window."""
@@ -240,9 +205,6 @@ class ThresholdFilter:
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
         if not self.settings.rate:
             return rate
-        return 0.0 if self._is_standing(time, rate) else rate
-
-    def _is_standing(self, time: float, rate: float) -> bool:
         window = self._window
         window.append((time, min(max(rate, -MAX_RATE), MAX_RATE)))
         while window[0][0] <= time - self.settings.window and len(window) > 1:
@@ -251,25 +213,17 @@ class ThresholdFilter:
         rates = [each for _, each in window]
         mean = sum(rates) / len(rates)
         if not abs(mean) < self.settings.rate:
-            return False
+            return rate
         # motion if the window varies by more than the noise
         explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
         variance = sum(each * each for each in rates) / len(rates) - mean * mean
-        return not 0.0 < explained < variance * (time - window[0][0])
+        return rate if 0.0 < explained < variance * (time - window[0][0]) else 0.0
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
-    heading = np.empty(len(time))
-    heading[:1] = begin
-    for first in range(1, len(time), CACHE_BLOCK_SAMPLES):
-        end = min(first + CACHE_BLOCK_SAMPLES, len(time))
-        turned = np.add(rate[first:end], rate[first - 1:end - 1], out=heading[first:end])
-        turned *= time[first:end] - time[first - 1:end - 1]
-        turned *= 0.5
-        turned[0] += heading[first - 1]
-        np.cumsum(turned, out=turned)
-    return heading
+    steps = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
+    return np.cumsum(np.append(begin, steps))[:len(time)]
 
 
 def integrate_with_curvature(time: Array, rate: Array) -> Array:
@@ -304,32 +258,22 @@ class BlockIntegrator:
     The result is that of a `tracker.HeadingTracker` that does not detect rest. Over a gap longer
     than `MAX_GAP` nothing is integrated: the robot may have turned to any direction.
 
-    Attributes
-    ----------
-    intervals : of the samples, with the number of lost ones
-
     """
 
     def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
         """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
         self._settings, self._noise, self._covariance = settings, noise, covariance
         self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
-        self._last_rows: Array = np.zeros((2 + len(covariance), 0))
-        self._integrals: Array = np.zeros(2 + len(covariance))
+        self._last_rows: Array = np.zeros((3 + len(covariance), 0))
+        self._integrals: Array = np.zeros(3 + len(covariance))
         self._gap_variance, self.intervals = 0.0, Intervals()
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
         """
-        Take the next block, which may be empty.
+        Take the next block, which may be empty; return three arrays of shape (n,).
 
-        Parameters
-        ----------
-        time, rate : s and rad/s, before the threshold filter, shape (n,)
-        sensitivity : of the rates to the calibration, shape (m, n), as in `compensation`
-
-        Returns
-        -------
-        filtered rate, rad/s, heading and its standard deviation, rad, shape (n,) each
+        Rates, rad/s, are those before the threshold filter, and the sensitivity, shape (m, n), as
+        in `compensation`. Returned are filtered rates, heading and its deviation, rad.
 
         """
         if not len(time):
@@ -344,7 +288,9 @@ class BlockIntegrator:
         # from the last sample of the block before on
         before = min(carried, 1)
         time, rate = time[carried - before:], rate[carried - before:]
-        rows = np.hstack([self._last_rows, np.vstack([filtered, kept, kept * sensitivity])])
+        deleted = rate[before:] - filtered
+        rows = np.hstack(
+            [self._last_rows, np.vstack([filtered, kept, deleted, kept * sensitivity])])
         interval, step, used = np.diff(time), np.diff(rate), rows[1] > 0.0
         usual, lost = self.intervals.add_many(interval)
         is_long = (lost > 0) & (interval > MAX_GAP)
@@ -366,6 +312,6 @@ class BlockIntegrator:
         unseen = np.cumsum(unseen)
         self._last_rows, self._integrals = rows[:, -1:], grown[:, -1]
         self._gap_variance = float(unseen[-1])
-        variance = (quadratic_form(self._covariance, grown[2:])
-                    + self._noise.heading_variance(grown[1]) + unseen)
+        variance = (quadratic_form(self._covariance, grown[3:])
+                    + self._noise.heading_variance(grown[1]) + grown[2] ** 2 + unseen)
         return filtered, grown[0, before:], np.sqrt(variance[before:])

@@ -39,33 +39,18 @@ HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = 0, 1, 2
 
 @dataclass(slots=True)
 class RateIntegral:
-    """
-    Integral of the rates over some time.
+    """Integral of the rates over some time."""
 
-    Attributes
-    ----------
-    duration : s
-    angle : integral of the compensated rate, rad
-    sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
-    lost_variance : variance of rotation that was not measured, rad²
-    extra_noise_variance : additional variance of the noise by lost samples, rad²
-    wander_variance : variance of the rotation during a detected rest that may be a straight drive,
-        rad²
-    block_count, block_square_sum : number of blocks, and sum of their squared angles over their
-        durations, rad²/s
-    is_unobserved : there were no rates: the heading is constant, and errors of rates do not affect
-        it; not to be added to others
-
-    """
-
-    duration: float
-    angle: float
-    sensitivity: Array
-    lost_variance: float = 0.0
-    extra_noise_variance: float = 0.0
-    wander_variance: float = 0.0
+    duration: float  # s
+    angle: float  # integral of the compensated rate, rad
+    sensitivity: Array  # integral of that of the rate to the calibration, shape (m,)
+    lost_variance: float = 0.0  # of rotation that was not measured, rad²
+    extra_noise_variance: float = 0.0  # additional variance of the noise by lost samples, rad²
+    wander_variance: float = 0.0  # of the rotation in a rest that may be a straight drive, rad²
     block_count: int = 0
-    block_square_sum: float = 0.0
+    block_square_sum: float = 0.0  # of the angles of blocks, over their durations, rad²/s
+    #: There were no rates: the heading is constant, and errors of rates do not affect it; not to
+    #: be added to others.
     is_unobserved: bool = False
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
@@ -86,44 +71,24 @@ class RateIntegral:
                             block_count=self.block_count - other.block_count,
                             block_square_sum=self.block_square_sum - other.block_square_sum)
 
-    @property
-    def block_scatter(self) -> float:
-        """Return the sum of squared deviations of the blocks from their mean, rad²/s."""
-        return self.block_square_sum - self.angle ** 2 / self.duration
-
 
 @dataclass(frozen=True)
 class Transition:
-    """
-    Transition of the state over some time, without the rotation itself.
+    """Transition of the state over some time, without the rotation itself."""
 
-    Attributes
-    ----------
-    observation : contribution of each component to the integral of the compensated rate, shape
-        (n,)
-    retention : decay factor of each component, shape (n,)
-    process_noise : covariance of the process noise, shape (n, n); the first row and column are
-        those of the integral of the rate, negated
-
-    """
-
-    observation: Array
-    retention: Array
+    observation: Array  # of each component in the integral of the compensated rate, shape (n,)
+    retention: Array  # decay factor of each component, shape (n,)
+    #: Covariance, shape (n, n); first row and column: of the integral of the rate, negated.
     process_noise: Array
 
 
 @dataclass(frozen=True)
 class HeadingState:
-    """
-    Mean and covariance of the state, shape (n,) and (n, n).
-
-    n = 2 + parts of the flicker + values of the calibration.
-
-    """
+    """Mean and covariance of the state."""
 
     noise: Noise
-    mean: Array
-    covariance: Array
+    mean: Array  # shape (n,), where n = 2 + parts of the flicker + values of the calibration
+    covariance: Array  # shape (n, n)
 
     @property
     def first_value_index(self) -> int:
@@ -162,18 +127,10 @@ class HeadingState:
                      + step.process_noise[HEADING_INDEX, HEADING_INDEX])
 
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
-        """Return the state after a time at rest, with its measurement."""
+        """Return the state after a time of constant heading, with its measurement."""
+        # A `wander_variance` is added to the variance of the measurement and to that of the
+        # heading, which is then the heading at the end.
         step = self.transition(rate_integral)
-        return self.update_at_rest(rate_integral, step).propagate_at_rest(rate_integral, step)
-
-    def update_at_rest(self, rate_integral: RateIntegral, step: Transition) -> HeadingState:
-        """
-        Return the state at the begin of a time at rest, updated by its measurement.
-
-        A `wander_variance` is added to the variance of the measurement and to that of the
-        heading, which is then the heading at the end.
-
-        """
         gain_direction = self.covariance @ step.observation
         noise = step.process_noise[HEADING_INDEX, HEADING_INDEX]
         variance = float(step.observation @ gain_direction + noise) + rate_integral.wander_variance
@@ -183,16 +140,13 @@ class HeadingState:
             gain_direction[HEADING_INDEX] += rate_integral.wander_variance
             covariance = covariance.copy()
             covariance[HEADING_INDEX, HEADING_INDEX] += rate_integral.wander_variance
-        return HeadingState(self.noise, self.mean + gain_direction * (innovation / variance),
-                            covariance - gain_direction[:, None] * gain_direction / variance)
-
-    def propagate_at_rest(self, rate_integral: RateIntegral, step: Transition) -> HeadingState:
-        """Return the state after a time of constant heading without a measurement."""
-        grown = step.process_noise.copy()
+        mean = self.mean + gain_direction * (innovation / variance)
+        covariance = covariance - gain_direction[:, None] * gain_direction / variance
+        grown = step.process_noise
         grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
         grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance
-        return HeadingState(self.noise, step.retention * self.mean,
-                            step.retention[:, None] * self.covariance * step.retention + grown)
+        return HeadingState(self.noise, step.retention * mean,
+                            step.retention[:, None] * covariance * step.retention + grown)
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
@@ -247,16 +201,12 @@ class HeadingState:
 def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
                   age: float | None = None) -> HeadingState:
     """
-    Return the state some time after a calibration.
+    Return the state at a heading, rad, and its variance, rad², some time after a calibration.
 
-    Parameters
-    ----------
-    noise : of the model
-    covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
-    heading, variance : rad and rad²
-    age : of a self-calibration, s, whose bias, the last value, is a mean over
-        `BIAS_AVERAGING_TIME`; None without one. Its variance contains the floor of the Allan
-        deviation for the flicker, which is replaced here by that of the flicker components
+    The covariance is that of the calibration, shape (m, m), by `uncertainty_covariance`. The age,
+    s, is that of a self-calibration, whose bias, the last value, is a mean over
+    `BIAS_AVERAGING_TIME`; None without one. Its variance contains the floor of the Allan deviation
+    for the flicker, which is replaced here by that of the flicker components.
 
     """
     constants, flicker_variances = noise.flicker_processes()
@@ -305,12 +255,8 @@ def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
 @lru_cache(maxsize=4096)
 def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
                        value_count: int) -> tuple[Array, Array, Array]:
-    """
-    Return contributions to the integral, decay, and process noise, with calibrated values last.
-
-    White noise is not included. Without rates, walk and flicker go on, and contribute nothing.
-
-    """
+    """Return contributions to the integral, decay and process noise, calibrated values last."""
+    # White noise is not included. Without rates, walk and flicker go on, and contribute nothing.
     constants, variance = noise.flicker_processes()
     left, walk = np.exp(-duration / constants), noise.rate_random_walk ** 2
     (seen,), (integral,) = _integrated_wander(noise, np.array([duration]))
@@ -330,15 +276,7 @@ def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
 
 def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral],
                   resting: list[bool]) -> list[HeadingState]:
-    """
-    Return the states smoothed by all later data (Rauch, Tung and Striebel).
-
-    Parameters
-    ----------
-    states : before each turn, and after the last; n + 1 of them
-    rate_integrals, resting : n each
-
-    """
+    """Smooth n + 1 states around n integrals by all later data (Rauch, Tung and Striebel)."""
     later = [states[-1]]
     for state, turn, rest in zip(states[-2::-1], rate_integrals[::-1], resting[::-1]):
         later.append(_smooth_state(state, turn, rest, later[-1]))
@@ -363,14 +301,11 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
         after, transition = state.propagate(rate_integral), np.diag(step.retention)
         transition[HEADING_INDEX] -= step.observation
         shared = state.covariance @ transition.T
-    smoother_gain = shared @ _pseudo_inverse(after.covariance)
+    # the pseudo-inverse of correlations, as variances may be zero and of any size
+    size = np.sqrt(np.diagonal(after.covariance))
+    size = np.where(size > 0.0, size, 1.0)
+    sizes = np.outer(size, size)
+    smoother_gain = shared @ (pinvh(after.covariance / sizes) / sizes)
     change = smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T
     return replace(start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
                    covariance=start.covariance + change)
-
-
-def _pseudo_inverse(covariance: Array) -> Array:
-    """Return the pseudo-inverse of a covariance that may have zero variances."""
-    size = np.sqrt(np.diagonal(covariance))
-    size = np.where(size > 0.0, size, 1.0)
-    return pinvh(covariance / np.outer(size, size)) / np.outer(size, size)

@@ -139,17 +139,9 @@ def _remove_spikes(time: Array, rate: Array) -> Array:
 
 
 def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
-    """
-    Return smoothed heading, rad, its variance, rad², and rest, shape (n,) each.
-
-    The heading is the integral of the rates, with the correction interpolated between the steps.
-
-    Parameters
-    ----------
-    tracker : with its steps kept, after all samples
-    time, rate : of the samples, s and rad/s, shape (n,)
-
-    """
+    """Return smoothed heading, rad, its variance, rad², and rest, shape (n,) each."""
+    # The heading is the integral of the rates, with the correction interpolated between the steps.
+    # The tracker has taken all samples, s and rad/s, and kept its steps.
     last, steps, states = tracker.finish(), tracker.steps, list[HeadingState]()
     end, later = len(steps), None
     # of the data before another calibration, only the heading is in its state

@@ -66,23 +66,13 @@ _MAX_STRETCHES = 20.0
 
 @dataclass(slots=True)
 class Block:
-    """
-    Samples of a short time, as sums.
+    """Samples of a short time, as sums."""
 
-    Attributes
-    ----------
-    duration : of its samples, s, without gaps
-    count : of samples
-    rate_sum, square_sum : of the compensated rate, rad/s and (rad/s)²
-    difference_square_sum : sum of the squared differences of neighbours, (rad/s)²
-
-    """
-
-    duration: float = 0.0
+    duration: float = 0.0  # of its samples, s, without gaps
     count: int = 0
-    rate_sum: float = 0.0
-    square_sum: float = 0.0
-    difference_square_sum: float = 0.0
+    rate_sum: float = 0.0  # of the compensated rate, rad/s
+    square_sum: float = 0.0  # (rad/s)²
+    difference_square_sum: float = 0.0  # of squared differences of neighbours, (rad/s)²
 
     def add(self, duration: float, rate: float, rate_before: float) -> None:
         """Add a sample with a duration, s."""
@@ -111,18 +101,11 @@ _TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
 
 
 class EnergyDetector:
-    """
-    The energy of the last `WINDOW_DURATION` s.
-
-    Attributes
-    ----------
-    noise_factor : ratio of the noise of the samples to that of the model, by the quietest windows;
-        1 until there are enough windows
-
-    """
+    """The energy of the last `WINDOW_DURATION` s."""
 
     def __init__(self, noise: Noise, false_alarms: float):
         """Begin with an empty window."""
+        # ratio of the noise of the samples to that of the model, by the quietest windows
         self.noise_factor = 1.0
         self._blocks = deque[Block]()
         self._energies = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
@@ -178,13 +161,9 @@ class EnergyDetector:
 
     def _update_noise_factor(self, duration: float, count: int, energy: float,
                              differences: float) -> None:
-        """
-        Update the noise of the samples by the quietest tenth of the windows.
-
-        Vibration in a straight drive is not noise; it contributes less to differences of
-        neighbours.
-
-        """
+        """Update the noise of the samples by the quietest tenth of the windows."""
+        # Vibration in a straight drive is not noise; it contributes less to differences of
+        # neighbours.
         self._since_last_window += duration
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
@@ -196,12 +175,8 @@ class EnergyDetector:
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
     def sudden_limit(self) -> float:
-        """
-        Return the largest deviation of a single sample at rest, rad/s.
-
-        Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
-
-        """
+        """Return the largest deviation of a single sample at rest, rad/s."""
+        # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
         if self._sudden_limit is None:
             limit = mean_threshold_sigmas(round(self._interval, 9), self._sample_false_alarms)
             self._sudden_limit = limit * self.noise_factor * math.sqrt(
@@ -211,40 +186,23 @@ class EnergyDetector:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """
-    State at some time during a rest.
-
-    Attributes
-    ----------
-    state, deleted_heading, step_count : the state, the heading deleted until then, rad, and number
-        of steps
-    rate_integral : integral of the rates since the rest began
-    innovation, variance : deviation of the last angle from the mean of this rest before it, or
-        at first from the state, rad, and its variance by noise, rad²
-    scatter : median of `SCATTER_RATIOS` by the innovations so far; 0 before the first
-    log_likelihood : of the innovations since the rest began, by `SCATTER_RATIOS`, shape (k,)
-
-    """
+    """State at some time during a rest."""
 
     state: HeadingState
-    rate_integral: RateIntegral
-    deleted_heading: float
+    rate_integral: RateIntegral  # since the rest began
+    deleted_heading: float  # until then, rad
     step_count: int
+    #: Deviation of the last angle from the mean of this rest before it, or at first from the
+    #: state, rad, and its variance by noise, rad².
     innovation: float = 0.0
     variance: float = math.inf
-    scatter: float = 0.0
+    scatter: float = 0.0  # median of `SCATTER_RATIOS` by the innovations; 0 before the first
+    #: Of the innovations since the rest began, by `SCATTER_RATIOS`, shape (k,).
     log_likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTER_RATIOS)))
 
 
 class RestScatter:
-    """
-    Distribution of the scatter of the rates in detected rests.
-
-    Attributes
-    ----------
-    counts : number of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,)
-
-    """
+    """Distribution of the scatter of the rates in detected rests."""
 
     def __init__(self) -> None:
         """Begin with the prior numbers."""
@@ -253,13 +211,9 @@ class RestScatter:
         self.begin_rest(0.0)
 
     def begin_rest(self, bias_ratio: float) -> None:
-        """
-        Begin a rest.
-
-        The ratio is that of the variance of the bias, over 1 s, to that of the white noise.
-
-        """
+        """Begin a rest with a ratio of the variance of the bias, over 1 s, to the white noise."""
         passes = max(bias_ratio, _MAX_SCATTER_RATIO) >= SCATTER_RATIOS
+        # numbers of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,)
         self.counts = self._learned + self._retention * _PRIOR_COUNTS * passes
 
     def probabilities(self, likelihood: Array) -> Array:
@@ -282,20 +236,11 @@ class RestScatter:
 
 @dataclass
 class SlowTurn:
-    """
-    A turn that was detected late, and is so slow that it may be a change of the bias.
+    """A turn that was detected late, and is so slow that it may be a change of the bias."""
 
-    Attributes
-    ----------
-    snapshot : the state when it began
-    rate : of the turn, rad/s
-    rate_integral : integral of the rates since then
-
-    """
-
-    snapshot: Snapshot
-    rate: float
-    rate_integral: RateIntegral
+    snapshot: Snapshot  # when it began
+    rate: float  # rad/s
+    rate_integral: RateIntegral  # since then
 
 
 #: Time constant with which a pending correction of the heading is applied in motion, s.
@@ -321,42 +266,21 @@ class Samples:
 
 @dataclass
 class Epoch:
-    """
-    Samples with one state; heading and pending correction at the begin, rad.
+    """Samples with one state; heading and pending correction at the begin, rad."""
 
-    Attributes
-    ----------
-    start_index : index of the sample before its first
-    state_version : number of the state
-    open_integrals : last samples of its blocks, and integrals of the rates since the state
-    end_index : index after its last sample
-
-    """
-
-    start_index: int
+    start_index: int  # of the sample before its first
     state_version: int
     state: HeadingState
     is_resting: bool
     heading: float
     pending: float
+    #: Last samples of its blocks, and integrals of the rates since the state.
     open_integrals: list[tuple[int, RateIntegral]]
-    end_index: int = -1
+    end_index: int = -1  # after its last sample
 
 
 class EvenSamples:
-    """
-    n samples without jumps and gaps, and their sums over k blocks.
-
-    Attributes
-    ----------
-    used_sensitivity : the sensitivities used, first that of the sample before, shape (n + 1, m)
-    whole_blocks : range of complete blocks
-    block_sums : duration, integral, remaining share of a pending correction, and sums of the
-        rates, their squares, and the squares of their steps, by block
-    sensitivity_integrals : integrals of the sensitivities in motion and at rest, shape (k, m) each
-    results : the result of `HeadingTracker.follow`
-
-    """
+    """n samples without jumps and gaps, and their sums over k blocks."""
 
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
                  begun: float, rested: bool, found: Array):
@@ -371,6 +295,7 @@ class EvenSamples:
         self.intervals = np.diff(self.time, prepend=last[0])
         self.half_intervals, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
         self.angles = self.half_intervals * (2.0 * self.rate - steps)
+        # the sensitivities used, first that of the sample before
         self.used_sensitivity = np.empty((count + 1, len(last[3])))
         self.used_sensitivity[0] = last[3]
         self.block_stops = block_ends(self.intervals, BLOCK_DURATION, begun)
@@ -382,7 +307,9 @@ class EvenSamples:
         moving = self._integrate_sensitivity(self.motion_sensitivity)
         resting = (moving if self.still is None
                    else self._integrate_sensitivity(self.rest_sensitivity))
-        self.sensitivity_integrals = moving, resting
+        self.sensitivity_integrals = moving, resting  # shape (k, m) each
+        # by block: duration, integral, remaining share of a pending correction, and sums of the
+        # rates, their squares, and the squares of their steps
         summed = (self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)
         sums = [self._sum_by_blocks(values).tolist() for values in summed]
         self._pending_retention = 1.0 - self.intervals / SETTLING_TIME

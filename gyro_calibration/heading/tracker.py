@@ -22,7 +22,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.heading.integration import (
@@ -93,21 +93,13 @@ _POWER_SIGMAS = 1.645
 
 @dataclass(frozen=True)
 class Settings:
-    """
-    Settings of the heading tracker.
+    """Settings of the heading tracker."""
 
-    Attributes
-    ----------
-    false_alarms : false detections of motion per hour at rest, 1/h; 0 disables the detection of
-        rest, as does an unknown noise
-    threshold : of the filter of Hong and Park, eq. 12; used without detection of rest
-    maximum_gap : longest gap in the stamps that is integrated, s
-
-    """
-
+    #: False detections of motion at rest, 1/h; 0 disables the detection of rest, as does an
+    #: unknown noise; then the threshold is used.
     false_alarms: float = 0.1
-    threshold: Threshold = field(default_factory=lambda: Threshold(0.0))
-    maximum_gap: float = MAX_GAP
+    threshold: Threshold = Threshold(0.0)
+    maximum_gap: float = MAX_GAP  # longest gap in the stamps that is integrated, s
 
 
 @dataclass(frozen=True)
@@ -122,21 +114,11 @@ class TrackStep:
 
 class HeadingTracker:
     """
-    Track the heading sample by sample.
+    Track the heading, rad, which is continuous, and the rate, rad/s, zero at rest.
 
-    Attributes
-    ----------
-    heading : published heading, rad, continuous, not wrapped
-    rate : rad/s; zero at rest
-    is_resting : whether the robot is at rest
-    deleted_heading : heading attributed to bias or noise at rest, or deleted by the threshold
-        filter, rad
-    intervals : of the samples, with the number of lost ones
-    refused_count : number of samples beyond the largest rate; they count as lost
-    outlier_count : number of samples beyond the largest acceleration; they count as lost
-    rebuild_count : number of times that the state was not finite and was initialized again
-    steps : the drive so far, if it is kept
-    recalibrations : numbers of steps before another calibration was used, and the state before it
+    `deleted_heading` is that attributed to bias or noise at rest, or deleted by the threshold
+    filter, rad. Samples beyond the largest rate are refused, those beyond the largest acceleration
+    are outliers, and both count as lost; `rebuild_count` tells how often the state was not finite.
 
     """
 
@@ -146,18 +128,16 @@ class HeadingTracker:
         """
         Begin at heading zero.
 
-        Parameters
-        ----------
-        noise : of the model
-        covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
-        age : of the self-calibration, whose s and b are the last values, s; None without one
-        keeps_steps : the `steps`, for `log_compensation.smooth_track`
-        sensitivity_slope : change of the sensitivity with the rate, shape (m,): the rates include
-            the bias estimated at rest, on which a scale factor error does not act
+        The covariance is that of the calibration, shape (m, m), by `uncertainty_covariance`, and
+        the age, s, that of a self-calibration, whose s and b are the last values; None without
+        one. Steps are kept for `log_compensation.smooth_track`. The slope is the change of the
+        sensitivity with the rate, shape (m,): the rates include the bias estimated at rest, on
+        which a scale factor error does not act.
 
         """
         self._sensitivity_slope = sensitivity_slope
         self.steps, self._keeps_steps = list[TrackStep](), keeps_steps
+        # numbers of steps before another calibration was used, and the states before it
         self.recalibrations = list[tuple[int, HeadingState]]()
         self._interval, self._last_time, self.intervals = math.inf, 0.0, Intervals()
         self._last_sample: tuple[float, float, float, Array] | None = None
@@ -194,6 +174,7 @@ class HeadingTracker:
                                     age if len(covariance) else None)
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
+        self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
         self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
         if self._last_sample is not None:
@@ -205,6 +186,8 @@ class HeadingTracker:
     def configure(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings."""
         self._settings = settings
+        self._state = self._state.with_added_variance(HEADING_INDEX, self._filtered_turn ** 2)
+        self._filtered_turn = 0.0
         self._detects_rest = (settings.false_alarms > 0.0
                               and self._model_noise.angle_random_walk > 0.0)
         self._energy.configure(self._model_noise, settings.false_alarms)
@@ -213,11 +196,15 @@ class HeadingTracker:
                                        else settings.threshold)
         self._sigmas = {lag: _NOISE_TOLERANCE * mean_threshold_sigmas(lag, settings.false_alarms)
                         for lag in (WINDOW_DURATION, *MEAN_LAGS)} if self._detects_rest else {}
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Begin the present rest or motion again, with the state as it is."""
         if self.is_resting and self._detects_rest:
             self._enter_rest()
         else:
             self._enter_motion(WINDOW_DURATION)
-        self._adopt_state()
+            self._adopt_state()
 
     def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0,
                         sensitivity_slope: Array | None = None) -> None:
@@ -249,13 +236,9 @@ class HeadingTracker:
     def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
         self._advance_to_last_sample()
-        self.heading, self._suspected_turn = heading, None
+        self.heading, self._suspected_turn, self._filtered_turn = heading, None, 0.0
         self._state = self._state.with_heading(heading, variance)
-        if self.is_resting:
-            self._enter_rest()
-        else:
-            self._enter_motion(WINDOW_DURATION)
-        self._adopt_state()
+        self._begin_anew()
 
     @property
     def variance(self) -> float:
@@ -267,7 +250,8 @@ class HeadingTracker:
             self._open_variance = self._state.heading_variance(
                 self._with_unbiased_sensitivity(self._open_integral))
         part = self._block_integral
-        return (self._open_variance + self._state.noise.angle_random_walk ** 2 * part.duration
+        return (self._open_variance + self._filtered_turn ** 2
+                + self._state.noise.angle_random_walk ** 2 * part.duration
                 + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
 
     # Samples
@@ -275,29 +259,21 @@ class HeadingTracker:
     def add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None = None,
             still: Array | None = None) -> str:
         """
-        Take one sample.
+        Take one sample; return why the integration was restarted with it, or ''.
 
-        Parameters
-        ----------
-        time : stamp, s
-        rate : compensated, rad/s
-        sensitivity : of the rate to the calibration, shape (m,), as in `compensation`
-        wheels : whether wheels or commands move the robot, or moved it since the last sample; None
-            where that is not known
-        still : the sensitivity if the true rate is zero; without it that of the samples is used at
-            rest too: their noise then acts as a scale factor error, which matters unless the scale
-            factor is well known
-
-        Returns
-        -------
-        '', or why the integration was restarted with this sample
+        The stamp is in s, the compensated rate in rad/s; the sensitivity, shape (m,), is that of
+        the rate to the calibration, and `still` that of a true rate of zero. Without the latter
+        that of the samples is used at rest too: their noise then acts as a scale factor error,
+        which matters unless the scale factor is well known. `wheels` tells whether wheels or
+        commands move the robot, or moved it since the last sample; None where that is not known.
 
         """
         if not -MAX_RATE < rate < MAX_RATE:
             self.refused_count += 1
             return ''
         spike, self._held_jump = self._held_jump, None
-        if self._last_sample is not None and self._is_jump(time, rate):
+        if self._last_sample is not None and self._is_jump(
+                time - self._last_sample[0], rate - self._last_sample[1]):
             if spike is None:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
@@ -314,12 +290,10 @@ class HeadingTracker:
             self.outlier_count += 1
         return self._take_sample(time, rate, sensitivity, wheels, still)
 
-    def _is_jump(self, time: float, rate: float) -> bool:
-        """Tell whether the rate changed by more than a robot can since the last sample."""
-        if self._last_sample is None:
-            return False
-        interval, step = time - self._last_sample[0], abs(rate - self._last_sample[1])
-        return (step > MAX_RATE_STEP and step > MAX_RATE_STEP + MAX_ACCELERATION * interval
+    def _is_jump(self, interval: float, step: float) -> bool:
+        """Tell whether the rate changed by more than a robot can in an interval."""
+        return (abs(step) > MAX_RATE_STEP
+                and abs(step) > MAX_RATE_STEP + MAX_ACCELERATION * interval
                 and 0.0 <= interval <= self._settings.maximum_gap)
 
     def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
@@ -378,18 +352,10 @@ class HeadingTracker:
     def follow(self, time: Array, rate: Array, sensitivity: Array,
                wheels: Sequence[bool | None] | None = None, still: Array | None = None) -> Array:
         """
-        Take samples as `add` does, in whole blocks where no decision falls within them.
+        Take n samples as `add` does, in whole blocks where no decision falls within them.
 
-        Parameters
-        ----------
-        time, rate : as in `add`, shape (n,)
-        sensitivity : as in `add`, shape (n, m)
-        wheels : as in `add`, n of them, or None
-        still : as in `add`, shape (m,) or (n, m)
-
-        Returns
-        -------
-        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, (n, 5)
+        The sensitivity has shape (n, m), `still` too, or (m,). The result, shape (n, 5), has
+        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them.
 
         """
         given = Samples(time, rate, sensitivity, wheels, None if still is None
@@ -540,7 +506,9 @@ class HeadingTracker:
         if self.is_resting:
             self.deleted_heading += corrected
             return
-        self.deleted_heading += half * (rate - filtered + last_rate - last_filtered)
+        deleted = half * (rate - filtered + last_rate - last_filtered)
+        self.deleted_heading += deleted
+        self._filtered_turn += deleted
         settled = self._pending_correction * duration / SETTLING_TIME
         self._pending_correction -= settled
         self.heading += corrected + settled
@@ -587,7 +555,6 @@ class HeadingTracker:
         if quiet and self._is_mean_at_rest(wheels):
             self._advance_state(self._held_rest_integral())
             self._enter_rest()
-            self._adopt_state()
             self._rest_blocks.extend([*self._recent_blocks][1:])
 
     def _close_block(self) -> RateIntegral:
@@ -628,13 +595,9 @@ class HeadingTracker:
         return stands
 
     def _accept_slow_turn_as_bias(self) -> bool:
-        """
-        Attribute a slow turn of constant rate to a change of the bias at rest; tell whether so.
-
-        A robot does not turn at a constant rate for minutes. Otherwise a bias that wanders by more
-        than the model states would cause a permanent drift of the heading at rest.
-
-        """
+        """Attribute a slow, constant turn to a change of the bias at rest; tell whether so."""
+        # A robot does not turn at a constant rate for minutes. Otherwise a bias that wanders by
+        # more than the model states would cause a permanent drift of the heading at rest.
         suspected, held = self._suspected_turn, self._with_still_sensitivity(self._held_integral)
         if suspected is None:
             return False
@@ -653,7 +616,6 @@ class HeadingTracker:
                           self._last_sample[0] - self._block_integral.duration - held.duration))
         self._state, self._open_integral, self._suspected_turn = moved, self._held_integral, None
         self._enter_rest()
-        self._adopt_state()
         return True
 
     def _normalized_innovation(self, state: HeadingState, turn: RateIntegral,
@@ -680,7 +642,6 @@ class HeadingTracker:
                     self._state = self._state.with_added_variance(
                         WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
                     self._enter_rest()
-                    self._adopt_state()
                 else:
                     self._revert_to_motion(lag)
                 return
@@ -694,7 +655,7 @@ class HeadingTracker:
     # From rest to motion and back
 
     def _enter_rest(self) -> None:
-        """Begin a rest."""
+        """Begin a rest with the state as it is."""
         self.is_resting, self._rest_integral = True, self._zero_integral
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
@@ -703,6 +664,7 @@ class HeadingTracker:
         _, median = self._rest_scatter.mean_and_median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
+        self._adopt_state()
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
@@ -728,13 +690,9 @@ class HeadingTracker:
 
     def _locate_motion_start(self, snapshot: Snapshot,
                              turn: RateIntegral) -> tuple[Snapshot, RateIntegral]:
-        """
-        Return the state after the last block at rest after a snapshot, and the integral since.
-
-        The begin of motion is located by maximum likelihood, with rates of unknown scatter in
-        motion; the block before it is counted as motion, as it may contain the begin.
-
-        """
+        """Return the state at the last block at rest since a snapshot, and the integral after."""
+        # The begin of motion is located by maximum likelihood, with rates of unknown scatter in
+        # motion; the block before it is counted as motion, as it may contain the begin.
         blocks, duration = list[RateIntegral](), 0.0
         for block in reversed(self._rest_blocks):
             if duration + block.duration > turn.duration + TIME_TOLERANCE:
@@ -775,13 +733,9 @@ class HeadingTracker:
                 if abs(rate) < _SLOW_TURN_FACTOR * least else None)
 
     def _restart_after_gap(self, interval: float, fastest: float, may_have_turned: bool) -> str:
-        """
-        Restart after a gap or a backward jump of the stamps, over which nothing is integrated.
-
-        Unless the wheels stood, the robot may have turned to any direction meanwhile, also between
-        two rests. The duration of a backward jump is unknown.
-
-        """
+        """Restart after a gap or a backward jump of the stamps; nothing is integrated over it."""
+        # Unless the wheels stood, the robot may have turned to any direction meanwhile, also
+        # between two rests. The duration of a backward jump is unknown.
         self._advance_to_last_sample()
         assert self._last_sample is not None
         self._last_time = self._last_sample[0]
@@ -832,7 +786,9 @@ class HeadingTracker:
         shared = SCATTER_CORRELATIONS * wander
         gain = shared / (before.variance + wander)
         spread = variance + share * wander - gain * shared
-        blocks = turn.block_scatter * turn.duration / (
+        # of the blocks about their mean
+        scatter = turn.block_square_sum - turn.angle ** 2 / turn.duration
+        blocks = scatter * turn.duration / (
             self._energy.noise_factor ** 2 * self._model_noise.angle_random_walk ** 2
             * turn.duration + turn.extra_noise_variance + turn.lost_variance)
         likelihood = before.log_likelihood - 0.5 * (

@@ -167,12 +167,8 @@ def parse_layout(definition: str, axis: str = 'z') -> MessageLayout:
 
 def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
                     depth: int) -> Iterator[tuple[str, str]]:
-    """
-    Give name and format of each number; texts and sequences have no name, messages no format.
-
-    Fields after a sequence of texts or of messages are left out: their offset is not fixed.
-
-    """
+    """Give names and formats of numbers; texts and sequences have no name, messages no format."""
+    # Fields after a sequence of texts or of messages are left out: their offset is not fixed.
     for field in parts[part]:
         kind, count, name = field['kind'], field['count'], f'{path}{field["name"]}'
         code = _STRUCT_CODES.get(kind, '')

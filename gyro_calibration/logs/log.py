@@ -95,9 +95,16 @@ class DataRefused(InputError):
     """The data do not allow an answer; the message says why and what would."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Log:
-    """A log: arrays in SI, each of shape (n,) or absent."""
+    """
+    A log: arrays in SI, each of shape (n,) or absent; masked values are lost ones.
+
+    Raises
+    ------
+    LogError : for other shapes, values that are no numbers, and time that does not increase
+
+    """
 
     time: Array | None = None  # s, increasing; without it the rows are dwells of a rate table
     output: Array | None = None  # output of the gyro, rad/s, counter-clockwise positive
@@ -114,15 +121,20 @@ class Log:
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Convert lists and columns of a DataFrame to arrays."""
-        for quantity in QUANTITIES:
-            values = getattr(self, quantity)
-            if values is not None:
-                object.__setattr__(self, quantity, np.asarray(values, float))
+        """Convert lists and columns of a DataFrame to arrays, and refuse what is no log."""
+        arrays = {quantity: _to_floats(quantity, values) for quantity in QUANTITIES
+                  if (values := getattr(self, quantity)) is not None}
+        _refuse_invalid(arrays, {})
+        for quantity, values in arrays.items():
+            object.__setattr__(self, quantity, values)
 
     def __len__(self) -> int:
         first = self.output if self.output is not None else self.counts
         return 0 if first is None else len(first)
+
+    def __repr__(self) -> str:
+        named = [quantity for quantity in QUANTITIES if getattr(self, quantity) is not None]
+        return f'<Log: {len(self)} rows of {", ".join([*named, *self.others])}>'
 
 
 def read_log(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
@@ -391,21 +403,21 @@ def excerpt(text: str) -> str:
 
 
 def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: Array | None,
-                           previous_time: float) -> float:
+                           previous_time: float, place: str = 'line') -> float:
     """Refuse time that does not increase or is too large; return the last time."""
-    if time is None:
+    if time is None or not len(time):
         return previous_time
     if (far := np.abs(time) > MAX_TIME).any():
         row = int(np.argmax(far))
-        raise LogError(f'{path}: line {line_numbers[row]}, column time_s: {time[row]:g} s is '
+        raise LogError(f'{path}: {place} {line_numbers[row]}, column time_s: {time[row]:g} s is '
                        f'beyond the limit of {MAX_TIME:g} s; give its unit, as by --columns '
                        'time=time_s:ns')
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{path}: line {line_numbers[row]}, column time_s: {time[row]:g} s is not '
-                       f'later than {time[row - 1] if row else previous_time:g} s; sort the rows, '
-                       'or give the sample rate with --rate')
+        raise LogError(f'{path}: {place} {line_numbers[row]}, column time_s: {time[row]:g} s is '
+                       f'not later than {time[row - 1] if row else previous_time:g} s; sort the '
+                       'rows, or give the sample rate with --rate')
     return float(time[-1])
 
 
@@ -416,25 +428,49 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     Raise `LogError` for no output, different lengths, values that are no numbers, unordered time.
 
     """
-    header = [str(name) for name in table]
     try:
+        header = [str(name) for name in table]
         found = find_columns(header, columns, axis)
-        arrays: dict[str, Any] = {quantity: np.asarray(table[list(table)[index]], float) * factor
-                                  + offset for quantity, (index, factor, offset) in found.items()}
-    except (TypeError, ValueError) as error:
-        fault = error if isinstance(error, InputError) else describe_error(error)
-        raise LogError(f'the table is no log: {fault}') from None
-    shapes = {values.shape for values in arrays.values()}
-    if len(shapes) > 1 or min(shapes) < (2,) or len(min(shapes)) != 1:
-        raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
-                       'least two rows')
-    for quantity, values in arrays.items():
-        if (wrong := _mask_invalid(values, quantity)).any():
-            raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].position]} is '
-                           f'{values[np.argmax(wrong)]:g}; remove the row')
-    _refuse_unordered_time('the table', range(*min(shapes)), arrays.get('time'), -math.inf)
+    except (TypeError, InputError) as error:
+        raise LogError(f'the table is no log: {error}; wanted columns by their names') from None
+    names = {quantity: header[column.position] for quantity, column in found.items()}
+    arrays: dict[str, Any] = {
+        quantity: _to_floats(names[quantity], table[list(table)[index]]) * factor + offset
+        for quantity, (index, factor, offset) in found.items()}
+    _refuse_invalid(arrays, names)
+    if (count := len(next(iter(arrays.values())))) < 2:
+        raise LogError(f'the table has {count} of the 2 rows that are needed at least; record '
+                       'more')
     _AxisRotation(axis).replace_attitude(arrays)
     return Log(**arrays)
+
+
+def _to_floats(name: str, values: Any) -> Array:
+    """Return the values of a column as floats, nan where they are masked."""
+    try:
+        array = np.ma.getdata(values) if (mask := np.ma.getmask(values)) is np.ma.nomask else (
+            np.where(mask, np.nan, np.ma.getdata(values)))
+        if array.dtype.kind in 'cMm':
+            raise ValueError(f'its type is {array.dtype}')
+        return np.asarray(array, float)
+    except (TypeError, ValueError) as error:
+        raise LogError(f'{name} is no column of numbers ({describe_error(error)}); give real '
+                       'numbers, and dates as seconds since the first') from None
+
+
+def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> None:
+    """Refuse columns that are no log together; `names` are theirs, if not the quantities'."""
+    shapes = {names.get(quantity, quantity): values.shape for quantity, values in arrays.items()}
+    if len(set(shapes.values())) > 1 or any(len(shape) != 1 for shape in shapes.values()):
+        given = ', '.join(f'{name} {shape}' for name, shape in shapes.items())
+        raise LogError(f'the columns have the shapes {given}; wanted one shape (n,)')
+    for quantity, values in arrays.items():
+        if quantity != 'time' and (wrong := _mask_invalid(values, quantity)).any():
+            row = int(np.argmax(wrong))
+            raise LogError(f'row {row} of {names.get(quantity, quantity)} is {values[row]:g}; '
+                           'remove the row')
+    _refuse_unordered_time('the log', range(len(arrays.get('time', ()))), arrays.get('time'),
+                           -math.inf, 'row')
 
 
 def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
@@ -534,13 +570,9 @@ def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: A
 
 
 def refuse_wrapped(log: Log) -> None:
-    """
-    Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped.
-
-    Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
-    heading in deg instead of rad are none.
-
-    """
+    """Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped."""
+    # Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
+    # heading in deg instead of rad are none.
     if log.time is None or log.reference_heading is None:
         return
     known = np.flatnonzero(np.isfinite(log.reference_heading))

@@ -48,10 +48,8 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
     """
     Return the standard deviation of the white part of a signal, by its differences.
 
-    Parameters
-    ----------
-    values : shape (n,); differences with nan are left out
-    order : order of the differences: 3 in motion; 1 at rest, which shows filtered noise best
+    Those with nan are left out. Their order is 3 in motion, and 1 at rest, which shows filtered
+    noise best.
 
     """
     off = np.abs(np.diff(values, order))
@@ -120,12 +118,8 @@ def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, f
 
 
 def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
-    """
-    Return the length of the mean phasor of positions on a lattice, and the shift of the lattice.
-
-    The most frequent position is left out: a value at every rest would outweigh all others.
-
-    """
+    """Return the length of the mean phasor of positions on a lattice, and its shift."""
+    # The most frequent position is left out: a value at every rest would outweigh all others.
     counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
               if len(counts) > 1 else counts)
     mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
@@ -214,13 +208,9 @@ def refuse_dead(output: Array) -> None:
 
 
 def refuse_saturated(output: Array) -> None:
-    """
-    Refuse an output that is clipped at its largest or smallest value.
-
-    A clipped output has at least 10 samples and 0.5 % of all at a limit, and three times as many
-    as at the next value. An output whose codes are too coarse to show its noise is not refused.
-
-    """
+    """Refuse an output that is clipped at its largest or smallest value."""
+    # A clipped output has at least 10 samples and 0.5 % of all at a limit, and three times as many
+    # as at the next value. An output whose codes are too coarse to show its noise is not refused.
     values, counts = np.unique(output, return_counts=True)
     if len(values) < 2 or not _is_noise_resolved(output):
         return
@@ -232,12 +222,8 @@ def refuse_saturated(output: Array) -> None:
 
 
 def _is_noise_resolved(output: Array) -> bool:
-    """
-    Tell whether a fifth of neighbouring samples differ where the rate is steady.
-
-    That is in the flattest quarter of blocks of ten samples away from the extreme values.
-
-    """
+    """Tell whether a fifth of neighbouring samples differ where the rate is steady."""
+    # That is in the flattest quarter of blocks of ten samples away from the extreme values.
     blocks = output[:len(output) // 10 * 10].reshape(-1, 10)
     blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
     if len(blocks) < 4:

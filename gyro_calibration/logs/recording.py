@@ -82,16 +82,11 @@ def _is_same_topic(topic: str, other: str | None) -> bool:
 
 
 class _TopicBuffer:
-    """
-    Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities.
-
-    `frames` are the first two frames in the headers.
-
-    """
+    """Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities."""
 
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged_count = topic, kind, 0
-        self.frames = set[str]()
+        self.frames = set[str]()  # the first two in the headers
         self._layout = cdr.parse_layout(definition, axis)
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 

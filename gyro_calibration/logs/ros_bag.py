@@ -116,12 +116,8 @@ def is_recording(path: str | Path) -> bool:
 
 
 def list_recording_files(path: str | Path) -> list[Path]:
-    """
-    Return the files of a recording in order, or raise `LogError` where there are none.
-
-    The list in metadata.yaml is not used: a killed recorder does not write it.
-
-    """
+    """Return the files of a recording in order, or raise `LogError` where there are none."""
+    # The list in metadata.yaml is not used: a killed recorder does not write it.
     path = Path(path)
     if not os.path.isdir(path):
         return [path]
@@ -513,14 +509,10 @@ def _read_database(source: Path, path: Path, contents: Contents,
 
 @contextmanager
 def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
-    """
-    Open a database read-only, and give it with the names of its tables of stored columns.
-
-    Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
-    count corrected. Computed columns are not read: their cost is not limited by the size of the
-    file.
-
-    """
+    """Open a database read-only, and give it with the names of its tables of stored columns."""
+    # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
+    # count corrected. Computed columns are not read: their cost is not limited by the size of the
+    # file.
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
         for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):

@@ -46,11 +46,7 @@ class StampGrid:
     interval: float  # of the grid, s
     max_deviation: float  # largest deviation of the stamps from the grid, s
     has_bursts: bool  # the stamps come in bursts or with jitter; the grid is used instead
-
-    @property
-    def max_gap(self) -> int:
-        """Return the length to which longer gaps are cut, samples."""
-        return _max_kept_gap(self.time)
+    max_gap: int  # to which longer gaps are cut, samples
 
     @property
     def burst_remarks(self) -> list[str]:
@@ -91,8 +87,9 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     if uneven or wander > 0.05 * len(time) * interval:
         raise DataRefused(f'the stamps have no even interval (about {usual:g} s; up to {wander:g} '
                           's off); if the samples are even, give the sample rate with --rate')
-    return StampGrid(time, lost, _number_samples(np.minimum(lost, _max_kept_gap(time))), interval,
-                     wander, bursts)
+    max_gap = len(time) // MIN_WINDOWS + 1
+    return StampGrid(time, lost, _number_samples(np.minimum(lost, max_gap)), interval, wander,
+                     bursts, max_gap)
 
 
 def even_times(time: Array) -> Array:
@@ -115,10 +112,6 @@ def count_lost_samples(time: Array) -> Integers | None:
         return None
 
 
-def _max_kept_gap(time: Array) -> int:
-    return len(time) // MIN_WINDOWS + 1
-
-
 def _typical_interval(time: Array, steps: Array) -> float:
     """Return the interval, s: the median over 100 samples, or the divisor of most steps."""
     lag = min(100, len(time) // 4)
@@ -136,13 +129,9 @@ def _typical_interval(time: Array, steps: Array) -> float:
 
 
 def _count_lost_per_step(time: Array, steps: Array, interval: float, has_bursts: bool) -> Integers:
-    """
-    Return how many samples are lost in each step.
-
-    It is the number of intervals by which the stamps remain late. Samples that were delayed at a
-    host arrive in one burst of any size; the time to catch up begins after it.
-
-    """
+    """Return how many samples are lost in each step."""
+    # It is the number of intervals by which the stamps remain late. Samples that were delayed at a
+    # host arrive in one burst of any size; the time to catch up begins after it.
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
     # samples within which delayed stamps catch up, and the least loss beyond their jitter

@@ -12,12 +12,8 @@
 Channels that need a history: time since power-on, lagged channels, the sign of heating.
 
 A `ChannelHistory` takes a stream sample by sample, or a log as a whole or in blocks, with the same
-results. Each lag that is requested starts at the value of its channel at that time and is updated
-from then on.
-
-A lag is solved exactly for signals that are linear between their stamps. Over arrays it is a
-recurrence in rows of sqrt(n) samples, without a loop over samples; a stream and a log differ by
-rounding (1e-14 rad/s).
+results but for rounding (1e-14 rad/s). Each lag that is requested starts at the value of its
+channel at that time and is updated from then on.
 
 """
 

@@ -161,12 +161,7 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
 
 
 def uncertainty_covariance(model: GyroModel) -> np.ndarray:
-    """
-    Return the covariance of the uncertain values of a model, shape (m, m); nan where unknown.
-
-    The order is that of `rate_sensitivity`.
-
-    """
+    """Return the covariance of the values of `rate_sensitivity`, shape (m, m); nan if unknown."""
     blocks = [] if model.covariance is None else [model.covariance]
     blocks += [np.diag([getattr(model.tolerance, name) ** 2]) for name in model.active_tolerances]
     if model.self_calibration is not None:

@@ -38,13 +38,7 @@ from scipy.interpolate import CubicSpline
 
 @dataclass(frozen=True)
 class Channels:
-    """
-    Inputs of effects, at one instant (numbers) or at many (arrays of shape (n,)).
-
-    The channels ``lagged`` and ``heating`` depend on earlier samples; `model.channels` makes them.
-    Without them the past is taken to be constant.
-
-    """
+    """Inputs of effects, at one instant (numbers) or at many (arrays of shape (n,))."""
 
     rate: Number  # true rate, rad/s
     output: Number  # output of the gyro, rad/s
@@ -53,6 +47,7 @@ class Channels:
     specific_force: Number = 0.0  # along the input axis, m/s²
     supply: Number | None = None  # V; None where it is not known
     heading: Number = 0.0  # rad
+    # of earlier samples, by `model.channels`; without them the past is taken to be constant
     # (channel, time constant) -> the channel through a first-order lag; channels are
     # 'temperature', 'specific_force', and 'vibration', the squared deviation of the specific force
     # from its own mean over 1 s
@@ -75,20 +70,15 @@ class Channels:
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    A coefficient or a nonlinear parameter: name, unit, default value and bounds.
-
-    A parameter with a default is a convention, such as a reference temperature; one without is a
-    property of the gyro, and is fitted. `begin_with` holds the initial values of a nonlinear
-    parameter in the search of a diagnosis.
-
-    """
+    """A coefficient or a nonlinear parameter."""
 
     name: str
     unit: str
+    # a convention, such as a reference temperature; without one it is a property of the gyro, and
+    # is fitted
     default: float | None = None
     bounds: tuple[float, float] = (-np.inf, np.inf)
-    begin_with: tuple[float, ...] = ()
+    begin_with: tuple[float, ...] = ()  # of a nonlinear one in the search of a diagnosis
 
 
 @dataclass(frozen=True)
@@ -157,20 +147,10 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
     return _solve_recurrence(fallen + 1.0, change * (fallen / x), initial_difference)
 
 
-def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
-    """Return a signal, shape (n,), through a lag that starts at its first value."""
-    interval, change = np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1])
-    return signal + lag_difference(interval, change, time_constant)
-
-
 def _solve_recurrence(factors: Array, added: Array, initial: float) -> Array:
-    """
-    Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,).
-
-    Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
-    row before is propagated through each row.
-
-    """
+    """Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,)."""
+    # Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
+    # row before is propagated through each row.
     count = len(factors)
     width = math.isqrt(max(count - 1, 0)) + 1
     padding = (0, -count % width)
@@ -455,7 +435,9 @@ def _filter_lag(signal: Array, time: Array, time_constant: float) -> Array:
     """Return the signal through a lag, interpolated at 4 points a sample."""
     count = len(time)
     finer = np.interp(np.arange(4 * (count - 1) + 1) / 4, np.arange(count), time)
-    return lagged_signal(_interpolate(finer, time, signal), finer, time_constant)[::4]
+    signal = _interpolate(finer, time, signal)
+    interval, change = np.diff(finer, prepend=finer[:1]), np.diff(signal, prepend=signal[:1])
+    return (signal + lag_difference(interval, change, time_constant))[::4]
 
 
 _FAST_REVERSALS = ('swing fast with quick reversals: a lag reduces the amplitude of fast motion, '

@@ -47,13 +47,9 @@ class Term:
         """Return one column for each coefficient."""
         return self.effect.columns(channels, *self.values[:len(self.effect.nonlinear_parameters)])
 
-    def error(self, channels: Channels) -> Number:
-        """Return what the effect adds to the output, rad/s."""
-        return self.error_function(channels)
-
     @cached_property
-    def error_function(self) -> Callable[[Channels], Number]:
-        """Return the function of the channels that gives the error of the effect, rad/s."""
+    def error(self) -> Callable[[Channels], Number]:
+        """Return the function of the channels that the effect adds to the output, rad/s."""
         return self.effect.error_function(self.values)
 
     @cached_property
@@ -144,7 +140,7 @@ class Tolerance:
     per_rate: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GyroModel:
     """The model of one gyro."""
 
@@ -164,6 +160,11 @@ class GyroModel:
     tolerance: Tolerance = Tolerance()  # errors of the rate beyond the covariance
     # by name of a noise figure, the bounds that hold it with 95 % confidence
     noise_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        values = (f'{parameter.name} {value:.4g} {parameter.unit}'.removesuffix(' 1')
+                  for _, parameter, value, _ in self.estimates())
+        return f'<GyroModel: {", ".join(values) or "no errors"}>'
 
     def estimates(self) -> Iterator[tuple[str, Parameter, float, float]]:
         """Give effect name, parameter, value and standard deviation of each fitted value."""
@@ -191,13 +192,9 @@ class GyroModel:
 
     @cached_property
     def rate_limit(self) -> float:
-        """
-        Return the largest plausible output, rad/s.
-
-        It is twice the largest valid rate, but at least 10 rad/s, which robots reach: a model may
-        have been fitted at rest.
-
-        """
+        """Return the largest plausible output, rad/s."""
+        # It is twice the largest valid rate, but at least 10 rad/s, which robots reach: a model
+        # may have been fitted at rest.
         farther = max(map(abs, self.rate_range))
         return max(2.0 * farther, 10.0) if farther < math.inf else 100.0
 
@@ -231,25 +228,17 @@ class GyroModel:
 
     @cached_property
     def prior_deviations(self) -> Array | None:
-        """
-        Return the standard deviations of (s, b) before a calibration, shape (2,); inf if unknown.
-
-        The tolerance of a fleet model is the spread between units of a type. Tolerances of other
-        models are those of one gyro in a laboratory, and not used as a prior.
-
-        """
+        """Return the deviations of (s, b) before a calibration, shape (2,); inf if unknown."""
+        # The tolerance of a fleet model is the spread between units of a type. Tolerances of other
+        # models are those of one gyro in a laboratory, and not used as a prior.
         if 'fleet' not in self.origin:
             return None
         return np.array([getattr(self.tolerance, name) or math.inf
                          for name in ('scale_factor_error', 'bias')])
 
     def range_excess(self, output: Number, temperature: Number) -> tuple[Number, Number]:
-        """
-        Return how far outputs and temperatures are outside of the calibrated ranges, rad/s and K.
-
-        The range of temperatures includes that of the self-calibration.
-
-        """
+        """Return how far outputs and temperatures are out of the calibrated ranges, rad/s, K."""
+        # the range of temperatures includes that of the self-calibration
         low, high = self.valid_temperatures
         known = self.self_calibration.temperature if self.self_calibration else None
         if known is not None:
@@ -258,13 +247,9 @@ class GyroModel:
 
     @cached_property
     def rate_domain(self) -> tuple[float, float]:
-        """
-        Return the rates between which the response is inverted, rad/s.
-
-        They begin at the valid rate nearest to zero, and end where the output no longer grows with
-        the rate at some used temperature, or where the output would not be plausible.
-
-        """
+        """Return the rates between which the response is inverted, rad/s."""
+        # They begin at the valid rate nearest to zero, and end where the output no longer grows
+        # with the rate at some used temperature, or where the output would not be plausible.
         low, high = self.rate_range
         centre = min(max(0.0, low), high)
         down, up = (self._monotone_distance(centre, side) for side in (-1.0, 1.0))
@@ -381,22 +366,16 @@ def _split_terms(terms: Sequence[Term], channel: str) -> _TermSplit:
 def _sum_errors(terms: Sequence[Term], channels: Channels) -> Number:
     if not terms:
         return 0.0
-    total = terms[0].error_function(channels)
+    total = terms[0].error(channels)
     for term in terms[1:]:
-        total = total + term.error_function(channels)
+        total = total + term.error(channels)
     return total
 
 
 def _iterate_secant(g: Callable[[Number], Number], start: Number, low: float = -math.inf,
                     high: float = math.inf) -> tuple[Number, Number]:
-    """
-    Solve x = g(x) for a slope of g well below one; return x, and the last step.
-
-    The secant iteration takes one pass for a constant slope. The number of passes is fixed, so
-    that a sample and a log take the same steps; a single sample skips passes that would change
-    nothing, and is limited to the bounds.
-
-    """
+    """Solve x = g(x) for a slope of g well below one; return x, and the last step."""
+    # a single sample skips passes that would change nothing, and is limited to the bounds
     a, b = start, g(start)
     many, g_a, step = isinstance(b, np.ndarray), b, b - a
     for _ in range(6):

@@ -46,13 +46,7 @@ class MotionError(InputError):
 
 @dataclass(frozen=True)
 class Motion:
-    """
-    A motion, given at some times.
-
-    Between them the rate is linear where rates are given, and the heading is linear where only
-    headings are given.
-
-    """
+    """A motion: rates, linear between given times, or headings alone, linear between them."""
 
     time: Array  # s, increasing, shape (n,), beginning at 0
     heading: Array  # rad, continuous, shape (n,), beginning at 0
@@ -128,7 +122,9 @@ def _turns_and_rests(first_rest: float, turns: Iterable[tuple[float, float, floa
 
 #: 20 s that separate scale factor error from bias: both signs, two speeds, rests, ramps of 0.5 s,
 #: and the first heading at the end.
-CALIBRATION_MOTION = _turns_and_rests(1.0, ((4, 45, 1), (4, -45, 1), (3.5, 30, 1), (3.5, -30, 1)))
+CALIBRATION_MOTION = _turns_and_rests(1.0, (
+    (duration, rate, 1.0) for duration, speed in ((4.0, 45.0), (3.5, 30.0))
+    for rate in (speed, -speed)))
 #: 160 s of a robot in a building, half of it at rest or on straight paths: turns of 90 deg and the
 #: ramps after them.
 ROBOT_MOTION = _turns_and_rests(10.0, (
@@ -213,8 +209,11 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
     rate, heading = motion.rate_at(time), motion.heading_at(time)
-    degc = np.broadcast_to(model.reference_temperature if temperature is None else temperature,
-                           len(time)).astype(float)
+    degc = np.array(model.reference_temperature if temperature is None else temperature, float)
+    if degc.shape not in ((), time.shape):
+        raise InputError(f'temperature has the shape {degc.shape}; wanted one number, or one for '
+                         f'each sample, {time.shape}')
+    degc = np.broadcast_to(degc, time.shape).copy()
     channels = ChannelHistory().update(time, degc, heading=heading)
     output = simulate_gyro_output(model, time, channels.with_rate(rate, rate), generator)
     return Log(output=output, time=time, temperature=degc, reference_rate=rate,

@@ -52,38 +52,26 @@ class Noise:
                 + self.rate_random_walk ** 2 * duration / 3.0)
 
     def mean_change_variance(self, elapsed: Number, duration: float) -> Number:
-        """
-        Return the variance of the change of a mean over `duration` s after `elapsed` s, (rad/s)².
-
-        White noise is not included. Flicker with the two-sided spectrum B² / (2 pi f) has the
-        generalized covariance -B² / pi log|t|. Means over T at a distance t far above T then
-        differ with the variance 2 B² / pi (log(t / T) + 3/2).
-
-        """
+        """Return the variance of a change of means over `duration` s in `elapsed` s, (rad/s)²."""
+        # White noise is not included. Flicker with the two-sided spectrum B² / (2 pi f) has the
+        # generalized covariance -B² / pi log|t|. Means over T at a distance t far above T then
+        # differ with the variance 2 B² / pi (log(t / T) + 3/2).
         flicker = 2.0 / math.pi * self.bias_instability ** 2 * (
             np.log(np.maximum(elapsed / duration, 1.0)) + 1.5)
         return flicker + self.rate_random_walk ** 2 * np.maximum(elapsed, duration)
 
     def flicker_processes(self) -> tuple[Array, float]:
-        """
-        Return time constants, s, and variance, (rad/s)², of k Gauss-Markov processes for flicker.
-
-        The constants have shape (k,); all processes have the same variance. With time constants a
-        factor r apart and variances of B² ln(r) / pi, the two-sided spectrum between them is
-        B² / (2 pi f).
-
-        """
+        """Return k time constants, s, and the variance, (rad/s)², of processes for flicker."""
+        # The constants have shape (k,); all processes have the same variance. With time constants
+        # a factor r apart and variances of B² ln(r) / pi, the two-sided spectrum between them is
+        # B² / (2 pi f).
         constants = (_FLICKER_TIME_CONSTANTS
                      if self.bias_instability else _FLICKER_TIME_CONSTANTS[:0])
         return constants, self.bias_instability ** 2 * math.log(10.0) / math.pi
 
     def heading_variance(self, duration: Number) -> Number:
-        """
-        Return the variance, rad², of a heading after `duration` s.
-
-        The bias is estimated as its mean over the `BIAS_AVERAGING_TIME` s before.
-
-        """
+        """Return the variance, rad², of a heading after `duration` s."""
+        # The bias is estimated as its mean over the `BIAS_AVERAGING_TIME` s before.
         variance = (self.angle_random_walk ** 2 * duration + self.rate_random_walk ** 2
                     * (duration ** 3 + BIAS_AVERAGING_TIME * duration ** 2) / 3.0)
         constants, of_each = self.flicker_processes()
@@ -155,18 +143,13 @@ class GaussMarkov:
 
 @dataclass(frozen=True)
 class NoiseTerm:
-    """
-    A noise term by the slope of its Allan deviation (IEEE Std 952, C.1).
-
-    Its Allan variance is ``factor * coefficient² * tau ** (2 slope)``.
-
-    """
+    """A noise term by the slope of its Allan deviation (IEEE Std 952, C.1)."""
 
     name: str
     symbol: str
     unit: str  # in SI
     slope: float  # of log Allan deviation over log averaging time
-    allan_factor: float
+    allan_factor: float  # of coefficient² * time ** (2 slope) in the Allan variance
     #: Covariance of the angle at a time difference, for a coefficient of 1, except terms that
     #: second differences remove.
     angle_covariance: Callable[[Number], Array]
@@ -196,13 +179,9 @@ NOISE_TERMS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_
 
 def simulate_noise(noise: Noise, count: int, interval: float,
                    generator: np.random.Generator) -> Array:
-    """
-    Return noise of shape (count,), rad/s, for samples every `interval` s.
-
-    Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116; its spectrum is
-    B² / (2 pi f).
-
-    """
+    """Return noise of shape (count,), rad/s, for samples every `interval` s."""
+    # Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116; its spectrum is
+    # B² / (2 pi f).
     white = generator.standard_normal(count) * noise.angle_random_walk / math.sqrt(interval)
     innovations = generator.standard_normal(count) * noise.bias_instability
     response = np.cumprod(np.concatenate([[1.0], 1.0 - 0.5 / np.arange(1.0, count)]))

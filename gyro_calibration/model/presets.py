@@ -44,11 +44,6 @@ class Preset:
         return GyroModel((Term(SCALE_FACTOR_ERROR, (self.scale_factor_error,)),
                           Term(BIAS, (self.bias * DEGREE,))), noise=self.noise)
 
-    @property
-    def true_values(self) -> tuple[float, float]:
-        """Return scale factor error s, and bias b, rad/s."""
-        return self.scale_factor_error, self.bias * DEGREE
-
 
 XV3500 = Preset('XV3500', 'Epson XV-3500CB by Hong and Park 2008, sections 1, 2.1 and 4.2; their '
                 'bias is printed in deg/s, but only deg/min explains the drift',

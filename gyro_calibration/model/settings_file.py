@@ -133,16 +133,12 @@ def _parse_plain(text: str) -> Any:
 
 
 class _Loader(yaml.BaseLoader):
-    """
-    Reads names, texts, numbers and lists, and refuses aliases, tags and names given twice.
-
-    A few lines with aliases expand to gigabytes; deep nesting overflows the stack of Python.
-
-    """
+    """Reads names, texts, numbers and lists, and refuses aliases, tags and names given twice."""
 
     _depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        # a few lines with aliases expand to gigabytes; deep nesting overflows the stack of Python
         event: Any = self.peek_event()
         if event.anchor is not None:
             _refuse_node('an anchor or alias is not read; write out what it stands for', event)

@@ -65,16 +65,11 @@ def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussM
 
 @dataclass(frozen=True)
 class SimulatorParameters:
-    """
-    The parameters of a gyro that simulators support, in rad/s and s; 0 where there is none.
+    """The parameters of a gyro that simulators support, in rad/s and s; 0 where there is none."""
 
-    The bias is the output at rest, the white noise is the standard deviation of a sample.
-
-    """
-
-    bias: float
+    bias: float  # output at rest
     bias_deviation: float
-    white_noise: float
+    white_noise: float  # standard deviation of a sample
     wander: GaussMarkov
     saturation: float
     quantization: float
@@ -108,14 +103,10 @@ def simulator_parameters(model: GyroModel, sample_rate: float, temperature: floa
 
 
 def _format_sdf(parameters: SimulatorParameters) -> tuple[str, set[str]]:
-    """
-    Return the noise of the z axis for an `<imu>` in SDF.
-
-    Gazebo draws the sign of `bias_mean` at random and decays it with the correlation time, so the
-    bias is exported as the mean of the noise. `dynamic_bias_stddev` is the density of a
-    Gauss-Markov process.
-
-    """
+    """Return the noise of the z axis for an `<imu>` in SDF."""
+    # Gazebo draws the sign of `bias_mean` at random and decays it with the correlation time, so
+    # the bias is exported as the mean of the noise. `dynamic_bias_stddev` is the density of a
+    # Gauss-Markov process.
     values = {'mean': parameters.bias, 'stddev': parameters.white_noise, 'bias_mean': 0.0,
               'bias_stddev': parameters.bias_deviation}
     names = {'bias', 'bias_instability', 'rate_random_walk', 'angle_random_walk'}

@@ -148,15 +148,9 @@ class CalibrationRun:
 
 
 class Drive:
-    """
-    The commands of a run that drives the robot, and the guards that end it.
+    """The commands of a run that drives the robot, and the guards that end it."""
 
-    `command_lateness` and `sample_lateness` are the largest ones, s.
-
-    """
-
-    INTERVAL = 0.02
-    """Time between commands, s."""
+    INTERVAL = 0.02  # time between commands, s
 
     def __init__(self, run: CalibrationRun, motion: Motion, clock: Clock):
         """Start to wait for a receiver of the commands."""
@@ -165,7 +159,7 @@ class Drive:
         self._has_receiver = self._had_callers = self._lost_callers = False
         self._next_command_time = -math.inf
         self._stamp_delay = StampDelay(clock, DRIVE_SAMPLE_TIMEOUT, window=2.0)
-        self.command_lateness = self.sample_lateness = 0.0
+        self.command_lateness = self.sample_lateness = 0.0  # largest ones, s
 
     def add_sample(self, time: float) -> None:
         """Update the lateness of samples relative to the recent least delay."""
@@ -229,18 +223,13 @@ def _max_rate(motion: Motion) -> float:
 
 
 class CalibrationSession:
-    """
-    Calibrations on request; `run` is the one in progress, or None.
-
-    `warning` says that the robot kept turning after a drive, in a sentence or ''; `max_lateness`
-    is that of commands and of samples in the last drive, s.
-
-    """
+    """Calibrations on request; `run` is the one in progress, or None."""
 
     def __init__(self, estimator: HeadingEstimator, store: StateStore, monitor: HealthMonitor,
                  send: Callable[[float], None], clock: Clock):
         """Start without a run; `send` publishes a rate about z on cmd_vel, rad/s."""
         self.run: CalibrationRun | None = None
+        # that the robot kept turning after a drive; lateness in it of commands and samples, s
         self.warning, self.max_lateness = '', (0.0, 0.0)
         self._estimator, self._store, self._monitor = estimator, store, monitor
         self._send, self._clock = send, clock
@@ -257,12 +246,7 @@ class CalibrationSession:
     # Start
 
     def begin(self, kind: str, values: SimpleNamespace, obstacle: str = '') -> str:
-        """
-        Begin a run of a kind by the parameters of the node; return '', or why it is refused.
-
-        `obstacle` is why the robot must not be driven now, or ''.
-
-        """
+        """Begin a run by the parameters of the node; return '', or why it is refused."""
         if self.run:
             return 'a calibration is in progress; wait for its end, or call cancel_calibration'
         if self._store.problem:
@@ -491,12 +475,8 @@ class CalibrationSession:
 
 def fit_run(run: CalibrationRun, noise: Noise, date: str,
             prior: Array | None = None) -> tuple[SelfCalibration, str]:
-    """
-    Return the calibration by a complete run, and a remark; raise `DataRefused` as its methods do.
-
-    The prior is that of a fleet model; it is used in runs against a motion.
-
-    """
+    """Return the calibration by a run, and a remark; raise `DataRefused` as its methods do."""
+    # the prior is that of a fleet model, for runs against a motion
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
     limits = run.limits
     temperature = float(np.mean(run.temperatures)) if run.temperatures else None

@@ -24,7 +24,6 @@ import os
 from pathlib import Path
 import sys
 import time
-from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -98,11 +97,13 @@ class CompensationNode(Node):
     def __init__(self) -> None:
         """Read the model and the last calibration; without them raw rates are published."""
         super().__init__('compensation_node')
-        values = declare_parameters(self, PARAMETERS, self._use_parameters)
-        self._values, clock = values, NodeClock(self)
+        values = declare_parameters(self, PARAMETERS,
+                                    lambda changed: self._pipeline.use_parameters(changed))
+        clock = NodeClock(self)
         self._velocity: Publisher | None = None
         self._velocity_type = TwistStamped if values.cmd_vel_stamped else Twist
-        self._pipeline = Pipeline(values, self._calibration_file(), clock, self._publish_command)
+        self._pipeline = Pipeline(values, self._calibration_file(values.calibration_file), clock,
+                                  self._publish_command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
         self._receivers = 0
@@ -113,7 +114,7 @@ class CompensationNode(Node):
         self._diagnostics = Diagnostics(self, 'heading', lambda: self._report.make())
         session = self._pipeline.session
         self._offer_service('calibrate', lambda answer: self._calibrate(
-            self._values.calibration_reference, answer))
+            self._pipeline.values.calibration_reference, answer))
         self._offer_service('calibrate_bias', lambda answer: self._calibrate(REST, answer))
         self._offer_service('finish_calibration', lambda answer: self._fill_response(
             answer, *session.finish()))
@@ -125,9 +126,9 @@ class CompensationNode(Node):
         call_every(self, 0.2, self._poll_graph)
         self._publish_status()
 
-    def _calibration_file(self) -> Path:
-        if self._values.calibration_file:
-            return Path(os.path.expanduser(self._values.calibration_file))
+    def _calibration_file(self, path: str) -> Path:
+        if path:
+            return Path(os.path.expanduser(path))
         home = Path(os.path.expanduser(os.environ.get('ROS_HOME', '~/.ros')))
         name = self.get_fully_qualified_name().strip('/').replace('/', '_')
         return home / 'gyro_calibration' / f'{name}.yaml'
@@ -139,7 +140,7 @@ class CompensationNode(Node):
         self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
         self._has_subscribers = {self._heading: False, self._yaw_rate: False}
         self._pose_message = PoseWithCovarianceStamped()
-        self._pose_message.header.frame_id = self._values.heading_frame
+        self._pose_message.header.frame_id = self._pipeline.values.heading_frame
         self._rate_message = TwistWithCovarianceStamped()
         for place in range(5):
             self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
@@ -150,17 +151,13 @@ class CompensationNode(Node):
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
         subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
-        if self._values.calibration_drive:
+        if self._pipeline.values.calibration_drive:
             self._offer_velocity()  # calibrate reports a failure
 
     def _offer_service(self, name: str,
                        fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
         allow_future_response(
             self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response)))
-
-    def _use_parameters(self, values: SimpleNamespace) -> None:
-        self._values = values
-        self._pipeline.use_parameters(values)
 
     # Subscriptions
 
@@ -204,7 +201,7 @@ class CompensationNode(Node):
             xx = yy = UNMEASURED_VARIANCE
             xy = yx = 0.0
         elif not (xx or yy):  # all zeros: not known
-            xx = yy = self._values.assumed_bias ** 2
+            xx = yy = self._pipeline.values.assumed_bias ** 2
         imu.angular_velocity_covariance[:] = (xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0,
                                               corrected.rate_variance)
         covariance = imu.linear_acceleration_covariance.tolist()
@@ -260,11 +257,10 @@ class CompensationNode(Node):
 
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
         """Begin a run, which `_answer_finished_run` answers, or refuse with the reason."""
-        session = self._pipeline.session
-        obstacle = ''
-        if self._values.calibration_drive:
+        session, values, obstacle = self._pipeline.session, self._pipeline.values, ''
+        if values.calibration_drive:
             obstacle = self._offer_velocity() or self._pipeline.find_obstacle()
-        if refusal := session.begin(kind, self._values, obstacle):
+        if refusal := session.begin(kind, values, obstacle):
             return self._refuse(response, refusal)
         if session.is_driving:
             self._timer = call_every(self, Drive.INTERVAL, self._drive)
@@ -420,9 +416,11 @@ class CompensationReport:
         elif estimator.temperature is not None and estimator.is_temperature_lost:
             yield (f'the temperature is missing; {estimator.temperature:.1f} degC, the last one, '
                    'is held, and the standard deviation of the bias increases')
-        for channel in estimator.missing_channels(pipeline.journal.channels):
-            yield (f'the model needs the {channel.replace("_", " ")}, which no message contains; '
-                   'that effect is left out')
+        for channel in ('supply', 'specific_force'):
+            if (estimator.current_model.uses_channel(channel)
+                    and channel not in pipeline.journal.channels):
+                yield (f'the model needs the {channel.replace("_", " ")}, which no message '
+                       'contains; that effect is left out')
         yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
                     pipeline.odometry_fault, store.calibration_hint, store.shared_hint,
                     monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,

@@ -29,6 +29,7 @@ from gyro_calibration.driver.connection import (
     ConnectionCounts,
     ConnectionState,
     Decimator,
+    MAX_BAUD,
     SampleMean,
 )
 from gyro_calibration.driver.protocols import AUTO, Sample, Settings
@@ -65,7 +66,7 @@ PARAMETERS = (
               f'Wire format of the gyro, see wire formats; {AUTO} finds it by listening.'),
     Parameter('baud', 0,
               'Speed of the line; 0 is that of the protocol, or found by listening where that is '
-              'auto.', 'bit/s', (0, 4000000)),
+              'auto.', 'bit/s', (0, MAX_BAUD)),
     Parameter('frame_id', 'gyro', 'Frame of the gyro, whose z is its input axis.'),
     Parameter('axis', 'z', 'Axis to read of a gyro with three.', choices=('x', 'y', 'z')),
     Parameter('invert', 'default',

@@ -62,7 +62,8 @@ class RepeatedOutputDetector:
     20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
     larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
     a repeated zero counts only after a deceleration that no robot has, 20 rad/s², or if a whole
-    stretch at rest had the noise of the model before the first such zero.
+    stretch at rest had the noise of the model before the first such zero. Two neighbouring codes,
+    as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above.
 
     """
 
@@ -71,21 +72,25 @@ class RepeatedOutputDetector:
         self._noise, self._step, self._changes = noise, math.inf, 0
         self._value, self._since, self._count, self._had_sudden_stop = math.nan, 0.0, 0, False
         self._reports_zero = False
+        # Smallest and largest value since a time, s, and the number of samples after the first.
+        self._band = math.nan, math.nan, 0.0, 0
 
     def add(self, time: float, output: float, odometry_rate: float,
             has_noise_at_rest: bool = False) -> bool:
         """Add a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
-        if output != self._value:
-            step = abs(output - self._value)
+        step = abs(output - self._value)
+        if step:
             self._step = min(step, self._step)
+        toggles = self._toggles(time, output, has_noise_at_rest)
+        if output != self._value:
             self._had_sudden_stop = step > _MIN_TURN_RATE + 20.0 * abs(time - self._since)
             self._value, self._since, self._count = output, time, 0
             self._changes += 1
-            return False
+            return toggles
         self._count += 1
         lasts = time - self._since
-        if self._count < 20 or lasts < 0.25:
-            return False
+        if toggles or self._count < 20 or lasts < 0.25:
+            return toggles
         if (lasts > _PART_DURATION and abs(odometry_rate) > _MIN_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
@@ -96,20 +101,40 @@ class RepeatedOutputDetector:
         if (output == 0.0 and self._reports_zero and not self._had_sudden_stop
                 or self._changes <= 100 or not sample):
             return False
-        # probability of one more equal sample, for low noise around the value; that of all must be
-        # below e^-100, since it is e^-25 for a gyro that sends each sample four times
-        repeats = math.erf(_MAX_NOISE_REDUCTION * self._step / (2.0 * math.sqrt(2.0) * sample))
         return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
-                or -self._count * math.log(max(repeats, 1e-9)) > 100.0)
+                or self._excludes_chance(self._step, self._count, sample))
+
+    def _toggles(self, time: float, output: float, has_noise_at_rest: bool) -> bool:
+        """Tell whether the output has two neighbouring codes for longer than noise allows."""
+        low, high, since, count = self._band
+        low, high, count = min(low, output), max(high, output), count + 1
+        if not high - low < 1.5 * self._step:
+            low, high, since, count = output, output, time, 0
+        self._band = low, high, since, count
+        lasts = time - since
+        sample = self._noise.angle_random_walk / math.sqrt(lasts / count) if lasts > 0.25 else 0.0
+        return (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
+                and self._changes > 100 and sample > 0.0
+                and self._excludes_chance(2.0 * self._step, count, sample))
+
+    def _excludes_chance(self, width: float, count: int, sample: float) -> bool:
+        """
+        Tell whether a live gyro cannot have `count` samples within a width, rad/s.
+
+        The noise of a sample, rad/s, may be lower than that of the model. The probability must be
+        below e^-100, since it is e^-25 for a gyro that sends each sample four times.
+
+        """
+        stays = math.erf(_MAX_NOISE_REDUCTION * width / (2.0 * math.sqrt(2.0) * sample))
+        return -count * math.log(max(stays, 1e-9)) > 100.0
 
 
 class HealthMonitor:
     """
     Monitor of noise and bias at rest on a robot.
 
-    `noise_alarm` and `bias_alarm` are a sentence each, or ''; `last_rest` is the last stretch at
-    rest, or None, `examined_count` the number of them, and `has_noise_at_rest` whether one had the
-    noise and the bias of the model.
+    The alarms are a sentence each, or ''; `examined_count` is the number of stretches at rest, and
+    `has_noise_at_rest` tells whether one had the noise and the bias of the model.
 
     """
 

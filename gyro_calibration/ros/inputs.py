@@ -53,12 +53,7 @@ class Parameter:
         return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
 
     def check(self, value: object) -> object:
-        """
-        Return the value in the type of the default; an integer is accepted for a float.
-
-        A `ValueError` states the valid ones.
-
-        """
+        """Return the value in the type of the default, or raise `ValueError` with valid ones."""
         if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:
             value = float(value)
         several = isinstance(self.default, Sequence) and not isinstance(self.default, str)
@@ -112,17 +107,12 @@ def node_time(clock: Clock) -> float:
 
 
 class StampDelay:
-    """
-    Delay of stamps behind the clock of a node, and a test whether both advance equally.
-
-    `min_delay` is the least delay of recent samples, s; nan before the first.
-
-    """
+    """Delay of stamps behind the clock of a node, and a test whether both advance equally."""
 
     def __init__(self, clock: Clock, tolerance: float, window: float):
         """Start without samples; tolerance of their delay and window of the test, both in s."""
         self._clock, self._tolerance, self._window = clock, tolerance, window
-        self.min_delay = math.nan
+        self.min_delay = math.nan  # of recent samples, s
         # Time of arrival and delay, s, of samples with less delay than any after them.
         self._min_delays = deque[tuple[float, float]]()
         self._previous: tuple[float, float] | None = None
@@ -158,34 +148,25 @@ class StampDelay:
 
 
 class RosTime:
-    """
-    Whether ROS time advances.
-
-    `paused_duration` is the time since its last advance, s of the steady clock; 0 where it is not
-    simulated, inf before a simulation starts.
-
-    """
+    """Whether ROS time advances."""
 
     def __init__(self) -> None:
         """Start without readings."""
+        # time since its last advance, s of the steady clock; 0 where it is not simulated, inf
+        # before a simulation starts
         self.paused_duration = 0.0
         self._last: float | None = -1.0
         self._last_change = self._last_poll = 0.0
 
     def poll(self, clock: Clock) -> None:
-        """
-        Compare with the last poll; to be called by one timer.
-
-        Only the time up to that poll counts: after a pause of this process, queued messages of
-        /clock are delivered after its timers.
-        """
+        """Compare with the last poll; to be called by one timer."""
+        # Only the time up to that poll counts: after a pause of this process, queued messages of
+        # /clock are delivered after its timers.
         now, time = clock.steady(), clock.simulated()
         if time != self._last:
             self._last, self._last_change, self._last_poll = time, now, now
-        if time is None:
-            self.paused_duration = 0.0
-        else:
-            self.paused_duration = self._last_poll - self._last_change if time else math.inf
+        self.paused_duration = (0.0 if time is None else math.inf if not time
+                                else self._last_poll - self._last_change)
         self._last_poll = now
 
 
@@ -206,11 +187,6 @@ class Velocity:
     angular: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
-    def is_finite(self) -> bool:
-        """Tell whether all parts are finite."""
-        return all(math.isfinite(part) for part in (*self.linear, *self.angular))
-
-    @property
     def is_moving(self) -> bool:
         """Tell whether it exceeds the speeds at standstill."""
         return (any(abs(part) > STANDSTILL_SPEED for part in self.linear)
@@ -229,7 +205,7 @@ class Wheels:
 
     def add(self, source: str, velocity: Velocity, now: float) -> None:
         """Add a velocity at its time of arrival, s; one that is not finite is ignored."""
-        if not velocity.is_finite:
+        if not all(map(math.isfinite, (*velocity.linear, *velocity.angular))):
             return
         then, _ = self._last.get(source, (-math.inf, None))
         if velocity.is_moving or now - then > MAX_VELOCITY_AGE:

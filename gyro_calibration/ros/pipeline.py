@@ -31,6 +31,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
+from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pair
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
@@ -78,15 +79,15 @@ PARAMETERS = (
     Parameter('stationary.method', 'rest',
               'How standstill is found: by the statistics of the rate, by the threshold filter, '
               'or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),
-    Parameter('stationary.threshold', 0.3 * DEGREE,
+    Parameter('stationary.threshold', Threshold.rate,
               'Threshold filter: a mean rate over 0.2 s below it is zero; 0 switches it off.',
               'rad/s', (0.0, 0.1), True),
-    Parameter('assumed.bias', 0.5 * DEGREE,
+    Parameter('assumed.bias', Assumptions.bias,
               'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
-    Parameter('assumed.scale_factor_error', 0.03,
+    Parameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
               'Standard deviation of the scale factor error without a calibration.', '1',
               (0.0, 1.0)),
-    Parameter('assumed.bias_temperature_coefficient', 0.03 * DEGREE,
+    Parameter('assumed.bias_temperature_coefficient', Assumptions.bias_temperature_coefficient,
               'Standard deviation of the change of the bias with temperature; 0 for a gyro that '
               'compensates it.', 'rad/s/K', (0.0, 0.1)),
     Parameter('calibration.reference', 'profile', 'What calibrate compares the gyro with.',
@@ -101,7 +102,7 @@ PARAMETERS = (
               'number that the gyro shows.', '', (-100, 100), True),
     Parameter('calibration.odometry_scale_deviation', 0.01,
               'Standard deviation of the scale of turns by odometry.', '1', (0.0, 0.5), True),
-    Parameter('calibration.maximum_bias', 10.0 * DEGREE,
+    Parameter('calibration.maximum_bias', RunLimits.max_bias,
               'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
@@ -116,18 +117,13 @@ _INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several
 
 
 class CorrectedSample(NamedTuple):
-    """
-    A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
+    """A corrected sample."""
 
-    Where the noise of the gyro is unknown, the heading counts as not measured.
-
-    """
-
-    stamp: int
-    heading: float
-    heading_variance: float
-    rate: float
-    rate_variance: float
+    stamp: int  # ns
+    heading: float  # rad
+    heading_variance: float  # rad²; as not measured where the noise of the gyro is unknown
+    rate: float  # rad/s
+    rate_variance: float  # (rad/s)²
 
 
 COUNT_NAMES = ('samples', 'refused_samples', 'refused_temperatures', 'lost_samples',
@@ -157,23 +153,11 @@ def _tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
 
 
 class Pipeline:
-    """
-    Computes corrected rates and the heading from raw samples.
-
-    `conflict` says why samples cannot be used, `publisher_conflict` that the graph lists several
-    publishers, `repeat_fault` that the gyro repeats one value, and `clock_fault` that stamps and
-    clock advance differently, each in a sentence or ''.
-
-    """
+    """Computes corrected rates and the heading from raw samples; faults are sentences or ''."""
 
     def __init__(self, values: SimpleNamespace, calibration_file: Path, clock: Clock,
                  send: Callable[[float], None]):
-        """
-        Read model and last calibration; faults of the files are reported.
-
-        `values` are those of `PARAMETERS`; `send` publishes a rate about z on cmd_vel, rad/s.
-
-        """
+        """Read model and calibration; `send` publishes a rate about z on cmd_vel, rad/s."""
         self.values, self._clock = values, clock
         coefficient = values.assumed_bias_temperature_coefficient
         self.store = store = StateStore(
@@ -185,13 +169,13 @@ class Pipeline:
         self.estimator = HeadingEstimator(
             store.model, store.table,
             Assumptions(values.assumed_bias, values.assumed_scale_factor_error, coefficient),
-            self._tracking_settings, TEMPERATURE_TIMEOUT, clock.date())
+            self._tracking_settings, clock.date())
         # false alarms: 0.001 per hour of rest
         self.monitor = HealthMonitor(noise, 0.001, self._tracking_settings.threshold.rate)
         self.wheels, self.journal = Wheels(), Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
-        self.conflict = ''
+        self.conflict = ''  # why samples cannot be used
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -199,6 +183,7 @@ class Pipeline:
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
         self._first_frame: str | None = None
         self._frame: str | None = None
+        # that the graph lists several publishers, and samples too soon after the one before
         self.publisher_conflict, self._interleaved_count = '', 0
         self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
@@ -387,12 +372,8 @@ class Pipeline:
 
     def _integrate(self, time: float, since: tuple[float, float], output: float,
                    force: float | None, now: float) -> bool:
-        """
-        Compensate and integrate a sample, and tell whether it was used.
-
-        `since` is the interval from the sample before, by stamps and by arrivals, s.
-
-        """
+        """Compensate and integrate a sample, and tell whether it was used."""
+        # `since` is the interval from the sample before, by stamps and by arrivals, s.
         estimator, journal, refused = self.estimator, self.journal, self.estimator.refused_count
         counts, intervals = journal.counts, estimator.tracker.intervals
         sources = _WHEEL_SOURCES[self.values.wheels]
@@ -494,15 +475,9 @@ class Pipeline:
             self._trusted_heading = tracker.heading, tracker.variance
 
     def _detect_interleaving(self, stamp: int) -> None:
-        """
-        Count samples that follow too soon to be of the same publisher.
-
-        A sample of a second publisher divides an interval, so that one part is at most half of it.
-        A restarted driver sends alone, although the middleware lists the killed one for up to 20
-        s; one that sends twice as fast is refused until then. Delayed samples also follow too
-        soon, until they have caught up.
-
-        """
+        """Count samples that follow too soon to be of the same publisher."""
+        # A restarted driver that sends twice as fast as before is refused while the middleware
+        # lists the killed one. Delayed samples also follow too soon, until they have caught up.
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
         interval, behind = stamp - self._last_stamp, self._backlog
         begins = self._clock.steady() - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
@@ -525,7 +500,7 @@ class Pipeline:
         if self.wheels.is_moving(now):
             return 'odom or cmd_vel shows that the robot moves: stop it, and run again'
         bias, deviation = self.estimator.tracker.bias
-        rate = sum(each for _, each in self._recent_rates) / max(len(self._recent_rates), 1) - bias
+        rate = sum(each for _, each in self._recent_rates) / len(self._recent_rates) - bias
         noise = self.store.model.noise.angle_random_walk / math.sqrt(_TURN_CHECK_DURATION)
         if abs(rate) > 4.0 * math.hypot(deviation, noise, self._tracking_settings.threshold.rate):
             return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: stop the robot, or, if '

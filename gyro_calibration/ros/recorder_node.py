@@ -43,13 +43,7 @@ _TYPE_ALIASES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'oc
 
 
 class RecorderNode(Node):
-    """
-    Subscribes to topics as they appear, and hands over each message with its definition.
-
-    `topics` are the full names of the requested ones; `unknown_topics` those whose type is not
-    installed, with the reason.
-
-    """
+    """Subscribes to topics as they appear, and hands over each message with its definition."""
 
     def __init__(self, topics: Sequence[str], all_topics: bool,
                  on_message: Callable[[Message, str], None], context: rclpy.Context):
@@ -60,7 +54,7 @@ class RecorderNode(Node):
         except (RuntimeError, ValueError) as error:
             raise LogError(f'{", ".join(topics)}: no topic name ({_describe_error(error)}); '
                            'give another') from None
-        self.unknown_topics: dict[str, str] = {}
+        self.unknown_topics: dict[str, str] = {}  # with a type that is not installed: the reason
         self.message_count = 0
         self._all_topics, self._on_message = all_topics, on_message
         self._taken: dict[str, Subscription | None] = {}  # topics; None for an unknown type
@@ -72,10 +66,6 @@ class RecorderNode(Node):
     def missing_topics(self) -> list[str]:
         """Return the requested topics without a publisher so far."""
         return [topic for topic in self.topics if topic not in self._taken]
-
-    def known_topics(self) -> list[str]:
-        """Return the topics in the graph."""
-        return sorted(name for name, _ in self.get_topic_names_and_types())
 
     def poll(self) -> None:
         """Subscribe to new topics in the graph."""
@@ -168,12 +158,8 @@ def take_messages(topics: Sequence[str], all_topics: bool,
     Receive the messages of these topics, or of all, until an event is set.
 
     `on_message` is called with each message and its definition, and `tick` at least every 50 ms
-    with the node.
-
-    Raises
-    ------
-    LogError : a topic name is not valid, or ROS 2 cannot be started, as with an invalid
-        ROS_DOMAIN_ID
+    with the node. Raise `LogError` where a topic name is not valid, or ROS 2 cannot be started, as
+    with an invalid ROS_DOMAIN_ID.
 
     """
     context = rclpy.Context()

@@ -80,11 +80,11 @@ def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_Q
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
-def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[..., None],
-                 qos: QoSProfile = SENSOR_QOS) -> Subscription:
+def subscribe_to(node: Node, kind: type, topic: str,
+                 callback: Callable[..., None]) -> Subscription:
     """Return a subscription whose quality of service parameters may override."""
     return node.create_subscription(
-        kind, topic, callback, qos,
+        kind, topic, callback, SENSOR_QOS,
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
@@ -95,11 +95,8 @@ def declare_parameters(
     """
     Declare the parameters of a table and return their values as one record.
 
-    `on_change` is called with the record of all values after a change.
-
-    Raises
-    ------
-    ValueError : an override has the wrong type or is out of range; the message is one sentence
+    `on_change` is called with the record of all values after a change. `ValueError` says in a
+    sentence that an override has the wrong type or is out of range.
 
     """
     known = {each.name: each for each in table}
@@ -179,12 +176,7 @@ class Diagnostics:
 
     def __init__(self, node: Node, name: str, report: Callable[[], Report],
                  hardware_id: str = 'none'):
-        """
-        Create the publisher of diagnostics with a status name, such as ``'gyro'``.
-
-        `report` is never called concurrently, and must not call `publish`.
-
-        """
+        """Create the publisher; `report` is never called concurrently, nor may call `publish`."""
         self.level: bytes | None = None
         self._node, self._name, self._hardware = node, name, hardware_id
         self._report, self._lock = report, threading.Lock()

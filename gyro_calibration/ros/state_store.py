@@ -40,16 +40,11 @@ from gyro_calibration.model.model_file import ModelError, ModelNotFound, read_mo
 
 class StateStore:
     """
-    The files of one gyro.
+    The files of one gyro: its model, empty if it cannot be read, and its table of biases at rest.
 
-    Attributes
-    ----------
-    model : the model with its self-calibration; an empty one if it cannot be read
-    table : biases at rest
-    problem : why the rates are uncalibrated, in a sentence; ''
-    calibration_hint, table_hint : fault of the calibration file and of the bias table; ''
-    shared_hint : that another process has written to a file; ''
-    table_written_time : time when the bias table was last written, s since 1970; None before
+    `problem` says why the rates are uncalibrated, `calibration_hint` and `table_hint` a fault of
+    the calibration file and of the table, `shared_hint` that another process has written to a
+    file, each in a sentence or ''. `table_written_time` is in s since 1970, None before the first.
 
     """
 

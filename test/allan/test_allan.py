@@ -14,11 +14,12 @@ import json
 import math
 
 from chance import fewest, mean_bound, most, rms_bounds
-from gyro_calibration.allan import allan_deviation, build_rest_record, fit_noise, NOISE_TERMS
+from gyro_calibration.allan.deviation import allan_deviation, build_rest_record
+from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.cli.allan import figure_labels
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
+from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, NOISE_TERMS, simulate_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter

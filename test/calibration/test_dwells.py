@@ -86,12 +86,6 @@ def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
     assert list(found.sweep[turning]) == list(np.repeat([0, 1, 2], len(sweep))[turning])
 
 
-def test_a_rate_that_is_repeated_where_sweeps_turn_belongs_to_both():
-    up = [-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]
-    found = dwells_from_table(table([*up, *up[::-1], *up, *up[::-1]]))
-    assert list(found.sweep) == list(np.repeat([0, 1, 2, 3], 7))
-
-
 @pytest.mark.parametrize('rates, more, sweeps', [
     ([1, 2, 3, 4], {'sweep': ('cold', 'warm', 'cold', 'warm')}, [0, 1, 0, 1]),
     ([-100, -50, 0, 50, 100, 50, 0, -50, -100], {}, [0] * 5 + [1] * 4),
@@ -314,15 +308,3 @@ def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):
 def test_a_turntable_that_turns_back_before_it_is_steady_is_refused(data):
     with pytest.raises(DataRefused, match='likelihood'):
         find_dwells(read_log(data / 'mems_encoder_turntable' / 'yaw_fast.csv.gz'))
-
-
-@pytest.mark.parametrize('name', ['slow', 'fast'])
-def test_a_motion_of_the_hand_gives_its_rests_only(data, name):
-    log = read_log(data / 'mems_motion_capture' / f'{name}.csv.gz')
-    found = find_dwells(log)
-    assert len(found) == 2 and (np.abs(found.rate) < 0.05 * DEGREE).all()
-    moving = log.time[log.moving > 0.5]
-    ends = [[float(word) for word in place.split() if word[0].isdigit()]
-            for place in found.location]
-    # The hand stands still a little before the recording says so.
-    assert ends[0][1] < moving[0] and ends[1][0] > moving[-1] - 1.0

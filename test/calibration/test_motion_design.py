@@ -133,7 +133,7 @@ def test_a_calibration_states_what_the_plan_promised(size):
     """Within 1.1, for a gyro of consumer grade and a fine one, with the rest after the run."""
     noise, deviations = Noise(size * WHITE.angle_random_walk), []
     time = np.arange(2450) / 100.0
-    for seed in range(24):
+    for seed in range(12):
         rate = np.where(time <= 20.0, CALIBRATION_MOTION.rate_at(time), 0.0) + simulate_noise(
             noise, len(time), 0.01, np.random.default_rng([3, seed]))
         fit = self_calibrate(time[time < 21.0], rate[time < 21.0], CALIBRATION_MOTION, noise=noise,

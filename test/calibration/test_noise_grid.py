@@ -20,7 +20,6 @@ from gyro_calibration.calibration.noise_grid import (
     fit_noise_grid,
     heading_noise,
     SharedNoise,
-    TridiagonalMatrix,
 )
 import numpy as np
 import pytest
@@ -73,16 +72,6 @@ def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
 
 def _shared(name, variance, size):
     return SharedNoise(name, variance, (size, size))
-
-
-def test_whitened_noise_is_independent():
-    diagonal, neighbours = np.linspace(2.0, 3.0, 30), np.full(30, -0.8)
-    matrix = TridiagonalMatrix(diagonal, neighbours)
-    dense = np.diag(diagonal) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
-    whitened = matrix.whiten(np.eye(30))
-    np.testing.assert_allclose(whitened @ dense @ whitened.T, np.eye(30), atol=1e-12)
-    np.testing.assert_allclose(matrix.solve(dense), np.eye(30), atol=1e-12)
-    assert matrix.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1])
 
 
 def test_the_sizes_of_the_noise_are_found():

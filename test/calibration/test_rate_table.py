@@ -15,13 +15,17 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
-from gyro_calibration.calibration.scatter import estimate_scatter, find_inliers, Scatter
+from gyro_calibration.calibration.scatter import (
+    cross_validation_parts,
+    estimate_scatter,
+    find_inliers,
+    Scatter,
+)
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
-    polynomial_to_matrix,
     rate_temperature_polynomial,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
@@ -31,7 +35,6 @@ from gyro_calibration.model.effects import (
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
-from numpy.polynomial.polynomial import polyval2d
 import pytest
 from recovery import CUBIC, gyros, LINEAR, POLYNOMIAL, run, SINE, Table
 from scipy.stats import binom, chi2, linregress
@@ -120,6 +123,7 @@ def test_the_shape_of_a_sine_is_found_wherever_it_is(k):
 
 def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_scatter_alike():
     table = measured(CUBIC, sweeps=3)
+    table = replace(table, sweep=np.zeros(len(table), int))
     fit = fit_effects(table, [term.effect for term in CUBIC], alike(table))
     columns = np.column_stack(
         [column for term in fit.terms for column in term.columns(channels_of(table))])
@@ -131,20 +135,6 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
     sizes = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(fit.model.covariance / np.outer(sizes, sizes),
                                covariance / np.outer(sizes, sizes), atol=1e-5)
-
-
-def test_the_matrix_of_the_paper_is_the_polynomial():
-    table = measured(SINE)
-    fit = fit_effects(table, [rate_temperature_polynomial(3, 2)])
-    matrix = polynomial_to_matrix(fit.terms[0].effect, fit.terms[0].values)
-    by_matrix = polyval2d(table.temperature, table.output / DEGREE, matrix[::-1, ::-1])
-    np.testing.assert_allclose(by_matrix * DEGREE, fit.terms[0].error(channels_of(table)),
-                               atol=1e-9)
-    raw = np.column_stack([table.temperature ** j * (table.output / DEGREE) ** i for j in range(3)
-                           for i in range(4)])
-    columns = np.column_stack(fit.terms[0].columns(channels_of(table)))
-    assert (fit.condition_number < 100.0
-            and np.linalg.cond(columns) < 1e3 < 1e9 < np.linalg.cond(raw))
 
 
 # few dwells
@@ -188,6 +178,25 @@ def test_what_is_left_out_is_what_a_fit_without_the_sweep_gives():
     np.testing.assert_allclose(fit.left_out_residual[~seen],
                                hidden.output - hidden.rate - without.error(channels_of(hidden)),
                                atol=1e-9)
+
+
+def test_what_is_left_out_of_one_of_few_sweeps_is_predicted_by_the_rest_of_the_sweep_too():
+    table = measured(CUBIC, sweeps=2, sweep_bias=0.2 * DEGREE)
+    fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR))
+    shared = fit.scatter.sweep_columns(table)
+    covariance = (np.diag(fit.scatter.deviation(table) ** 2)
+                  + shared @ shared.T * (table.sweep[:, None] == table.sweep))
+    columns = np.column_stack([np.ones(len(table)), table.rate])
+    error, part = table.output - table.rate, cross_validation_parts(table)
+    for hidden in (part == number for number in range(part.max() + 1)):
+        inverse = np.linalg.inv(covariance[np.ix_(~hidden, ~hidden)])
+        known = columns[~hidden]
+        values = np.linalg.solve(known.T @ inverse @ known, known.T @ inverse @ error[~hidden])
+        left = error - columns @ values
+        np.testing.assert_allclose(
+            fit.left_out_residual[hidden],
+            left[hidden] - covariance[np.ix_(hidden, ~hidden)] @ inverse @ left[~hidden],
+            atol=1e-9)
 
 
 def test_what_one_sweep_alone_shows_cannot_be_left_out():

@@ -131,13 +131,6 @@ def test_a_robot_that_does_not_reach_the_rates_of_the_profile_is_refused_by_its_
     assert found == pytest.approx(limit, abs=0.5 + 0.025 * 45)
 
 
-def test_a_run_of_which_a_part_is_short_is_refused_by_a_turn_that_explains_it():
-    short = np.where(TIME > 11.0, -0.06, 0.0) * CALIBRATION_MOTION.rate_at(TIME)
-    with pytest.raises(DataRefused, match='differs by .* deg from the profile') as refused:
-        self_calibrate(TIME, output() + short, CALIBRATION_MOTION)
-    assert float(re.search(r'differs by ([\d.]+) deg', str(refused.value))[1]) > 5.0
-
-
 def test_a_run_without_known_noise_is_judged_by_the_noise_of_its_samples():
     """White noise of a gyro is no fault; a robot that swings about its profile is one."""
     limits = RunLimits(max_scale_deviation=1.0, max_heading_error=math.tau)
@@ -157,7 +150,7 @@ def test_a_scale_factor_error_that_gyros_hardly_have_is_remarked_with_a_remedy()
 
 def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_length():
     """The node serves nothing else meanwhile; short pieces only would take 10 times as long."""
-    time, work = np.arange(30000) / 100.0, []
+    time, work = np.arange(12000) / 100.0, []
     motion = motion_from_rates(time, 0.5 * np.sin(0.5 * time))
     rate = ((1.0 + S) * motion.rate_at(time) + B + 0.3 * ((time > 9.0) & (time < 9.7))
             + 1e-3 * np.random.default_rng(0).standard_normal(len(time)))

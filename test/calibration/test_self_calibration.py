@@ -24,7 +24,6 @@ from gyro_calibration.calibration.self_calibration import (
     fit_heading,
     fit_likelihood,
     fit_rate,
-    RunLimits,
     self_calibrate,
 )
 from gyro_calibration.heading.integration import integrate
@@ -237,12 +236,6 @@ def test_a_good_rest_is_not_refused():
     rests = (simulate_noise(flicker, len(TIME), 0.01, np.random.default_rng(seed))
              for seed in range(200))
     assert all(abs(calibrate_bias(TIME, rest, noise=flicker)[0]) < 0.1 * DEGREE for rest in rests)
-
-
-def test_limits_are_for_the_caller_to_set():
-    fit = self_calibrate(TIME, run(s=-0.4), CALIBRATION_MOTION,
-                         limits=RunLimits(max_scale_factor_error=0.5))
-    assert fit.scale_factor_error == pytest.approx(-0.4, abs=0.002)
 
 
 def heading_error(log, start, calibrated):

@@ -128,12 +128,6 @@ def sweeps(seed=0, deviation=1e-5, odd=None):
                  sweep=number)
 
 
-def test_errors_that_are_nothing_but_scatter_are_predicted_as_large_as_they_are():
-    found = sweeps(3, 0.01)
-    rate = fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)).left_out_rate
-    assert rms(rate - found.rate) / DEGREE == pytest.approx(0.01, rel=0.3)
-
-
 def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
     found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
                   [0, 0, 1, 1, 2])
@@ -245,19 +239,6 @@ def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
     (tmp_path / 'outlying.csv').write_text('\n'.join(lines))
     assert ('1 outlying dwells are left out: row 4'
             in run(tmp_path / 'outlying.csv', '--model', model)[1])
-
-
-def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model, tmp_path):
-    time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
-    motion = motion_from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
-    write_log(tmp_path / 'log.csv', simulate(GYRO, motion, 50.0, np.random.default_rng(2)))
-    code, text, _ = run(tmp_path / 'log.csv', '--model', model, '--json')
-    answer = json.loads(text)
-    assert code == 0 and answer['turns'] == 2
-    rate = np.array(answer['rate_rad_s'])
-    expected = ((GYRO.output(rate, np.full(2, 25.0)) - GYRO.output(0.0, 25.0) - rate) * TURN
-                / np.abs(rate))
-    assert answer['static_rad_per_turn'] == pytest.approx(expected, abs=5e-3)
 
 
 def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_path):

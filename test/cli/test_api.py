@@ -60,7 +60,7 @@ def run_model():
 def test_allan_is_a_function_and_a_folder_whichever_comes_first(order):
     program = order.format('from gyro_calibration import allan') + """
 import gyro_calibration, gyro_calibration.allan.deviation as chart, numpy
-from gyro_calibration.allan import allan_deviation
+from gyro_calibration.allan.deviation import allan_deviation
 log = gyro_calibration.simulate(gyro_calibration.read_model(
     {'effects': {}, 'noise': {'angle_random_walk': 1e-3}}), 'rest', seed=1)
 assert str(allan(log)) == str(gyro_calibration.allan(log)) and chart.allan_deviation
@@ -145,6 +145,18 @@ def test_a_diagnosis_names_its_causes_and_writes_its_files(tmp_path):
     assert 'cubic_nonlinearity' in found.causes
     found.write(tmp_path)
     assert read_model(tmp_path / 'model.yaml').terms == found.model.terms
+    assert repr(found.model).startswith('<GyroModel: ') and 'cubic_nonl' in repr(found.model)
+
+
+def test_a_diagnosis_shows_its_report_and_its_charts_in_a_notebook(tmp_path):
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    rate = np.tile(np.linspace(-1.0, 1.0, 21), 6)
+    log = Log(output=rate + 0.02 * rate ** 3, reference_rate=rate)
+    found = diagnose(log)
+    assert repr(log) == '<Log: 126 rows of output, reference_rate>'
+    assert 'cubic nonlinearity' in found._repr_html_() and 'iframe srcdoc' in found._repr_html_()
+    figure = found.plot(tmp_path / 'picture.png')
+    assert 'rate [deg/s]' in [axes.get_xlabel() for axes in figure.axes]
 
 
 @pytest.mark.parametrize(('call', 'sentence'), [
@@ -152,8 +164,20 @@ def test_a_diagnosis_names_its_causes_and_writes_its_files(tmp_path):
     (lambda log: fit(log, method='x'), "method is 'x', but must be of dwells, "),
     (lambda log: fit(log, effects=['x']), "effects is 'x', but must be of bias, "),
     (lambda log: diagnose(log, kind='x'), "kind is 'x', but must be of rate_command, "),
-    (lambda log: self_calibrate(log, method='x'), "method is 'x', but must be of likelihood, ")])
-def test_an_unknown_name_is_refused_in_one_sentence_with_those_that_are_known(call, sentence):
+    (lambda log: self_calibrate(log, method='x'), "method is 'x', but must be of likelihood, "),
+    (lambda log: fit(), 'None is no log; read_log(path) reads one'),
+    (lambda log: fit([log]), 'is no log; read_log(path) reads one'),
+    (lambda log: compensate('log.csv', GYRO), "'log.csv' is no log; read_log(path) reads one"),
+    (lambda log: allan(Log([0.0, 0.5])), 'the log has no output of the gyro'),
+    (lambda log: track(Log(output=[0.0, 0.1]), NOISE), 'the log has no time'),
+    (lambda log: compensate(log, 'm.yaml'), "'m.yaml' is no model; read_model(path) reads one"),
+    (lambda log: diagnose(log, model='m.yaml'), "'m.yaml' is no model"),
+    (lambda log: simulate(GYRO, 5), '5 is no motion; wanted calibration, robot or rest, '),
+    (lambda log: simulate(GYRO, ([0, 1], [0])), 'shapes time (2,), reference_rate (1,); wanted'),
+    (lambda log: simulate(GYRO, sample_rate=0), 'sample_rate is 0; wanted a number of Hz'),
+    (lambda log: simulate(GYRO, temperature=[1, 2]), 'temperature has the shape (2,); wanted'),
+    (lambda log: fit(log), 'the gyro has a value in 3 of 3 samples; at least 100 are needed')])
+def test_what_is_not_possible_is_refused_in_one_sentence_with_what_is(call, sentence):
     log = Log([0.0, 0.5, 1.0], [0.0, 0.1, 0.2], reference_heading=[0.0, 0.05, 0.1])
     with pytest.raises(ValueError, match=re.escape(sentence)):
         call(log)

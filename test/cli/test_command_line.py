@@ -27,7 +27,6 @@ from gyro_calibration.cli.main import find_verbs
 from gyro_calibration.driver.protocols import find_protocol
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
 from tqdm import tqdm
@@ -95,101 +94,60 @@ def test_a_wrong_name_or_value_is_answered_in_one_line_with_what_is_right(
     assert (code, text, error.count('\n')) == (2, '', 1) and said in error
 
 
-def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, tmp_path):
-    code, text, _ = run('compensate', log, '--model', model,
-                        '--out', tmp_path / 'out.csv', '--json')
-    assert code == 0
-    answer = json.loads(text)
+def test_simulate_then_compensate_gives_the_true_heading_back(compensate, model, log):
+    done = compensate(log, model, '--json')
+    answer = json.loads(done.text)
     assert answer['rows'] == 2001 and abs(answer['heading_rad']) < 1e-9
     assert answer['mean_heading_error_rad'] < 1e-9 and 'errors' not in answer
     assert answer['heading_std_rad'] is None  # the model has neither noise nor covariance
-    compensated = read_log(tmp_path / 'out.csv')
-    heading = np.array(compensated.others['heading_rad'], dtype=float)
-    np.testing.assert_allclose(heading, compensated.reference_heading, atol=1e-9)
-    np.testing.assert_allclose(np.array(compensated.others['rate_rad_s'], dtype=float),
-                               compensated.reference_rate, atol=1e-12)
+    np.testing.assert_allclose(done.columns['heading_rad'], done.log.reference_heading, atol=1e-9)
+    np.testing.assert_allclose(done.columns['rate_rad_s'], done.log.reference_rate, atol=1e-12)
 
 
-def test_compensate_measures_the_error_against_the_reference_from_its_first_row_on(
-        run, model, tmp_path):
+def test_compensate_measures_the_error_against_the_reference_from_its_first_row_on(compensate):
     reference = np.arange(200) * 1e-3 + 2.0
     reference[:20], reference[100:] = np.nan, reference[100:] - 0.01
-    write_log(tmp_path / 'log.csv', Log(output=np.full(200, 0.1), time=np.arange(200) / 100.0,
-                                        reference_heading=reference))
-    (tmp_path / 'ideal.yaml').write_text('effects: {}')
-    text = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'ideal.yaml',
-               '--out', tmp_path / 'out.csv')[1]
+    text = compensate(Log(output=np.full(200, 0.1), time=np.arange(200) / 100.0,
+                          reference_heading=reference), 'effects: {}').text
     assert ('Error against the reference heading: mean 0.318 deg, at the end 0.573 deg.' in text
             and 'temperature' not in text)
 
 
-def test_compensate_says_how_sure_it_is(run, log, tmp_path):
-    (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
-    assert run('compensate', log, '--model', tmp_path / 'noisy.yaml',
-               '--out', tmp_path / 'out.csv')[0] == 0
-    deviation = float(read_log(tmp_path / 'out.csv').others['heading_std_rad'][-1])
-    assert deviation == pytest.approx(7.3e-4 * math.sqrt(20.0), rel=1e-6)
-
-
 @pytest.mark.parametrize('words, resting',
                          [(['--rest'], True), (['--hindsight'], True), ([], False)])
-def test_compensate_looks_for_rests(run, tmp_path, words, resting):
+def test_compensate_looks_for_rests(run, compensate, tmp_path, words, resting):
     """The robot's drive, with the noise of an XV-3500 and a bias known to 0.02 deg/s."""
     noise = '\nnoise: {angle_random_walk: 7.3e-4, bias_instability: 8.7e-5}'
     (tmp_path / 'gyro.yaml').write_text('effects: {bias: {bias: 0.002}}' + noise)
     known = '{scale_factor_error: 0.0, bias: 0.0017, covariance: [[1.0e-8, 0.0], [0.0, 1.2e-7]]}'
-    (tmp_path / 'model.yaml').write_text(f'effects: {{}}\nself_calibration: {known}{noise}')
     assert run('simulate', '--model', tmp_path / 'gyro.yaml', '--motion', 'robot',
                '--out', tmp_path / 'log.csv', '--seed', 1)[0] == 0
-    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-               '--out', tmp_path / 'out.csv', *words)[0] == 0
-    found = read_log(tmp_path / 'out.csv')
-    columns = {name: np.array(values, float) for name, values in found.others.items()}
-    error = columns['heading_rad'] - found.reference_heading
-    deviation = columns['heading_std_rad'][-1]
+    done = compensate(tmp_path / 'log.csv', f'effects: {{}}\nself_calibration: {known}{noise}',
+                      *words)
+    error = done.columns['heading_rad'] - done.log.reference_heading
+    deviation = done.columns['heading_std_rad'][-1]
     assert abs(error[-1]) < 4.0 * deviation and (deviation < 0.03) == resting
-    stands = found.reference_rate == 0.0
-    assert (columns['resting'][stands].mean() > 0.85 and columns['resting'][~stands].mean() < 0.05
-            if resting else 'resting' not in columns)
+    stands, seen = done.log.reference_rate == 0.0, done.columns.get('resting')
+    assert (seen[stands].mean() > 0.85 and seen[~stands].mean() < 0.05 if resting
+            else seen is None)
 
 
-def test_compensate_looks_for_no_rests_where_the_noise_is_not_known(run, model, log, tmp_path):
-    code, _, text = run('compensate', log, '--model', model,
-                        '--out', tmp_path / 'out.csv', '--rest')
-    assert code == 2 and 'allan' in text and not (tmp_path / 'out.csv').exists()
+def test_compensate_looks_for_no_rests_where_the_noise_is_not_known(compensate, model, log):
+    done = compensate(log, model, '--rest')
+    assert done.code == 2 and 'allan' in done.error and done.log is None
 
 
 @pytest.mark.parametrize('words', [(), ('--rest',), ('--hindsight',)])
-def test_compensate_does_not_take_another_unit_of_time_for_seconds(run, tmp_path, words):
-    (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(
-        f'{10 * row},1.0\n' for row in range(300)))  # in ms
-    code, out, error = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml',
-                           '--out', tmp_path / 'out.csv', *words)
-    assert code == bool(words) and '10 s apart' in (error if words else out)
-    assert 'check the unit of time_s' in (error if words else out)
+def test_compensate_does_not_take_another_unit_of_time_for_seconds(compensate, words):
+    in_ms = Log(output=np.full(300, DEGREE), time=10.0 * np.arange(300))
+    done = compensate(in_ms, NOISY_GYRO, *words)
+    said = done.error if words else done.text
+    assert done.code == bool(words) and '10 s apart' in said and 'the unit of time_s' in said
 
 
-def test_compensate_gives_rates_alone_for_a_rate_table(run, model, tmp_path):
-    (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n0,0\n10,9.1\n')
-    assert run('compensate', tmp_path / 'table.csv', '--model', model,
-               '--out', tmp_path / 'out.csv')[0] == 0
-    columns = read_log(tmp_path / 'out.csv').others
+def test_compensate_gives_rates_alone_for_a_rate_table(compensate, model):
+    columns = compensate(Log(output=[0.0, 0.16], reference_rate=[0.0, 0.17]), model).columns
     assert 'rate_rad_s' in columns and 'heading_rad' not in columns
-
-
-@pytest.mark.parametrize('method, tolerance',
-                         [('likelihood', 1e-6), ('rate', 1e-6), ('heading', 0.05)])
-def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tolerance):
-    profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,rate_dps\n' + ''.join(
-        f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION_MOTION.time, CALIBRATION_MOTION.rate)))
-    code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method,
-                        '--out', tmp_path / 'new.yaml', '--json')
-    answer = json.loads(text)
-    assert code == 0 and answer['scale_factor_error'] == pytest.approx(-0.1, rel=tolerance)
-    assert read_model(tmp_path / 'new.yaml').self_calibration.bias == pytest.approx(
-        0.002, rel=tolerance)
 
 
 def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(run, log, model, tmp_path):
@@ -252,15 +210,12 @@ def test_wrong_use_ends_with_2_says_why_and_writes_nothing(
     assert os.listdir() == before and (said != EMPTY or error.count('\n') == 1)
 
 
-def test_a_log_of_counts_wants_its_sensitivity(run, model, tmp_path):
-    (tmp_path / 'counts.csv').write_text('gyro_counts\n' + '100\n' * 10)
-    words = ['compensate', tmp_path / 'counts.csv', '--model', model,
-             '--out', tmp_path / 'out.csv', '--rate', 10]
-    code, _, error = run(*words)
-    assert code == 2 and '--sensitivity' in error
-    assert run(*words, '--sensitivity', 0.07)[0] == 0
-    assert float(read_log(tmp_path / 'out.csv').others['rate_rad_s'][0]) == pytest.approx(
-        (7 * DEGREE - 0.002) / 0.9)
+def test_a_log_of_counts_wants_its_sensitivity(compensate, model):
+    log = Log(counts=np.full(10, 100.0))
+    done = compensate(log, model, '--rate', 10)
+    assert done.code == 2 and '--sensitivity' in done.error
+    done = compensate(log, model, '--rate', 10, '--sensitivity', 0.07)
+    assert done.columns['rate_rad_s'] == pytest.approx((7 * DEGREE - 0.002) / 0.9)
 
 
 def test_the_same_seed_gives_the_same_log_and_the_seed_is_reported(run, tmp_path):
@@ -337,13 +292,11 @@ def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not
         refusals, MAX_ATTEMPTS - 1)
 
 
-def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_path):
+def test_a_method_that_gives_no_standard_deviation_claims_none(run, compensate, log, tmp_path):
     code, text, _ = run('self-calibrate', log, '--method', 'rate', '--out', tmp_path / 'new.yaml')
     assert code == 0 and '+-' not in text
     assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
-    assert run('compensate', log, '--model', tmp_path / 'new.yaml',
-               '--out', tmp_path / 'out.csv')[0] == 0
-    assert read_log(tmp_path / 'out.csv').others['heading_std_rad'][-1] == 'nan'
+    assert np.isnan(compensate(log, tmp_path / 'new.yaml').columns['heading_std_rad'][-1])
 
 
 def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run, log, tmp_path):

@@ -19,7 +19,7 @@ import os
 from diagnosed import log_of
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.logs.log import read_log, write_log
+from gyro_calibration.logs.log import write_log
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration_bench.hidden import hide
 import numpy as np
@@ -109,26 +109,6 @@ def test_a_seed_gives_the_same_answer_again_and_a_file_is_written_into_a_folder_
     assert {**again, 'logs': 0} == {**found, 'logs': 0}
 
 
-def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(diagnosed, run):
-    folder, _ = diagnosed
-    code, text, _ = run('diagnose', folder / 'drive.csv', '--model', folder / 'found/model.yaml',
-                        '--json')
-    found = json.loads(text)
-    assert code == 0 and found['verdict'] == 'adequate', found['findings']
-    assert found['gain'] is None
-
-
-def test_the_extended_model_simulates_and_compensates(diagnosed, log, run, tmp_path):
-    model = diagnosed[0] / 'found/model.yaml'
-    assert run('compensate', tmp_path / 'drive.csv', '--model', model, '--out',
-               tmp_path / 'rates.csv')[0] == 0
-    rate = np.array(read_log(tmp_path / 'rates.csv').others['rate_rad_s'], float)
-    left = [np.std(each - log.reference_rate) for each in (log.output, rate)]
-    assert left[1] < left[0]
-    assert run('simulate', '--model', model, '--motion', 'robot', '--out',
-               tmp_path / 'simulated.csv', '--seed', '1')[0] == 0
-
-
 def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
     names = ['first.csv', 'second.csv']
     for name, log in zip(names, hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white',
@@ -178,17 +158,6 @@ def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, r
 
 
 # data that allow an answer only in part
-
-def test_without_motion_what_the_motion_shows_cannot_be_shown(hidden, log, diagnose):
-    truth = hidden.truth
-    rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
-    answer = answer_of(diagnose(
-        replace(log, output=rest, reference_rate=0.0 * rest, moving=0.0 * rest), '--json'))
-    assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
-    reasons = answer['cannot_show']
-    of_motion = {reasons[name]
-                 for name in ('scale_factor_asymmetry', 'time_offset', 'reference_once_per_rev')}
-    assert of_motion == {'the reference shows no motion'}
 
 
 def test_stretches_of_nan_are_left_out(log, diagnose):

@@ -15,8 +15,10 @@ import math
 import subprocess
 import sys
 
-from gyro_calibration.logs.log import Log, read_log, read_log_blocks, write_log
+from gyro_calibration.logs.log import Log, read_log_blocks
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import ROBOT_MOTION
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 
@@ -83,35 +85,26 @@ WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--inver
 
 
 @pytest.mark.parametrize('words', WORDS.values(), ids=WORDS)
-def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, request, run):
+def test_a_log_in_blocks_gives_the_columns_of_one_piece(
+        model, tmp_path, words, request, compensate):
     write_robot(tmp_path / 'log.csv', 4001)
     lines = (tmp_path / 'log.csv').read_text().splitlines()
     for lost in (1, 2, *range(290, 1300), 4001):  # outputs of whole blocks and of the last row
         time, _, degc = lines[lost].split(',')
         lines[lost] = f'{time},nan,{degc}'
     (tmp_path / 'log.csv').write_text('\n'.join(lines) + '\n')
-    answers = []
-    for out in ('whole.csv', 'blocks.csv.gz'):
-        code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model,
-                            '--out', tmp_path / out, '--json', *words)
-        assert code == 0
-        answers.append(text.replace(out, ''))
-        request.getfixturevalue('small_blocks')
-    assert answers[0] == answers[1] and '"rows_without_output": 1013' in answers[0]
-    whole, blocks = (read_log(tmp_path / out).others for out in ('whole.csv', 'blocks.csv.gz'))
-    assert list(whole) == list(blocks) and len(whole) == 6
-    for name in whole:
-        np.testing.assert_allclose(np.array(blocks[name], float), np.array(whole[name], float),
-                                   rtol=1e-12, err_msg=name)
+    whole = compensate(tmp_path / 'log.csv', model, '--json', *words)
+    request.getfixturevalue('small_blocks')
+    blocks = compensate(tmp_path / 'log.csv', model, '--json', *words)
+    assert whole.text == blocks.text and '"rows_without_output": 1013' in whole.text
+    assert list(whole.columns) == list(blocks.columns) and len(whole.columns) == 6
+    for name, values in whole.columns.items():
+        np.testing.assert_allclose(blocks.columns[name], values, rtol=1e-12, err_msg=name)
 
 
-def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, run):
-    (tmp_path / 'log.csv').write_text(
-        'time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
-    code, _, error = run('compensate', tmp_path / 'log.csv', '--model', model,
-                         '--out', tmp_path / 'out.csv')
-    assert (code == 1 and 'no gyro output is finite' in error
-            and not (tmp_path / 'out.csv').exists())
+def test_a_log_without_any_output_is_refused(model, small_blocks, compensate):
+    done = compensate(Log(output=np.full(1000, np.nan), time=np.arange(1000.0)), model)
+    assert done.code == 1 and 'no gyro output is finite' in done.error and done.log is None
 
 
 @pytest.mark.parametrize('time, output, interval', [
@@ -121,10 +114,7 @@ def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, run)
     (np.arange(2000) / 100.0, np.where(np.arange(2000) % 10, np.nan, 0.0), 0.1)],
     ids=['gaps', 'rows of others'])
 def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(
-        tmp_path, small_blocks, run, time, output, interval):
-    (tmp_path / 'model.yaml').write_text('effects: {}\nnoise: {angle_random_walk: 7.3e-4}')
-    write_log(tmp_path / 'log.csv', Log(output=output, time=time))
-    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-               '--out', tmp_path / 'out.csv')[0] == 0
-    deviation = np.array(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'], float)
+        small_blocks, compensate, time, output, interval):
+    deviation = compensate(Log(output=output, time=time), GyroModel(noise=Noise(7.3e-4))).columns[
+        'rate_std_rad_s']
     assert deviation[np.isfinite(output)] == pytest.approx(7.3e-4 / math.sqrt(interval), rel=1e-9)

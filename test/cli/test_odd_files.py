@@ -305,7 +305,7 @@ def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
     date = str(np.datetime64(round(now + ahead), 's')) + '+00:00'
     calibration = SelfCalibration(0.0, 0.01, ((1e-8, 0.0), (0.0, variance)), date)
     model = GyroModel(noise=Noise(angle_random_walk=1e-4), self_calibration=calibration)
-    live = HeadingEstimator(model, BiasTable(model, Prior()), Assumptions(), Settings(), 10.0, now)
+    live = HeadingEstimator(model, BiasTable(model, Prior()), Assumptions(), Settings(), now)
     live.add(0.0, 0.01, now)
     assert (live.age(now) == max(-ahead, 0.0)) == known == (
         'later than the clock' not in live.calibration_message)

@@ -386,7 +386,7 @@ REFUSED = {
                 reference_rate=GOOD.reference_rate[:90]),
             None, '90 of 90 samples'),
     'short': (Log(output=GOOD.output[:900], time=GOOD.time[:900],
-                  reference_rate=GOOD.reference_rate[:900]), None, 'lasts 9.0 s'),
+                  reference_rate=GOOD.reference_rate[:900]), None, 'lasts 8.99 s'),
     'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1), None,
                  'in 100 % of the samples: it is dead'),
     'same': (replace(GOOD, reference_rate=GOOD.output), None, '1 times the reference plus'),

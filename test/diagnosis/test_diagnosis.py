@@ -25,6 +25,7 @@ from diagnosed import diagnosis_of, held, judge_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Log
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.model_file import format_model, read_model
@@ -43,6 +44,7 @@ from gyro_calibration_bench.hidden import (
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 SHORT = {'duration': 600.0, 'sample_rate': 25.0}
 #: References in turn.
@@ -223,6 +225,22 @@ def test_a_log_of_a_gyro_at_rest_needs_no_reference():
 
 
 # several logs of one gyro
+
+def test_rests_do_not_stand_for_a_drive_that_the_gyro_filters():
+    """They are the only stretches of constant rate, and the filter differs between them."""
+    generator = np.random.default_rng(0)
+    time = np.arange(0.0, 100.0, 0.04)
+    rate = np.zeros(len(time))
+    for begin in range(200, len(time), 200):  # turns of 2 s
+        rate[begin:begin + 50] = generator.uniform(-1.0, 1.0) * np.sin(
+            np.pi * np.arange(50) / 50.0) ** 2
+    vibration = lfilter([0.01], [1.0, -0.8], generator.standard_normal(len(time)))
+    rate += np.where(rate == 0.0, 0.0, vibration)
+    sensed = np.convolve(rate, np.full(3, 1.0 / 3.0), 'same')
+    output = sensed + 0.02 * np.abs(sensed) + 3e-4 * generator.standard_normal(len(time))
+    found = diagnose([Log(time, output, reference_rate=rate)], generator)
+    assert 'scale_factor_asymmetry' in names_of(found)
+
 
 def recorded(names, steps, seed, given=None, multiple=8.0):
     """Record a gyro once for each moment of a temperature step of 10 K up, 15 K down later."""

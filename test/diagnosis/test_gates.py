@@ -13,6 +13,7 @@
 from dataclasses import replace
 import re
 
+from chance import seeds
 from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
@@ -102,14 +103,14 @@ def tilted(seed, noise):
     return replace(log, output=0.15 * MOTION + noise * vibration)
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', seeds(3))
 def test_an_axis_that_follows_in_part_by_another_factor_is_another_motion(seed):
     # half of the variance is common, which alone passes as the noise of a reference
     gate, = (each for each in check_gates(tilted(seed, 0.2)) if each.passed is False)
     assert gate.name == 'motion' and 'the output is 0.' in gate.evidence, gate
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', seeds(3))
 def test_a_noisy_gyro_of_the_right_factor_passes(seed):
     log = tilted(seed, 0.0)
     noisy = replace(log, output=log.output / 0.15 + 2.0 * np.repeat(
@@ -120,6 +121,19 @@ def test_a_noisy_gyro_of_the_right_factor_passes(seed):
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
 def test_a_gyro_that_follows_passes_all_gates(noise):
     assert all(gate.passed for gate in check_gates(drive(1, noise)))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_turns_between_long_rests_that_the_gyro_does_not_make_are_another_motion(seed):
+    generator = np.random.default_rng(seed)
+    turns = np.zeros((2, len(TIME)))  # of the gyro, and of the reference
+    for row in turns:
+        for begin in generator.integers(0, len(TIME) - 200, 8):
+            row[begin:begin + 200] = generator.uniform(-1.5, 1.5)
+    log = Log(TIME, turns[0] + 1e-3 * generator.standard_normal(len(TIME)),
+              reference_heading=np.cumsum(turns[1]) * 0.01)
+    gate = check_gates(log)[-1]
+    assert gate.name == 'motion' and gate.passed is False, gate
 
 
 def test_a_late_reference_passes_all_gates():

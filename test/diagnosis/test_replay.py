@@ -110,6 +110,18 @@ def test_a_reference_that_is_slower_than_the_gyro_is_compared_with_all_samples(q
     assert (each.reference - 0.5 * np.sin(0.7 * TIME))[each.valid].std() < 0.02
 
 
+@pytest.mark.parametrize('share', [0.1, 0.3])
+def test_noise_stays_white_where_single_samples_are_lost(share):
+    generator = np.random.default_rng(0)
+    output = generator.standard_normal(20_000)
+    lost = generator.random(len(output)) < share
+    each = laid_out(Log(0.01 * np.arange(len(output)), np.where(lost, np.nan, output)))
+    power = each.transform_residual(each.channels.output) ** 2
+    low, high = power[16:2000], power[-2000:]
+    # five standard deviations of a ratio of two means of the squares of 2000 normal values
+    assert low.mean() / high.mean() == pytest.approx(1.0, abs=5.0 * np.sqrt(4.0 / 2000.0))
+
+
 def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
     heading = -0.5 / 2.0 * np.cos(2.0 * TIME)
     lost = (TIME > 50.0) & (TIME < 51.5)

@@ -313,7 +313,7 @@ def holds(port, count):
 
 def test_what_is_there_is_read_at_once(terminal, wait_until):
     master, path = terminal
-    port = SerialPort(path, 115200, timeout=0.01)
+    port = SerialPort(path, 115200)
     port.open()
     assert port.read() == port.read() == b''
     os.write(master, b'x' * 1000)
@@ -358,7 +358,7 @@ def test_a_port_that_cannot_be_opened_says_why(path, reason):
 def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
     """What came at the other speed is dropped."""
     master, path = terminal
-    port = SerialPort(path, 9600, timeout=0.01)
+    port = SerialPort(path, 9600)
     port.open()
     os.write(master, b'garbage')
     wait_until(lambda: holds(port, 7))

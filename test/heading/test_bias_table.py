@@ -278,11 +278,6 @@ def test_a_person_may_write_one(tmp_path):
             and entry.variance == pytest.approx(1e-10))
 
 
-def test_no_file_is_no_fault(tmp_path):
-    table, message = read_bias_table(tmp_path / 'none.yaml', MODEL)
-    assert message == '' and not table.entries and table.run == 0
-
-
 DAMAGES = {
     'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2],
     'garbage': lambda text: bytes(range(256)) * 4,

@@ -12,11 +12,10 @@
 
 import math
 
-from gyro_calibration.cli.main import main
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
+from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
@@ -103,8 +102,8 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
     temperature[12500] = 1e9
     time, output, temperature = lossy(time, output, temperature)
     model = GyroModel((Term(BIAS, (0.005,)),), noise=NOISE, self_calibration=calibration)
-    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), 10.0,
-                                      NOW) for _ in range(2))
+    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
+                     for _ in range(2))
     expected = np.empty((len(time), 6))
     for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
         if degc == degc:
@@ -122,18 +121,13 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
         [entry.bias for entry in single.table.entries], rel=1e-9)
 
 
-def test_compensate_and_the_node_give_the_same_heading_while_the_gyro_warms_up(tmp_path):
+def test_compensate_and_the_node_give_the_same_heading_while_the_gyro_warms_up(
+        compensate, tmp_path):
     time, rate, output, temperature = drive(300.0, 3, 0.02 * DEGREE)
     rig = Rig(tmp_path, model=MODEL, stationary_method='rest')
     node = rig.feed(output, INTERVAL, temperature)
-    write_log(tmp_path / 'log.csv',
-              Log(output=output, time=BEGIN + INTERVAL + time, temperature=temperature))
-    columns = {}
-    for words in ('--rest', '--hindsight'):
-        assert main(['compensate', str(tmp_path / 'log.csv'), '--model',
-                     str(tmp_path / 'model.yaml'), '--out', str(tmp_path / 'out.csv'), words]) == 0
-        others = read_log(tmp_path / 'out.csv').others
-        columns[words] = {name: np.array(values, float) for name, values in others.items()}
+    log = Log(output=output, time=BEGIN + INTERVAL + time, temperature=temperature)
+    columns = {words: compensate(log, MODEL, words).columns for words in ('--rest', '--hindsight')}
     np.testing.assert_allclose(columns['--rest']['heading_rad'],
                                [each.heading for each in node], atol=2e-6)
     # the node says at least what one sample may be off by, also of the first

@@ -10,6 +10,7 @@
 
 """Recordings of gyros: calibrated on seconds, followed for minutes, and the errors as stated."""
 
+import contextlib
 from dataclasses import replace
 from functools import cache
 import math
@@ -49,15 +50,12 @@ def read(path):
 
 @pytest.fixture(params=sorted(SENSES))
 def recording(request, data):
-    """Return a recording's name, and a function of time, s, output, rad/s, and heading, rad."""
-    log = read(data / 'mems_encoder_turntable' / f'{request.param}.csv.gz')
+    """Return the path of a recording."""
+    return data / 'mems_encoder_turntable' / f'{request.param}.csv.gz'
 
-    def part(start):
-        chosen = (log.time >= start) & (log.time < start + FOLLOWED)
-        time, output, heading = (values[chosen]
-                                 for values in (log.time, log.output, log.reference_heading))
-        return time - time[0], SENSES[request.param] * output, heading - heading[0]
-    return request.param, part
+
+def name_of(path):
+    return path.name.partition('.')[0]
 
 
 def follow(fit, time, output, heading):
@@ -76,24 +74,27 @@ def rms(error):
     return math.sqrt(np.mean(error ** 2))
 
 
-def calibrated(part, seconds, noise=None):
-    """Return a fit, or None if refused, and the rest of the recording, for every start."""
+@cache
+def calibrated(path, seconds, noise=None):
+    """Return for every start a fit, or None if refused, and time, output and heading."""
+    log, found = read(path), []
     for start in STARTS:
-        time, output, heading = part(start)
-        run = time <= seconds
-        try:
+        chosen = (log.time >= start) & (log.time < start + FOLLOWED)
+        time = log.time[chosen] - log.time[chosen][0]
+        output = SENSES[name_of(path)] * log.output[chosen]
+        heading = log.reference_heading[chosen] - log.reference_heading[chosen][0]
+        run, fit = time <= seconds, None
+        with contextlib.suppress(DataRefused):
             fit = self_calibrate(time[run], output[run],
                                  motion_from_headings(time[run], heading[run]), noise=noise)
-        except DataRefused:
-            fit = None
-        yield fit, time, output, heading
+        found.append((fit, time, output, heading))
+    return found
 
 
 def test_a_gyro_that_shakes_on_its_mount_is_not_refused_for_being_louder_than_at_rest(recording):
     """Errors that repeat with the motion do not add up; rest has a tenth of the swing's noise."""
-    name, part = recording
-    if name != 'yaw_fast':
-        assert (sum(fit is not None for fit, *_ in calibrated(part, 60.0, noise=NOISE))
+    if name_of(recording) != 'yaw_fast':
+        assert (sum(fit is not None for fit, *_ in calibrated(recording, 60.0, NOISE))
                 >= len(STARTS) - 1)
 
 
@@ -101,8 +102,7 @@ def test_a_gyro_that_shakes_on_its_mount_is_not_refused_for_being_louder_than_at
     60.0, *(pytest.param(seconds, marks=pytest.mark.evidence) for seconds in (20.0, 30.0))])
 def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(
         recording, seconds):
-    name, part = recording
-    found = list(calibrated(part, seconds))
+    name, found = name_of(recording), calibrated(recording, seconds)
     errors = [(*follow(*run), rms(integrate(run[1], run[2]) - run[3]))
               for run in found if run[0] is not None]
     for error, deviation, raw in errors:
@@ -118,9 +118,8 @@ def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibratio
 @pytest.mark.parametrize('seconds', [pytest.param(20.0, marks=pytest.mark.evidence), 60.0])
 def test_on_the_stamps_as_they_are_too(recording, seconds):
     """The gyro is 12 ms later than the encoder: 0.5 deg at 45 deg/s, and 4 deg at 330 deg/s."""
-    name, part = recording
-    found = [run for run in calibrated(part, seconds) if run[0] is not None]
-    inside = []
+    name, inside = name_of(recording), []
+    found = [run for run in calibrated(recording, seconds) if run[0] is not None]
     for fit, time, output, heading in found:
         on_stamps = replace(fit, time_offset=0.0, start_heading=0.0, start_heading_deviation=0.0)
         error, deviation = follow(on_stamps, time, output, heading)

@@ -19,7 +19,7 @@ from dataclasses import replace
 from datetime import datetime, timezone
 import math
 
-from gyro_calibration.heading.bias_table import BiasTable, Entry, Prior
+from gyro_calibration.heading.bias_table import BiasTable, Entry
 from gyro_calibration.heading.heading_estimator import (
     Assumptions,
     HeadingEstimator,
@@ -45,7 +45,7 @@ MODEL = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
 def begun(model=MODEL, table=None, assumptions=None, now=NOW, temperature=25.0):
     """Return a heading that begins; with a temperature, if one is given."""
     live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(),
-                            Settings(), 10.0, now)
+                            Settings(), now)
     if temperature is not None:
         live.add_temperature(0.0, temperature)
     return live
@@ -117,15 +117,6 @@ def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_be
             and live.age(later) == pytest.approx(300.0 * 86400.0))
 
 
-def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():
-    gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=0.3 * DEGREE).go(60.0)
-    stood = gyro.error
-    assert gyro.live.tracker.is_resting and abs(stood) < 0.5 * DEGREE
-    gyro.go(10.0, 0.5).go(5.0)
-    assert (abs(gyro.error - stood) < 0.5 * DEGREE
-            and gyro.deviation == pytest.approx(5.0 * 0.03, rel=0.1))
-
-
 def test_the_variance_grows_with_the_distance_of_the_temperature_and_a_rest_takes_that_back():
     coefficient = 0.03 * DEGREE
     gyro = Gyro(begun(), coefficient=coefficient).go(30.0).go(20.0, 0.3, (25.0, 35.0))
@@ -183,16 +174,6 @@ def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_i
     assert 0.05 < on < old < far
 
 
-@pytest.mark.parametrize('temperature', [25.0, None])
-def test_a_calibration_of_now_is_used_as_it_is(temperature):
-    live = begun(temperature=temperature)
-    live.add(0.1, 0.0, NOW)
-    live.use_calibration(MODEL, NOW)
-    live.add(0.2, 0.0, NOW)
-    assert (math.sqrt(live.covariance[-1, -1]) == pytest.approx(0.01 * DEGREE)
-            and not live.calibration_message)
-
-
 def test_a_gyro_that_was_without_power_may_have_another_bias():
     gyro = Gyro(begun()).go(40.0)
     gyro.live.use_calibration(MODEL, gyro.now + gyro.time)
@@ -210,14 +191,6 @@ def test_a_rest_corrects_an_old_calibration_and_ends_the_remark():
     gyro.go(INTERVAL)
     assert gyro.live.calibration_message
     assert not gyro.go(20.0).live.calibration_message
-
-
-def test_a_gyro_that_compensates_its_temperature_by_itself_has_no_variance_by_it():
-    none = Assumptions(bias_temperature_coefficient=0.0)
-    table = BiasTable(MODEL, Prior(coefficient=0.0))
-    gyro = Gyro(begun(table=table, assumptions=none)).go(40.0).go(10.0, 0.3, (25.0, 45.0)).go(
-        40.0, temperature=45.0)
-    assert len(table.entries) == 2 and abs(gyro.error) < 3.0 * gyro.deviation < 3.0 * DEGREE
 
 
 def test_a_calibrated_model_takes_the_bias_of_earlier_runs():

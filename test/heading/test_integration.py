@@ -87,12 +87,6 @@ def test_a_log_longer_than_the_cache_is_integrated_by_the_trapezoid_rule():
     assert np.array_equal(integrate(time, rate, 0.25), np.cumsum([0.25, *steps]))
 
 
-def test_single_samples_are_filtered_by_equation_12():
-    time, rate = noisy_robot()
-    as_printed = np.where(np.abs(rate) < 0.3 * DEGREE, 0.0, rate)
-    assert np.array_equal(filtered_singly(Threshold(0.3 * DEGREE, 0.0), time, rate), as_printed)
-
-
 def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_little():
     """0.3 deg/s is 0.72 sigma of a 100 Hz sample (47 % beyond), 3.2 of a mean of 20 (0.13 %)."""
     time = np.arange(20001) * INTERVAL

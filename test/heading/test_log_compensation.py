@@ -14,12 +14,11 @@ from dataclasses import replace
 
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
-from gyro_calibration.logs.log import Log, read_log, write_log
+from gyro_calibration.logs.log import Log, read_log
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.motion import simulate_gyro_output
 import numpy as np
 from operations import operations
@@ -50,6 +49,14 @@ def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
     return replace(log, output=simulate_gyro_output(model, TIME, channels))
 
 
+def in_blocks(model, log, size):
+    """Return rates, and sensitivities, of a log that is compensated in blocks."""
+    compensation = LogCompensation(model)
+    parts = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))
+             for first in range(0, len(log), size)]
+    return np.concatenate([part.rate for part, _ in parts]), np.hstack([each for _, each in parts])
+
+
 @pytest.mark.parametrize('size', [1, 700, 5000])
 def test_blocks_are_compensated_as_the_whole(size):
     model = model_of(VALUES | HEADING, covariance=np.eye(16) * 1e-10)
@@ -57,23 +64,16 @@ def test_blocks_are_compensated_as_the_whole(size):
     if size == 1:
         log = rows_of(log, np.arange(600))
     whole, sensitivity = LogCompensation(model).add(log)
-    compensation = LogCompensation(model)
-    parts = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))
-             for first in range(0, len(log), size)]
-    np.testing.assert_allclose(np.concatenate([part.rate for part, _ in parts]), whole.rate,
-                               rtol=0.0, atol=1e-13)
-    np.testing.assert_allclose(np.hstack([rows for _, rows in parts]), sensitivity,
-                               rtol=1e-6, atol=1e-9)
+    rates, sensitivities = in_blocks(model, log, size)
+    np.testing.assert_allclose(rates, whole.rate, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(sensitivities, sensitivity, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize('size', [700, 18000])
 def test_a_heading_that_nobody_measured_is_found_meanwhile(size):
     model = model_of(HEADING | {'scale_factor_error': (0.01,)})
     log = replace(drive(model), reference_heading=None)
-    compensation = LogCompensation(model)
-    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate
-             for first in range(0, len(log), size)]
-    assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-8)
+    assert in_blocks(model, log, size)[0] == pytest.approx(log.reference_rate, abs=1e-8)
     plain = compensate_log(model_of({'scale_factor_error': (0.01,)}), log)
     assert np.abs(plain - log.reference_rate).max() > 1e-3, 'the heading did not matter'
 
@@ -89,10 +89,7 @@ def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_block
     lost = (TIME > 0.1) & (TIME < 0.2) | (TIME > 100.0) & (TIME < 400.1) | (TIME > 800.0)
     log = replace(turned, output=output,
                   reference_heading=np.where(lost, np.nan, turned.reference_heading))
-    compensation = LogCompensation(model)
-    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate
-             for first in range(0, len(log), size)]
-    assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-6)
+    assert in_blocks(model, log, size)[0] == pytest.approx(log.reference_rate, abs=1e-6)
 
 
 def test_before_its_first_value_a_reference_heading_is_that_value():
@@ -105,18 +102,14 @@ def test_before_its_first_value_a_reference_heading_is_that_value():
     assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
 
 
-def test_rows_without_output_are_left_out(tmp_path, run):
+def test_rows_without_output_are_left_out(tmp_path, compensate):
     model = model_of(VALUES | HEADING)
     log = drive(model)
-    write_model(tmp_path / 'model.yaml', model)
-    write_log(tmp_path / 'log.csv',
-              replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan, log.output)))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-                        '--out', tmp_path / 'out.csv')
-    done = read_log(tmp_path / 'out.csv')
-    rate, heading = (np.array(done.others[name], float) for name in ('rate_rad_s', 'heading_rad'))
-    assert code == 0 and '18 rows have no output' in text and 'no reference heading' not in text
-    assert np.nanmax(np.abs(heading - done.reference_heading)) < 1e-3
+    done = compensate(replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan,
+                                                   log.output)), model)
+    rate = done.columns['rate_rad_s']
+    assert '18 rows have no output' in done.text and 'no reference heading' not in done.text
+    assert np.nanmax(np.abs(done.columns['heading_rad'] - done.log.reference_heading)) < 1e-3
     assert np.isnan(rate).sum() == 18 and np.nanmax(np.abs(rate - log.reference_rate)) < 1e-3
     assert np.array_equal(compensate_log(model, read_log(tmp_path / 'log.csv')), rate,
                           equal_nan=True)
@@ -133,24 +126,19 @@ def test_the_uncertainty_of_a_time_constant_goes_into_the_rate():
     assert deviation.max() > 1e-4
 
 
-def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(tmp_path, run):
-    (tmp_path / 'model.yaml').write_text(
-        'effects: {supply_sensitivity: {supply_sensitivity: 1.0e-4}, '
-        'time_offset: {time_offset: 0.02},heading_sensitivity: {sine: 0.0, cosine: 0.0}, '
-        'saturation: {saturation: 1.0}}')
-    log = drive(GyroModel())
-    write_log(tmp_path / 'log.csv', replace(log, supply=None, reference_heading=None))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-                        '--out', tmp_path / 'out.csv')
-    assert code == 0 and all(words in text
-                             for words in ('no supply voltage', 'no reference heading',
-                                           'saturation: An output at the limit'))
+def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(compensate):
+    model = model_of({'supply_sensitivity': (5.0, 1e-4), 'time_offset': (0.02,),
+                      'heading_sensitivity': (0.0, 0.0), 'saturation': (1.0,)})
+    done = compensate(replace(drive(GyroModel()), supply=None, reference_heading=None), model)
+    assert done.code == 0 and all(words in done.text
+                                  for words in ('no supply voltage', 'no reference heading',
+                                                'saturation: An output at the limit'))
 
 
 @pytest.mark.parametrize('name, value',
                          [('time_offset', 0.03), ('time_offset', -0.03), ('clock_rate', 2e-3)])
 def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_time(
-        tmp_path, run, name, value):
+        compensate, name, value):
     """Across block borders too; rates between samples are linear, and the ends are left out."""
     model, time = model_of({name: (value,)}), np.arange(70_000) * 0.01
     rate = np.sin(1.3 * time)
@@ -158,16 +146,11 @@ def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_t
               reference_heading=(1.0 - np.cos(1.3 * time)) / 1.3)
     log = replace(log, output=simulate_gyro_output(model, time,
                                                    channels_from_log(log).with_rate(rate, rate)))
-    write_model(tmp_path / 'model.yaml', model)
-    write_log(tmp_path / 'log.csv', log)
-    code, *_ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-                   '--out', tmp_path / 'out.csv')
-    done, inside = read_log(tmp_path / 'out.csv'), slice(10, -200)
-    heading = np.array(done.others['heading_rad'], float) - done.reference_heading
-    assert code == 0 and 'true_time' not in done.others
-    assert (np.abs(np.array(done.others['rate_rad_s'], float) - rate)[inside].max() < 1e-4
+    done, inside = compensate(log, model), slice(10, -200)
+    assert 'true_time' not in done.columns
+    assert (np.abs(done.columns['rate_rad_s'] - rate)[inside].max() < 1e-4
             < np.abs(log.output - rate).max())
-    assert np.ptp(heading[inside]) < 5e-4
+    assert np.ptp((done.columns['heading_rad'] - done.log.reference_heading)[inside]) < 5e-4
 
 
 def test_samples_that_look_around_take_two_operations_each():

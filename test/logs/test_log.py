@@ -343,14 +343,31 @@ def test_an_unwrapped_heading_is_the_true_one(run, tmp_path):
 
 
 @pytest.mark.parametrize(('table', 'wanted'), [
-    ({'w': [1.0, 2.0]}, 'no gyro column'), ({'gyro_dps': ['a', 'b']}, 'is no log'),
+    ({'w': [1.0, 2.0]}, 'no gyro column'), ({'gyro_dps': ['a', 'b']}, 'numbers'),
     ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 2.0, 3.0]}, 'one shape'),
-    ({'gyro_dps': [1.0]}, 'two rows'), ({'gyro_dps': [[1.0], [2.0]]}, 'one shape'),
+    ({'gyro_dps': [1.0]}, '2 rows'), ({'gyro_dps': [[1.0], [2.0]]}, 'one shape'),
     ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 1.0]}, 'is not later than'),
     ({'gyro_dps': [1.0, math.inf]}, 'remove the row')])
 def test_a_table_that_is_no_log_is_refused_in_a_sentence(table, wanted):
     with pytest.raises(LogError, match=wanted):
         log_from_table(table)
+
+
+@pytest.mark.parametrize(('arrays', 'wanted'), [
+    ({'time': [0.0, 1.0, 2.0]}, r'time \(3,\), output \(2,\); wanted one shape'),
+    ({'time': [1.0, 0.0]}, 'row 1, column time_s: 0 s is not later than 1 s'),
+    ({'time': [0.0, math.nan]}, 'row 1, column time_s: nan s is not later than 0 s'),
+    ({'time': np.array(['2026-01-01', '2026-01-02'], 'M8[ns]')}, 'time is no column of numbers'),
+    ({'output': [1j, 2.0]}, 'output is no column of numbers'),
+    ({'temperature': [20.0, math.nan]}, 'row 1 of temperature is nan')])
+def test_arrays_that_are_no_log_are_refused_in_a_sentence(arrays, wanted):
+    with pytest.raises(LogError, match=wanted):
+        Log(**{'output': [1.0, 2.0]} | arrays)
+
+
+def test_masked_values_are_lost_ones():
+    log = Log([0.0, 1.0, 2.0], np.ma.masked_greater([0.1, 9.0, 0.2], 5.0))
+    assert np.isnan(log.output).tolist() == [False, True, False]
 
 
 def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(tmp_path):

@@ -170,11 +170,3 @@ def test_the_standard_deviation_grows_outside_of_what_was_calibrated():
     # a self-calibration finds bias and scale factor of this run, at its temperature
     known = replace(TOLERANT, self_calibration=replace(CALIBRATION, temperature=55.0))
     assert deviation(known, 0.0, 55.0) == deviation(known, 0.0, 25.0) < deviation(known, 0.0, 60.0)
-
-
-def test_the_covariance_has_the_order_of_the_sensitivity():
-    whole = uncertainty_covariance(replace(MODEL, self_calibration=CALIBRATION))
-    assert whole.shape == (4, 4) and np.diag(whole).tolist() == [1e-6, 4e-6, 1e-6, 1e-6]
-    assert whole[2, 3] == 1e-8 and not whole[:2, 2:].any()
-    assert uncertainty_covariance(GyroModel()).shape == (0, 0)
-    assert rate_sensitivity(GyroModel(), np.zeros(3), np.zeros(3), np.zeros(3)).shape == (0, 3)

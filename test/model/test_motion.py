@@ -11,8 +11,7 @@
 """Motions: headings are the exact integral of rates; files; what a simulated gyro makes of one."""
 
 from gyro_calibration.logs.log import DEGREE, read_log
-from gyro_calibration.model.channels import channels_from_log
-from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION,
@@ -23,7 +22,6 @@ from gyro_calibration.model.motion import (
     read_motion,
     ROBOT_MOTION,
     simulate,
-    simulate_gyro_output,
 )
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -129,24 +127,6 @@ def test_a_log_holds_the_motion_and_what_equation_1_of_hong_and_park_makes_of_it
     assert log.output == pytest.approx(0.9 * log.reference_rate + 0.01, abs=1e-12)
     noise = simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0)).output - log.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
-
-
-def test_a_log_is_replayed_with_its_motion_and_surroundings():
-    """The model reproduces the simulated output from the channels of the log."""
-    model = GyroModel((*GYRO.terms, Term(CATALOGUE['thermal_lag'], (5.0, 1e-3)),
-                       Term(CATALOGUE['warm_up'], (10.0, 0.01)),
-                       Term(CATALOGUE['heading_sensitivity'], (1e-3, 0.0)),
-                       Term(CATALOGUE['time_offset'], (0.02,))))
-    log = simulate(model, CALIBRATION_MOTION, 50.0,
-                   temperature=25.0 + 10.0 * np.sin(np.arange(1001) / 200.0))
-    channels = channels_from_log(log)
-    assert np.array_equal(simulate_gyro_output(
-        model, log.time, channels.with_rate(log.reference_rate, log.reference_rate)), log.output)
-    error = log.output - simulate(GYRO, CALIBRATION_MOTION, 50.0).output
-    late = 0.9 * (CALIBRATION_MOTION.rate_at(log.time - 0.02) - log.reference_rate)
-    lagging = 1e-3 * (channels.lagged('temperature', 5.0) - log.temperature)
-    assert error - late - lagging == pytest.approx(
-        0.01 * np.exp(-log.time / 10.0) + 1e-3 * np.sin(log.reference_heading), abs=1e-12)
 
 
 def test_the_verb_simulates_what_a_gyro_makes_of_time_and_heading(tmp_path, run):

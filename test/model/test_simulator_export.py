@@ -14,7 +14,7 @@ import json
 import math
 import xml.etree.ElementTree as ElementTree
 
-from gyro_calibration.allan import allan_deviation
+from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise

@@ -15,7 +15,8 @@ import math
 import re
 
 from chance import fewest, mean_bound, most
-from gyro_calibration.allan import build_rest_record, fit_noise
+from gyro_calibration.allan.deviation import build_rest_record
+from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import ROBOT_MOTION

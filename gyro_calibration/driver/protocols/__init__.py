@@ -60,15 +60,10 @@ def find_protocol(name: str) -> Protocol:
 
 @dataclass(frozen=True)
 class Recognition:
-    """
-    The recognized format of some bytes.
-
-    The explained share, 0 to 1, is that of the bytes in frames of the best format, without an
-    incomplete frame at the beginning.
-
-    """
+    """The recognized format of some bytes."""
 
     protocol: Protocol | None  # None if ambiguous, or too few bytes
+    #: Of the bytes in frames of the best format, without an incomplete one at the beginning.
     explained_share: float
     summary: str  # the result as a sentence
 

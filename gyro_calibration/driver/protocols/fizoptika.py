@@ -38,18 +38,20 @@ from gyro_calibration.driver.protocols.protocol import (
     FrameSplitter,
     Protocol,
     Reading,
+    ROOM_TEMPERATURE,
     Sample,
     Settings,
     to_signed_count,
 )
 
 _HEADER = 0xDD
-# number of the high byte: name, unit of one count, offset, default of an emulated unit
+_FULL_COUNT = 0x8000  # of a status value
+# number of the high byte: name, value of the full count, offset, default of an emulated unit
 _STATUS_VALUES = {
-    0: ('temperature', 250.0 / 0x8000, -50.0, 25.0),
-    2: ('supply_v', 10.0 / 0x8000, 0.0, 5.0),
-    4: ('source_current_a', 0.25 / 0x8000, 0.0, 0.1),
-    6: ('diagnostic_v', 2.5 / 0x8000, 0.0, 1.0),
+    0: ('temperature', 250.0, -50.0, ROOM_TEMPERATURE),
+    2: ('supply_v', 10.0, 0.0, 5.0),
+    4: ('source_current_a', 0.25, 0.0, 0.1),
+    6: ('diagnostic_v', 2.5, 0.0, 1.0),
 }
 
 
@@ -70,8 +72,8 @@ class _Parser:
         rate = int.from_bytes((high, middle, low), 'big', signed=True)
         if before not in _STATUS_VALUES or number != before + 1:
             return Reading(rate)
-        name, unit, offset, _ = _STATUS_VALUES[before]
-        value = int.from_bytes((first, byte), 'big', signed=True) * unit + offset
+        name, full, offset, _ = _STATUS_VALUES[before]
+        value = int.from_bytes((first, byte), 'big', signed=True) * full / _FULL_COUNT + offset
         if name == 'temperature':
             return Reading(rate, temperature=value)
         return Reading(rate, health={name: value})
@@ -87,9 +89,10 @@ class _Writer:
         number = (sample.sequence or 0) % 8
         even = number & ~1
         if number == even or even not in self._latched:
-            name, unit, offset, usual = _STATUS_VALUES[even]
+            name, full, offset, usual = _STATUS_VALUES[even]
             known = sample.temperature if name == 'temperature' else sample.health.get(name)
-            half = to_signed_count(((usual if known is None else known) - offset) / unit)
+            status = usual if known is None else known
+            half = to_signed_count((status - offset) / full * _FULL_COUNT)
             self._latched = {even: half.to_bytes(2, 'big', signed=True)}
         high, middle, low = to_signed_count(value, 24).to_bytes(3, 'big', signed=True)
         frame = bytes([_HEADER, low, high, middle, number, self._latched[even][number - even]])

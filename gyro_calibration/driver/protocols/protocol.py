@@ -94,17 +94,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Reading:
-    """
-    The content of one frame.
+    """The content of one frame; what is not stated here is as in `Sample`."""
 
-    The value is in the unit and the sense of rotation of the device; `valid` is the status that
-    the device reports. A correct frame without a rate has the value None. The rest is as in
-    `Sample`.
-
-    """
-
-    value: float | None
-    valid: bool = True
+    value: float | None  # in unit and sense of the device; None in a correct frame without a rate
+    valid: bool = True  # by the status that the device reports
     temperature: float | None = None
     time: float | None = None
     sequence: int | None = None
@@ -201,12 +194,7 @@ class Protocol:
         return Decoder(self, settings or Settings())
 
     def encoder(self, settings: Settings | None = None) -> Callable[[Sample], bytes]:
-        """
-        Return ``encode(sample)`` of one device, which gives the bytes that it sends.
-
-        Beyond full scale it saturates. It raises as `check_settings` does.
-
-        """
+        """Return ``encode(sample)``: the bytes of a device, which saturates at full scale."""
         settings = settings or Settings()
         self.check_settings(settings)
         limit, factor, write = (self.effective_full_scale(settings), self.unit_scale(settings),
@@ -267,12 +255,7 @@ class Decoder:
 
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
-
-    Attributes
-    ----------
-    device_faults : frames whose value the device marks as invalid
-    refused_samples : frames whose value is not finite, or beyond full scale
-    refused_temperatures : not finite, or beyond -100 to 300 degC
+    The counts are those of `ConnectionCounts`.
 
     """
 
@@ -343,11 +326,7 @@ class LineSplitter(Splitter):
     Splits bytes into complete, nonempty lines without their ends.
 
     A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
-    first line is discarded, unless it begins as only complete lines do.
-
-    Parameters
-    ----------
-    line_starts : first bytes that occur only at the beginning of a line
+    first line is discarded, unless it begins with bytes with which only complete lines begin.
 
     """
 
@@ -385,11 +364,7 @@ class FrameSplitter(Splitter):
     """
     Splits bytes into frames that match a pattern and pass their check, from any byte on.
 
-    Parameters
-    ----------
-    pattern : regular expression that a frame matches; ``.`` is any byte
-    length : bytes of a frame
-    is_intact : whether the checksum of a frame is right
+    In the pattern, a regular expression, ``.`` is any byte; the length is in bytes.
 
     """
 
