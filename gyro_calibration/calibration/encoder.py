@@ -485,9 +485,14 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
             rate, half = (each / DEGREE for each in fit.reference_drift)
             yield (f'in motion the reference drifts by {rate:.3f} +- {half:.3f} deg/s (95 %) '
                    'against the rests in which it stands; the bias is that of the rests')
+        elif fit.reference_adds_up:
+            yield ('the reference is never lost, as odometry, and stands in no rest: its drift in '
+                   'motion has the same effect as a bias, which the intervals do not include; '
+                   'rest now and then')
         yield (f'scale factor error and bias have priors of the technology {technology} '
                '(--technology) with mean zero, which the intervals include')
-        return
+        if not fit.reference_adds_up:
+            return
     reference_error = -s / (1.0 + s)
     yield (f'a reference that shows {abs(100 * reference_error):.2f} % too '
            f'{"much" if reference_error > 0.0 else "little"}, '

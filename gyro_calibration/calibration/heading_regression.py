@@ -37,11 +37,12 @@ technology of the gyro.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
+from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns,
@@ -192,6 +193,7 @@ class Spans:
     # begin and end of each hole in the output that is as long as a span, s, shape (k, 2); over a
     # span that meets one, nothing is compared, and its observation is 0
     holes: Array
+    adds_up: bool  # whether the reference is never lost, as odometry, which adds up its errors
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
 
@@ -256,6 +258,11 @@ class Spans:
         """Return the time without the rests, s, shape (m,)."""
         assert self.log.time is not None
         return integrate(self.log.time, self.is_in_motion.astype(float))
+
+    @property
+    def angles(self) -> Array:
+        """Return the angle that is turned in each span, rad, shape (n,)."""
+        return np.diff(self.point_means(np.asarray(self.channels.heading)))
 
     @property
     def rest_durations(self) -> Array:
@@ -440,6 +447,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         noisier = rate_noise_share(log)
         white = math.hypot(white, white_noise_deviation(log.reference_rate))
         reference = integrate_with_curvature(time, bridge_gaps(log.reference_rate))
+    given = reference if given is None else given
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     walks = [white * math.sqrt(float(np.median(np.diff(time))))]
     if treatment.is_fine:
@@ -457,8 +465,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
         reference = np.append(np.where(np.diff(reference) != 0.0,
                                        0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
-    rests, stands = find_rests(
-        time, output, reference if treatment.is_fine or given is None else given)
+    rests, stands = find_rests(time, output, reference if treatment.is_fine else given)
     if treatment.is_fine:
         rests, stands = rests[~stands], stands[~stands]
     known = np.flatnonzero(np.isfinite(reference) & ~mark_rows(rests[stands], len(time)))
@@ -479,7 +486,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
-                 find_holes(time[np.isfinite(measured)], length))
+                 find_holes(time[np.isfinite(measured)], length),
+                 not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
 
 
 @dataclass(frozen=True)
@@ -650,11 +658,13 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     deviation = np.append(prior, np.full(columns.shape[1] - len(prior), np.inf))
     observed, (waves, shared) = spans.observed, spans.bias_wander()
 
-    def fit_with(correlation: Array | None = None, **options: Any) -> GridFit:
+    def fit_with(correlation: Array | None = None, reference_walk: Array | None = None,
+                 walk_size: float | None = None, **options: Any) -> GridFit:
         parts = heading_noise(in_motion, rates, point_variances, correlation=correlation,
-                              angle_random_walk=(low * least, high * most))
-        if spans.stands.any():  # odometry adds up its errors
-            parts[2] = replace(parts[0], name='reference_walk', size_range=parts[1].size_range)
+                              angle_random_walk=(low * least, high * most),
+                              reference_walk=reference_walk)
+        if walk_size is not None:
+            parts[2] = replace(parts[2], size_range=(walk_size, walk_size))
         parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
                          off_diagonal=None if part.off_diagonal is None
                          else np.append(part.off_diagonal, 0.0 * durations))
@@ -667,16 +677,17 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     if spans.treatment.is_fine:
         fit = fit_with()
     else:
+        walk, size = _reference_walk(spans, fit_with) if spans.adds_up else (None, None)
         greatest, likeliest = -math.inf, None
         for over_span in _COURSE_CORRELATIONS:
             correlation = over_span ** (np.diff(spans.time) / spans.treatment.min_span)
-            evidence = fit_with(correlation).log_evidence
+            evidence = fit_with(correlation, walk, size).log_evidence
             if evidence < greatest:
                 break
             greatest, likeliest = evidence, correlation
         # what a drive of minutes does not determine is drawn to 0, and the mean bias of the drive
         # is not that of the gyro
-        fit = fit_with(likeliest, wandering_value=1, hierarchical_priors=[
+        fit = fit_with(likeliest, walk, size, wandering_value=1, hierarchical_priors=[
             HierarchicalPrior(name, place, (1e-2 * size, size))
             for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))])
     values = fit.values + spans.correction(causes, len(fit.values))
@@ -687,10 +698,39 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     return replace(done, covariance=covariance, effective_stretches=effective, freedom=freedom)
 
 
+def _reference_walk(spans: Spans,
+                    fit_with: Callable[..., GridFit]) -> tuple[Array | None, float | None]:
+    """
+    Return how errors of odometry grow over each span, shape (n,), and their size.
+
+    They do not add up, grow in proportion to the time in motion, or to the angle turned by many
+    small slips, or a slip is a share of a whole turn, from a reversal to the next: whichever is
+    the likeliest. The spans of a turn may slip alike, so that the errors of whole turns count too.
+
+    """
+    angles, independent = np.abs(spans.angles), np.zeros(len(spans.time) - 1)
+    number = np.cumsum(np.diff(spans.angles > 0.0, prepend=spans.angles[0] > 0.0))
+    walks = [None, np.diff(spans.point_means(spans.time_in_motion)), angles,
+             angles * np.bincount(number, angles)[number]]
+    fits = [fit_with(independent, each) for each in walks]
+    walk, fit = max(zip(walks, fits), key=lambda each: each[1].log_evidence)
+    if walk is None:
+        return None, None
+    of_spans, white, by_span = (fit.likeliest_sizes[name] ** 2 for name in (
+        'angle_random_walk', 'reference', 'reference_walk'))
+    left, grown, duration = (np.bincount(number, each) for each in (
+        fit.residual[:len(walk)], walk, np.diff(spans.time)))
+    by_turn = np.sum(left ** 2 - of_spans * duration - 2.0 * white) / np.sum(grown)
+    return walk, math.sqrt(max(by_turn, by_span))
+
+
 def _cluster_robust_covariance(data: WhitenedRegression,
                                fit: GridFit) -> tuple[Array, Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
+
+    Nor less than their mean square error under the widest prior, as a value that is drawn to 0 by
+    a narrower one may be as large as the technology allows.
 
     Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958):
     the few turning points of a swing at an even rate may determine a value and take up their
@@ -702,12 +742,14 @@ def _cluster_robust_covariance(data: WhitenedRegression,
     count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
     left = data.observed - data.design @ values
-    influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, :count]
+    inverse = np.linalg.pinv(data.design.T @ data.design)[:, :count]
+    influence = data.design @ inverse
     inside = stretch < data.stretch_count
     scores = np.array([np.bincount(stretch, part * left) for part in influence.T])
     number = float(stretch.max()) + 1.0
-    variances = np.maximum(np.diag(fit.covariance),
-                           np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5))
+    scatter = np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5)
+    variances = np.maximum(np.maximum(np.diag(fit.covariance), scatter),
+                           np.diag(inverse) + (values[:count] - fit.values) ** 2)
     effective = effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
     for cluster in sectors:
@@ -835,7 +877,7 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     drift = (drifts[0], fit.half_width(len(BASE_VALUES))) if drifts else None
     return ScaleBiasFit(scale, bias, covariance[:2, :2], delay, fit.fit.size('angle_random_walk'),
                         fit.fit.size('reference'), time_offset_deviation=float(deviations[2]),
-                        reference_drift=drift)
+                        reference_drift=drift, reference_adds_up=spans.adds_up)
 
 
 def find_drift(log: Log) -> tuple[float, float] | None:

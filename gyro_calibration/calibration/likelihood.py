@@ -97,6 +97,7 @@ class ScaleBiasFit:
     # drift of a reference in motion against the rests in which it stands, and half its interval of
     # 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
+    reference_adds_up: bool = False  # whether the reference adds up its errors, as odometry
 
 
 #: Limit of significance, standard deviations: noise does not exceed it in 10 000 stretches a run,

@@ -43,7 +43,8 @@ name               unit       noise
 angle_random_walk  rad/√s     gyro, white: variance in proportion to the length of the span
 reference          rad        reference, white from point to point; neighbouring spans share one
 motion             s          the same, in proportion to the rate at the point: side slip, jitter
-turned             √rad       either, variance in proportion to the angle turned in the span
+reference_walk     rad/√s, …  reference that adds up its errors: in the span's time in motion,
+                              by the angle turned, √rad, or by its square, 1
 bias_instability   rad/s      gyro, flicker of the two-sided spectrum B²/ω
 rate_random_walk   rad/s/√s   gyro, random walk of the two-sided spectrum K²/ω²
 =================  =========  ==================================================================
@@ -189,10 +190,10 @@ class TridiagonalMatrix:
 
 
 def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
-                  with_angle_noise: bool = False,
                   typical_reference_noise: float = math.radians(1.0),
                   angle_random_walk: tuple[float, float] | None = None,
-                  correlation: Array | None = None) -> list[BandedNoise]:
+                  correlation: Array | None = None,
+                  reference_walk: Array | None = None) -> list[BandedNoise]:
     """
     Return the parts of the noise of increments between headings.
 
@@ -202,36 +203,35 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     rate : at the points, rad/s, shape (n + 1,)
     point_variance : of the reference at each point, relative to the others, shape (n + 1,); larger
         where a point is an outlier
-    with_angle_noise : whether noise in proportion to the angle turned is looked for
     typical_reference_noise : typical size of the noise of the reference, rad; sizes from 1e-4 to
         10 times it are possible
     angle_random_walk : smallest and largest N that is possible, rad/√s, where a log at rest, a
         data sheet or the differences between samples bound it; equal ends where it is known
     correlation : of the errors of the reference at both ends of each span, shape (n,); the parts
         are then those of the differences by `carried_shares`. None where they are independent
+    reference_walk : variance by which errors of a reference that add up grow over each span,
+        relative to the others, shape (n,); the last part is then 'reference_walk'
 
     """
     points = np.ones(len(time)) if point_variance is None else point_variance
-    interval, rate_rms = np.diff(time), math.sqrt(float(np.mean(rate**2))) + 1e-12
-    walk, walk_covariance = interval, None
-    if correlation is not None:
-        carried, before = carried_shares(correlation), np.append(0.0, interval[:-1])
-        walk, walk_covariance = interval + carried ** 2 * before, -carried * before
-    parts = [
-        BandedNoise(
-            'angle_random_walk', walk, walk_covariance, angle_random_walk
-            or (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
-        BandedNoise('reference', *difference_covariance(points, correlation),
-                    (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
-        BandedNoise(
-            'motion', *difference_covariance(points * rate ** 2, correlation),
-            (1e-3 * typical_reference_noise / rate_rms, 1e1 * typical_reference_noise / rate_rms)),
-    ]
-    if with_angle_noise:
-        angle = np.abs(0.5 * (rate[1:] + rate[:-1]) * interval)
-        parts.append(BandedNoise('turned', angle, None,
-                                 (1e-3 * typical_reference_noise, 1e1 * typical_reference_noise)))
-    return parts
+    rate_rms = math.sqrt(float(np.mean(rate**2))) + 1e-12
+    sizes = 1e-4 * typical_reference_noise, 1e1 * typical_reference_noise
+    moving = (BandedNoise('reference_walk', *_walk_covariance(reference_walk, correlation), sizes)
+              if reference_walk is not None else BandedNoise(
+                  'motion', *difference_covariance(points * rate ** 2, correlation),
+                  (1e1 * sizes[0] / rate_rms, sizes[1] / rate_rms)))
+    return [BandedNoise('angle_random_walk', *_walk_covariance(np.diff(time), correlation),
+                        angle_random_walk or sizes),
+            BandedNoise('reference', *difference_covariance(points, correlation), sizes), moving]
+
+
+def _walk_covariance(variance: Array,
+                     correlation: Array | None) -> tuple[Array, Array | None]:
+    """Return variances of independent increments, and covariances with the one before."""
+    if correlation is None:
+        return variance, None
+    carried, before = carried_shares(correlation), np.append(0.0, variance[:-1])
+    return variance + carried ** 2 * before, -carried * before
 
 
 def difference_covariance(variance: Array,

@@ -50,7 +50,7 @@ MIN_LOST_SHARE, MAX_ROUNDING_STEP, MAX_ROUNDING_RATIO = 0.003, 2e-4, 1.5
 #: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
 #: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
-COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
+_COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
@@ -239,7 +239,7 @@ def is_course(log: Log) -> bool:
     # a heading between slower fixes lies on straight lines
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
     larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > MIN_LOST_SHARE
-              else COURSE_NOISE_RATIO)
+              else _COURSE_NOISE_RATIO)
     # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
     # the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0

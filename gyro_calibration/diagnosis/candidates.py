@@ -34,6 +34,9 @@ from scipy.interpolate import BSpline
 MIN_ENCODER_STEP_RATE = 20.0
 #: Times of a bias step, and of a bump, that are tried in all logs together.
 MAX_STEP_TIMES = 64
+#: Lack of log-likelihood at the ends of the interval of 95 % of the time of a step: a random walk
+#: with a drift of minus half its variance on either side exceeds it with that probability.
+MAX_STEP_TIME_LACK = -math.log(1.0 - math.sqrt(0.95))
 #: Least change of a channel in a log, K, V and m/s²; with less it counts as missing.
 MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 

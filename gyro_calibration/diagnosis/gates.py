@@ -35,7 +35,6 @@ from gyro_calibration.calibration.dwells import (
 )
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.reference_noise import (
-    COURSE_NOISE_RATIO,
     heading_difference,
     is_course,
     MAX_ROUNDING_RATIO,
@@ -744,10 +743,11 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     interval = float(np.median(np.diff(log.time)))
     if _is_interpolated(log):
-        # the exact motion between its values is not known, and odometry adds up its errors
+        # the exact motion between its values is not known, and odometry adds up its errors: more
+        # than half of the variance of the difference in a second is then not of the gyro
         walk = white_noise_deviation(log.output) * math.sqrt(interval)
         known = np.isfinite(log.reference_heading).mean()
-        if known < 0.5 or errors.total_walk > COURSE_NOISE_RATIO * walk:
+        if known < 0.5 or errors.total_walk ** 2 > 2.0 * walk ** 2:
             return True
     # the rounding error of an encoder does not show while its shaft rests
     rounding = step / math.sqrt(12.0)

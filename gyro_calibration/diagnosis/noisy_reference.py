@@ -41,12 +41,17 @@ from gyro_calibration.calibration.heading_regression import (
     whiten_regression,
     WhitenedRegression,
 )
-from gyro_calibration.diagnosis.candidates import lasting_shapes, MIN_CHANNEL_RANGE
+from gyro_calibration.diagnosis.candidates import (
+    lasting_shapes,
+    MAX_STEP_TIME_LACK,
+    MIN_CHANNEL_RANGE,
+)
 from gyro_calibration.diagnosis.causes import (
     add_remedies,
     Cause,
     CAUSES,
     make_finding,
+    mark_parts_of_log,
     mark_suspected,
     SINGLE_EVENT_REMEDY,
     untestable_causes,
@@ -144,8 +149,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     extended, found = search_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
                                     on_progress)
     on_progress(None, 'cross-validation')
+    events = [each for each in extended.causes if each.is_single_event]
     lasting_terms = [each for each in extended.causes if not each.is_single_event]
-    lasting = (extended if len(lasting_terms) == len(extended.causes)
+    lasting = (extended if not events else plain if not lasting_terms
                else fit_spans(plain.spans, lasting_terms))
     gain = _cross_validated_gain(plain, lasting)
     model_fit = lasting
@@ -153,8 +159,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
         # causes that do not improve the prediction are not added to the model
         model_fit = plain
         if not plain.spans.treatment.is_fine:
-            found = [replace(each, is_established=False) for each in found]
-            extended = plain
+            found = [replace(each, is_established=each.is_established
+                             and each.cause_term.is_single_event) for each in found]
+            extended = fit_spans(plain.spans, events) if events else plain
         gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
     parts, time = _heading_contributions(extended), extended.spans.time
@@ -167,6 +174,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                 *_drift_findings(extended, false_alarm_rate), *record.findings,
                 *(each for cause in found for each in [_cause_finding(cause, extended)]
                   if not each.parameters[each.effect].contains_zero)]
+    findings = mark_parts_of_log(findings)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
@@ -292,6 +300,8 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
                                 term.shapes):
         if parameter.default is None and parameter.name not in parameters:
             parameters[parameter.name] = Estimate.from_half_width(value, 0.0, parameter.unit)
+    if term.cause == 'bias_step':
+        parameters = _step_parameters(fit, term, parameters[term.cause])
     shown = make_finding(
         term.cause, parameters, found_cause.p_value,
         [other for other in found_cause.probability if other != term.cause],
@@ -306,6 +316,34 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
         where=((term.shapes[0], float(fit.spans.time[-1])) if term.is_single_event else None),
         remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
     return shown if found_cause.is_established else mark_suspected(shown)
+
+
+def _step_parameters(fit: SpanFit, term: CauseTerm, size: Estimate) -> dict[str, Estimate]:
+    """Return the size of a step, given its time, and its time, with intervals."""
+    place = fit.value_slice(term).start
+    inflation = float(fit.covariance[place, place] / fit.fit.covariance[place, place])
+    data = whiten_regression(fit, [each for each in fit.causes if each != term])
+    times = fit.spans.time[2:-2]
+    times = times[::max(len(times) // 200, 1)]
+    for _ in range(2):
+        times = np.unique(np.append(times, term.shapes))
+        gains, sizes = _step_gains(fit, data, times)
+        index = int(np.searchsorted(times, term.shapes[0]))
+        lack = (gains[index] - gains) / inflation
+        # the times around that of the step, and then between those beside it
+        outside = np.flatnonzero(lack > MAX_STEP_TIME_LACK)
+        beside = np.searchsorted(outside, index)
+        first = outside[beside - 1] if beside > 0 else 0
+        last = outside[beside] if beside < len(outside) else len(times) - 1
+        interval = float(times[first]), float(times[last])
+        inside = slice(first, last + 1)
+        weights = np.exp(-lack[inside]) / np.sum(np.exp(-lack[inside]))
+        of_time = float(weights @ (sizes[inside] - weights @ sizes[inside]) ** 2)
+        times = np.linspace(*interval, 100)
+    half = 0.5 * (size.interval[1] - size.interval[0])
+    return {term.cause: Estimate.from_half_width(
+        size.estimate, math.hypot(half, NORMAL_QUANTILE_975 * math.sqrt(of_time)), size.unit),
+        'step_time': Estimate(term.shapes[0], interval, 's')}
 
 
 def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
@@ -531,8 +569,7 @@ def _follows_the_rate(cause: str) -> bool:
 def search_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
-    fine = fit.spans.treatment.is_fine
-    steps = _find_steps(fit, (), false_alarm_rate) if fine else []
+    steps = _find_steps(fit, (), false_alarm_rate)
     found, candidates = list(steps), propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in candidates
@@ -558,7 +595,7 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
         found.append(best)
     found = [each for each in found if each.prediction_gain > 0.0]
     causes = [each for each in found if each not in steps]
-    if fine and causes:
+    if causes:
         # a step may have been part of another cause, or have been hidden by it
         found = causes + _find_steps(fit, [each.cause_term for each in causes
                                            if each.is_established], false_alarm_rate)
@@ -596,25 +633,44 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
     """
     Return the steps of the bias given some causes, at most three.
 
-    A step is tried at each point, and around the best of them. The noise is fitted again with the
-    steps, so that a random walk that they had caused does not hide them, and one that the log has
-    is not a step. Of three steps those that are not significant are removed, the weakest first.
+    A step is tried at each point, and around the best of them; first also two at once. The noise
+    is fitted again with the steps, so that a random walk that they had caused does not hide them,
+    and one that the log has is not a step. Of three steps those that are not significant are
+    removed, the weakest first.
 
     """
     times = fit.spans.time[2:-2]
     every = max(len(times) // 200, 1)
+    likely = math.log(2.0 * len(times))
     steps: list[CauseTerm] = []
-    while len(steps) < 3:
-        with_steps = fit_spans(fit.spans, [*causes, *steps]) if causes or steps else fit
-        data = whiten_regression(with_steps, with_steps.causes)
-        place = every * int(np.argmax(_step_gains(fit, data, times[::every])))
+
+    def given_noise(others: Sequence[CauseTerm]) -> WhitenedRegression:
+        """Return the regression on causes and other steps, under the noise with them."""
+        with_steps = fit_spans(fit.spans, [*causes, *others]) if causes or others else fit
+        return whiten_regression(with_steps, with_steps.causes)
+
+    def refined(data: WhitenedRegression, place: int) -> tuple[CauseTerm, float]:
+        """Return the best step around one of the times, and its gain."""
         # in a gap between two points, such as a rest of an encoder, the time matters too
         begin, end = max(place - every, 0), min(place + every, len(times) - 1)
         near = np.linspace(times[begin], times[end], 20 * (end - begin) + 1)
-        gains = _step_gains(fit, data, near)
-        if gains.max() < math.log(2.0 * len(times) / false_alarm_rate):
+        gains = _step_gains(fit, data, near)[0]
+        return CauseTerm('bias_step', (float(near[gains.argmax()]),)), float(gains.max())
+
+    while len(steps) < 3:
+        data = given_noise(steps)
+        step, gain = refined(data, every * int(np.argmax(
+            _step_gains(fit, data, times[::every])[0])))
+        by_two, pair = (gain, (0, 0)) if steps else _best_pair(fit, data, times[::every])
+        if max(gain, by_two - likely) < likely - math.log(false_alarm_rate):
             break
-        steps.append(CauseTerm('bias_step', (float(near[gains.argmax()]),)))
+        if gain >= by_two - likely:
+            steps.append(step)
+            continue
+        # one step explains little of a bias that differs in a part of a log
+        steps = [CauseTerm('bias_step', (float(times[every * place]),)) for place in pair]
+        for number, place in enumerate(pair):
+            steps[number] = refined(given_noise([steps[1 - number]]), every * place)[0]
     while steps:
         with_steps = fit_spans(fit.spans, [*causes, *steps])
         places = [with_steps.value_slice(each).start for each in steps]
@@ -634,11 +690,26 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
     return []
 
 
-def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> Array:
-    """Return the gain in log-likelihood by a step of the bias at each time."""
+def _best_pair(fit: SpanFit, data: WhitenedRegression,
+               times: Array) -> tuple[float, tuple[int, int]]:
+    """Return the largest gain in log-likelihood by two steps of the bias, and their places."""
     columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
     step, left = _given_design(data, data.whiten_columns(np.column_stack(columns)))
-    return np.asarray(0.5 * (left @ step) ** 2 / np.maximum(np.sum(step ** 2, axis=0), 1e-300))
+    size = np.sqrt(np.sum(step ** 2, axis=0)) + 1e-300
+    alone, alike = left @ step / size, step.T @ step / np.outer(size, size)
+    gains = 0.5 * (alone ** 2 + alone[:, None] ** 2 - 2.0 * alike * np.outer(alone, alone)) / (
+        1.0 - np.minimum(np.abs(alike), 1.0 - 1e-6) ** 2)
+    gains[np.abs(alike) > 0.999] = 0.0  # steps that these spans do not distinguish
+    first, second = np.unravel_index(int(gains.argmax()), gains.shape)
+    return float(gains.max()), (int(min(first, second)), int(max(first, second)))
+
+
+def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> tuple[Array, Array]:
+    """Return the gain in log-likelihood by a step of the bias at each time, and its size."""
+    columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
+    step, left = _given_design(data, data.whiten_columns(np.column_stack(columns)))
+    score, information = left @ step, np.maximum(np.sum(step ** 2, axis=0), 1e-300)
+    return 0.5 * score ** 2 / information, score / information
 
 
 def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:

@@ -38,6 +38,7 @@ from gyro_calibration.diagnosis.causes import (
     Cause,
     CAUSES,
     make_finding,
+    mark_parts_of_log,
     mark_suspected,
     next_experiment,
     REFERENCES,
@@ -243,6 +244,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     offered = gain is None or not gain.is_worse
     on_progress(None, 'findings')
     findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed)]
+    if len(logs) == 1:
+        findings = mark_parts_of_log(findings)
     if model is not None:
         findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))

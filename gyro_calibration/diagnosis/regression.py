@@ -32,6 +32,8 @@ from gyro_calibration.diagnosis.candidates import (
     Candidate,
     candidate_transforms,
     fitted_shape_indices,
+    MAX_STEP_TIME_LACK,
+    MAX_STEP_TIMES,
     smooth_shapes,
     with_shape,
 )
@@ -509,20 +511,45 @@ def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) ->
     candidate = fit.causes[cause_index]
     others = fit.causes[:cause_index] + fit.causes[cause_index + 1:]
     shape = candidate.shapes[shape_index]
+    if candidate.half_width:
+        return _time_deviation(fit_causes(fit.problem, others), candidate, shape_index)
 
     def likelihood(by: float) -> float:
         moved = with_shape(candidate, shape_index, shape + by)
         return fit_causes(fit.problem, [*others, moved]).log_likelihood
 
     least = likelihood(0.0) - 0.5 * NORMAL_QUANTILE_975 ** 2
-    first = fit.problem.replays[0].point_interval if candidate.half_width else 1e-3 * shape
-    ends = []
+    first, ends = 1e-3 * shape, []
     for end in (first, -first):
         while likelihood(end) >= least and abs(end) < 1e6 * abs(first):
             end *= 2.0
         ends.append(abs(bisect(lambda by: likelihood(by) - least, 0.0, end, rtol=0.01)
                         if likelihood(end) < least else end))
     return max(ends) / NORMAL_QUANTILE_975
+
+
+def shifted_evidence(fit: RegressionFit, candidate: Candidate, shape_index: int,
+                     half_range: float) -> tuple[Array, Array]:
+    """Return shifts of a shape in a range, and the evidence of a candidate at each of them."""
+    shifts = np.linspace(-half_range, half_range, 2 * MAX_STEP_TIMES + 1)
+    columns = np.concatenate([candidate_transforms(with_shape(
+        candidate, shape_index, candidate.shapes[shape_index] + by), fit.distorted)
+        for by in shifts.tolist()])
+    return shifts, column_evidence(fit, columns / fit.problem.deviation,
+                                   np.arange(len(shifts))[:, None].tolist())
+
+
+def _time_deviation(fit: RegressionFit, candidate: Candidate, shape_index: int) -> float:
+    """Return the standard deviation of a time, by all times that are about as likely."""
+    half_range, last = candidate.half_width or 0.0, max(
+        each.duration for each in fit.problem.replays)
+    while True:
+        shifts, evidence = shifted_evidence(fit, candidate, shape_index, half_range)
+        likely = evidence >= evidence[len(shifts) // 2] - MAX_STEP_TIME_LACK
+        largest = float(np.abs(shifts[likely]).max() + shifts[1] - shifts[0])
+        if largest < half_range or half_range > last:
+            return largest / NORMAL_QUANTILE_975
+        half_range *= 2.0
 
 
 # filtered noise

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 import math
 from typing import Any
 
@@ -36,6 +37,7 @@ from gyro_calibration.diagnosis.candidates import (
     indices_by_cause,
     is_discontinuous,
     is_named,
+    MAX_STEP_TIMES,
     propose_candidates,
     unnamed_variable,
     with_shape,
@@ -420,10 +422,43 @@ def _select_forward(search: Search) -> Causes:
     named: Causes = ()
     for _ in range(2 * MAX_CAUSES):  # some are removed again
         one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
-        if one_more is None:
+        more = _with_part_of_log(search, named) if one_more is None else (*named, one_more)
+        if not more:
             break
-        named = eliminate_backward(search, refine_jointly(search, (*named, one_more)))
+        named = eliminate_backward(search, refine_jointly(search, more))
     return named
+
+
+def _with_part_of_log(search: Search, causes: Causes) -> Causes:
+    """
+    Return causes with two steps of the bias that are significant together; nothing without them.
+
+    Where a bias differs in a part of a log, a random walk explains it about as well as one step.
+
+    """
+    steps = [each for each in search.candidates if each.cause == 'bias_step'][::2]
+    pairs = [pair for pair in combinations(range(len(steps)), 2)
+             if steps[pair[0]].log_index == steps[pair[1]].log_index]
+    # without generic terms nothing tells a part from another structure in time
+    if not pairs or len(causes) + 2 > MAX_CAUSES or all(map(is_named, search.candidates)):
+        return ()
+    fit = fit_causes(search.problem, causes)
+    columns = np.concatenate([candidate_transforms(each, fit.distorted) for each in steps])
+    evidence = column_evidence(fit, columns / search.problem.deviation, pairs)
+    # with the best times, which are tried where the pair is likelier than chance
+    likely = 2.0 * math.log(MAX_STEP_TIMES)
+    least = likely - math.log(search.rate)
+    if evidence.max() < likely:
+        return ()
+    first, second = (replace(steps[place], penalty=math.log(MAX_STEP_TIMES))
+                     for place in pairs[int(evidence.argmax())])
+    for _ in range(2):
+        first = refine_shape(fit_causes(search.problem, [*causes, second]), first)[0]
+        second = refine_shape(fit_causes(search.problem, [*causes, first]), second)[0]
+    both = (*causes, first, second)
+    gain = fit_causes(search.problem, both).log_likelihood - fit.log_likelihood
+    left = eliminate_backward(search, refine_jointly(search, both))
+    return both if gain > least and len(left) == len(both) else ()
 
 
 def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:

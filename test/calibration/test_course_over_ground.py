@@ -129,6 +129,34 @@ def test_fit_and_diagnose_give_the_same_values_of_a_recorded_drive(data, name):
         assert delay.deviation == pytest.approx(fit.time_offset_deviation, rel=1e-6)
 
 
+def odometry_that_slips(seed):
+    """Return 4 min beside wheels that lose or gain 3 % of each turn at random, and the turns."""
+    generator, time = np.random.default_rng(seed), np.arange(0.0, 240.0, 0.02)
+    rate, slip, turns, begin = np.zeros(len(time)), np.ones(len(time)), 0, 0.0
+    while begin < 240.0:
+        begin, length = begin + generator.uniform(1.0, 4.0), generator.uniform(2.0, 6.0)
+        inside = (time >= begin) & (time < begin + length)
+        rate[inside] = generator.choice([-1.0, 1.0]) * generator.uniform(0.3, 1.0) * np.sin(
+            np.pi * (time[inside] - begin) / length) ** 2
+        slip[inside] += 0.03 * generator.standard_normal()
+        begin, turns = begin + length, turns + 1
+    drift = 0.2 * DEGREE * 0.02 ** 0.5 * generator.standard_normal(len(time))
+    return Log(time=time, output=SCALE * rate + BIAS + 1e-3 * generator.standard_normal(len(time)),
+               reference_heading=np.cumsum(0.02 * slip * rate + drift)), turns
+
+
+def test_slip_of_whole_turns_is_in_the_interval_of_the_scale():
+    variances, least = [], []
+    for seed in range(3):
+        log, turns = odometry_that_slips(seed)
+        found = calibrate_encoder(log, 'course')
+        variances.append(found.fit.covariance[0, 0])
+        least.append(0.03 ** 2 / turns)  # of the mean slip
+        assert abs(found.fit.scale_factor_error - SCALE + 1.0) < 3.0 * math.sqrt(variances[-1])
+    assert np.mean(variances) > np.mean(least)
+    assert 'same effect as a bias' in found.remarks[0] and 'for 360 deg' in found.remarks[-1]
+
+
 @pytest.mark.evidence
 def test_intervals_hold_the_truth():
     held = []

@@ -214,10 +214,11 @@ def test_a_random_walk_of_the_bias_is_no_step(step, seed):
     assert not [each for each in found.findings if each.effect == 'bias_step']
 
 
-def test_odometry_that_was_interpolated_at_the_samples_of_the_gyro_is_not_exact():
+@pytest.mark.parametrize('size', [0.2, 0.05])  # 17 and 4 times the noise of the gyro
+def test_odometry_that_was_interpolated_at_the_samples_of_the_gyro_is_not_exact(size):
     log = turning_log(3, lambda time, _: 0.003)
     walk = np.cumsum(np.random.default_rng(3).standard_normal(len(log))) / np.sqrt(RATE)
-    heading = np.cumsum(log.output - 0.003) / RATE / (1.0 + SCALE) + 0.2 * DEGREE * walk
+    heading = np.cumsum(log.output - 0.003) / RATE / (1.0 + SCALE) + size * DEGREE * walk
     log = replace(log, reference_heading=np.interp(log.time, log.time[::4], heading[::4]))
     assert is_reference_limiting(log, classify_reference(log))
 
@@ -252,12 +253,20 @@ def test_a_large_effect_is_established_by_a_course_and_its_model_predicts_the_he
             f'{1000.0 * errors["motion"]:.2g} ms times the rate') in ' '.join(found.remarks)
 
 
-def test_a_step_of_the_bias_that_happens_once_is_in_no_model():
-    found = diagnosed(
-        drive(6, hidden=lambda time, rate, heading, temperature: 0.01 * (time > 140.0)))
-    assert not {'bias_step', 'reference_slip'} & {term.effect.name for term in found.model.terms}
-    assert all(each.status == 'suspected' and each.where for each in found.findings
-               if each.effect in ('bias_step', 'reference_slip'))
+@pytest.mark.parametrize('ends', [(140.0,), (70.0, 150.0)], ids=str)
+def test_a_step_of_the_bias_beside_a_course_is_established_and_in_no_model(ends):
+    found = diagnosed(drive(6, hidden=lambda time, rate, heading, temperature: 0.01 * (
+        np.searchsorted(ends, time) == 1)))
+    assert 'bias_step' not in {term.effect.name for term in found.model.terms}
+    steps = sorted((each for each in found.findings if each.effect == 'bias_step'),
+                   key=lambda each: each.where)
+    assert [each.status for each in steps] == ['established'] * len(ends), terminal_lines(found)
+    for each, time, size in zip(steps, ends, (0.01, -0.01)):
+        for name, true in (('bias_step', size), ('step_time', time)):
+            low, high = each.parameters[name].interval
+            assert low < true < high and high - low < (2e-3 if name == 'bias_step' else 10.0)
+    assert ('part of the log' in steps[0].cause) == (len(ends) == 2)
+    assert steps[0].where[1] == pytest.approx(ends[1] if len(ends) == 2 else 240.0, abs=5.0)
 
 
 def turning_once(seed):

@@ -180,6 +180,19 @@ def test_a_scale_factor_of_a_part_of_a_log_is_not_blamed_on_the_temperature():
 
 # where is looked
 
+def test_the_interval_of_the_time_of_a_step_holds_it():
+    times, held = (150.0, 185.0), 0
+    for seed in range(6):
+        part = 6e-4 * ((times[0] < TIME) & (times[1] > TIME))
+        search, named = found_in([laid(resting(part, seed=seed))])
+        assert [known.cause for known in named] == 2 * ['bias_step']
+        fit = fit_causes(search.problem, named)
+        for place in range(2):
+            time, = fit.shapes(place).values()
+            held += min(abs(time.value - true) for true in times) < 1.96 * time.deviation < 10.0
+    assert held >= 11
+
+
 LATE = (TIME >= 200.0) & (TIME < 300.0)
 
 
