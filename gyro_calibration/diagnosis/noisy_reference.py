@@ -574,7 +574,10 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
     # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in candidates
                if not each.is_single_event and each.cause != SINE_RESPONSE.name}
-    rich_fit = fit_spans(fit.spans, [*columns.values(), *(each.cause_term for each in steps)])
+    rich = [*columns.values(), *(each.cause_term for each in steps)]
+    # of a log with fewer spans than columns, the noise is that without them
+    rich_fit = (fit_spans(fit.spans, rich)
+                if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}

@@ -95,6 +95,13 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
             and 'course over ground' in render_report(found))
 
 
+def test_a_short_drive_with_more_channels_than_spans_shows_nothing():
+    log = drive(0, 40.0)
+    log = select_rows(log, log.time < 25.0)
+    log = replace(log, supply=4.8 + 0.02 * log.time, specific_force=9.8 + np.cos(0.3 * log.time))
+    assert not diagnosed(log).findings
+
+
 def test_nothing_is_compared_across_a_hole_in_the_samples():
     log = drive(3)
     rows = np.abs(log.time - 100.0) > 12.0
