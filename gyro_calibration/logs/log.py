@@ -332,7 +332,7 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
         return None
     arrays: dict[str, Array] = {}
     for quantity, (index, factor, offset) in table.columns.items():
-        if _mask_invalid(values[:, index], quantity).any():
+        if mask_invalid(values[:, index], quantity).any():
             return None
         arrays[quantity] = values[:, index] * factor + offset
     return range(first_line, first_line + len(lines) + 1), arrays, {}
@@ -376,7 +376,7 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: '
                        f'{reprlib.repr(texts[row])} is not a number; {remedy}') from None
     values = np.array(found)
-    wrong = _mask_invalid(values, quantity)
+    wrong = mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
         fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
@@ -392,7 +392,8 @@ def _to_number(text: str) -> float:
     return float(text)
 
 
-def _mask_invalid(values: Array, quantity: str) -> Mask:
+def mask_invalid(values: Array, quantity: str) -> Mask:
+    """Tell which values a log cannot hold: beyond the limit, or nan where it may not be lost."""
     valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
@@ -465,7 +466,7 @@ def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> No
         given = ', '.join(f'{name} {shape}' for name, shape in shapes.items())
         raise LogError(f'the columns have the shapes {given}; wanted one shape (n,)')
     for quantity, values in arrays.items():
-        if quantity != 'time' and (wrong := _mask_invalid(values, quantity)).any():
+        if quantity != 'time' and (wrong := mask_invalid(values, quantity)).any():
             row = int(np.argmax(wrong))
             raise LogError(f'row {row} of {names.get(quantity, quantity)} is {values[row]:g}; '
                            'remove the row')

@@ -35,6 +35,7 @@ from gyro_calibration.logs.log import (
     Log,
     LogError,
     Mask,
+    mask_invalid,
     select_rows,
     unwrap_heading,
 )
@@ -217,7 +218,7 @@ class _LogBuilder:
         self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, '
                            f'time_s from {_format_seconds(gyro.stamps[0])} s on')
         output = gyro.values('rate').copy()
-        lost = ~np.isfinite(output)
+        lost = mask_invalid(output, 'output') | np.isnan(output)
         if lost.any():
             self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
                                'as lost')
@@ -229,8 +230,11 @@ class _LogBuilder:
         if reference is not None:
             arrays |= self._interpolate_reference(reference.with_times(use_stamps), gyro, time,
                                                   output)
-        return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
-                   notes=(*self._notes, *self._contents.notes))
+        try:
+            return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
+                       notes=(*self._notes, *self._contents.notes))
+        except LogError as error:
+            raise LogError(f'{self._path}: {error}') from None
 
     def _find_only_imu(self) -> str:
         found = [topic for topic in self._topics_of_type({cdr.IMU})
@@ -351,7 +355,7 @@ class _LogBuilder:
         force = gyro.values('force')
         if (gyro.values('force variance') == cdr.NOT_REPORTED).any() or not force.any():
             return None
-        if not np.isfinite(force).all():
+        if mask_invalid(force, 'specific_force').any():
             self._notes.append('the specific force is not finite everywhere and was left out')
             return None
         return force.copy()
@@ -359,7 +363,8 @@ class _LogBuilder:
     def _interpolate_temperature(self, series: _TopicSeries, begin: np.int64,
                                  time: Array) -> Array | None:
         """Return the temperature between readings; before and after them it is constant."""
-        series = series.select(np.isfinite(series.values('temperature'))).with_unique_stamps()
+        valid = ~mask_invalid(series.values('temperature'), 'temperature')
+        series = series.select(valid).with_unique_stamps()
         at = (series.stamps - begin) / NSEC_PER_SEC
         if (not len(at) or at[0] > time[-1] + _MAX_TEMPERATURE_GAP
                 or at[-1] < -_MAX_TEMPERATURE_GAP):

@@ -106,7 +106,8 @@ def zeroed(log, within):
 
 def late(log, generator):
     """Return a log with stamps that a host gave when it got to it."""
-    return replace(log, time=log.time + generator.exponential(0.1 * INTERVAL, len(log)))
+    stamps = log.time + generator.exponential(0.1 * INTERVAL, len(log))
+    return replace(log, time=np.sort(stamps))  # none is given before an earlier one
 
 
 CLEAN = {'white': lambda generator: swing(generator),
