@@ -112,6 +112,8 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
 
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log)
+    if log.time is not None and not name:  # several logs may have a rate each
+        _refuse_narrow_range(log, found.rate)
     unexplained, scale = fit_scale(found.output, found.rate)
     if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
         refuse_unit_error(scale, 'reference')
@@ -119,6 +121,22 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
         return found
     return replace(found, location=tuple(f'{name}: {place}' for place in found.location),
                    remarks=tuple(f'{name}: {remark}' for remark in found.remarks))
+
+
+def _refuse_narrow_range(log: Log, rate: Array) -> None:
+    """Refuse dwells over less than half of the rates of a log in time, such as rests alone."""
+    if log.reference_rate is not None:
+        rates = log.reference_rate[np.isfinite(log.reference_rate)]
+    else:
+        time, heading = np.asarray(log.time), np.asarray(log.reference_heading)
+        known = np.isfinite(heading)
+        rates = np.diff(np.interp(np.arange(time[0], time[-1]), time[known], heading[known]))
+    low, high = np.quantile(rates, [0.01, 0.99])
+    if np.ptp(rate) < 0.5 * (high - low):
+        raise NothingSteady(
+            f'the reference is steady at {rate.min() / DEGREE:.1f} to {rate.max() / DEGREE:.1f} '
+            f'deg/s only, and turns at {low / DEGREE:.1f} to {high / DEGREE:.1f} deg/s; hold '
+            'faster rates for longer, or use --method likelihood')
 
 
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:

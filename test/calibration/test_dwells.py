@@ -19,6 +19,7 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells,
     find_dwells,
     join_dwells,
+    NothingSteady,
 )
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import constant_rate_motion
@@ -267,6 +268,17 @@ def test_a_rate_of_coarse_steps_or_of_no_values_gives_way_to_the_heading(generat
                                (np.full(len(TIME), np.nan), HEADING, 1e-6)):
         found = find_dwells(run(generator, reference_rate=rate, reference_heading=heading))
         assert np.allclose(found.rate / DEGREE, RATES, atol=off)
+
+
+@pytest.mark.parametrize('quantity', ['reference_rate', 'reference_heading'])
+def test_rests_alone_of_a_motion_are_no_dwells_to_calibrate_by(quantity, generator):
+    moves = (TIME % 60.0) > 30.0
+    rate = np.where(moves, 45.0 * DEGREE * np.sin(TIME), 0.0)
+    reference = rate if quantity == 'reference_rate' else np.cumsum(rate) * 0.01
+    log = run(generator, rate=rate, **{quantity: reference})
+    assert np.abs(find_dwells(log).rate).max() < 0.1 * DEGREE
+    with pytest.raises(NothingSteady, match='steady at .* only, and turns at .* --method like'):
+        extract_dwells(log)
 
 
 def test_a_simulation_without_noise_claims_nothing(generator):
