@@ -187,7 +187,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps = _bridge_jumps(log)
-        time, output, motion = _extract_motion(log)
+        if jumps:
+            time, output, motion = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)

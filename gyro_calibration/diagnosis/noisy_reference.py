@@ -330,11 +330,11 @@ def _step_parameters(fit: SpanFit, term: CauseTerm, size: Estimate) -> dict[str,
         gains, sizes = _step_gains(fit, data, times)
         index = int(np.searchsorted(times, term.shapes[0]))
         lack = (gains[index] - gains) / inflation
-        # the times around that of the step, and then between those beside it
+        # the times around that of the step, and then between its neighbours
         outside = np.flatnonzero(lack > MAX_STEP_TIME_LACK)
-        beside = np.searchsorted(outside, index)
-        first = outside[beside - 1] if beside > 0 else 0
-        last = outside[beside] if beside < len(outside) else len(times) - 1
+        after = np.searchsorted(outside, index)
+        first = outside[after - 1] if after > 0 else 0
+        last = outside[after] if after < len(outside) else len(times) - 1
         interval = float(times[first]), float(times[last])
         inside = slice(first, last + 1)
         weights = np.exp(-lack[inside]) / np.sum(np.exp(-lack[inside]))
