@@ -479,6 +479,12 @@ class Agreement(NamedTuple):
     deviation: float
     coherence: float  # common share of the variance
     residual: float  # standard deviation, rad
+    noise_share: float  # share of the variance of the integral that is white noise of the output
+
+    def is_followed(self) -> bool:
+        """Tell whether the reference may have made half the turns of the gyro, at least."""
+        highest = self.factor + NORMAL_QUANTILE_975 * self.deviation
+        return highest > 0.5 * (1.0 - self.noise_share)
 
 
 def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
@@ -540,7 +546,9 @@ def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: 
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
     elif best.coherence >= _MIN_MOTION_COHERENCE and not other_axis:
         return Gate('motion', True, evidence)
-    if longest.residual < _MIN_HEADING_DIFFERENCE or turned_angle < _MIN_TURNED_ANGLE:
+    # errors of a reference leave the factor as it is
+    if turned_angle < _MIN_TURNED_ANGLE or (longest.residual < _MIN_HEADING_DIFFERENCE
+                                            and all(each.is_followed() for each in by_length)):
         return Gate('motion', best.coherence >= _MIN_MOTION_COHERENCE or None,
                     f'{evidence}; the difference is within the errors of a reference')
     others = [name for name in log.others if 'gyro' in name.lower()]
@@ -610,7 +618,8 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _MIN_SPANS or np.isfinite(log.output).sum() < 2 * _MIN_SPANS:
         return []
-    turned = integrate(log.time, bridge_gaps(log.output))
+    output = bridge_gaps(log.output)
+    turned = integrate(log.time, output)
     span = max((log.time[-1] - log.time[0]) / _SPAN_COUNT,
                4.0 * float(np.median(np.diff(log.time))))
     number = np.floor((log.time[known] - log.time[0]) / span)
@@ -618,17 +627,19 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     at, heading = log.time[chosen], reference[chosen]
     if not np.ptp(heading) > 0.0:
         return []
-    return [_regress_at_best_lag(log.time, turned, at[::together], heading[::together], span)
+    white = white_noise_deviation(output) ** 2 * float(np.median(np.diff(log.time)))
+    return [_regress_at_best_lag(log.time, turned, at[::together], heading[::together], span,
+                                 white)
             for together in _SPAN_MULTIPLES if len(at[::together]) > _MIN_SPANS]
 
 
 def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading: Array,
-                         span: float) -> Agreement:
-    """Return the agreement at the best lag, in either direction up to 25 spans."""
+                         span: float, white: float) -> Agreement:
+    """Return the agreement at the best lag, up to 25 spans; white noise in rad²/s."""
     change, steps = np.diff(heading), np.diff(point_times)
     lags = span * np.arange(-25, 26)
-    found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change)
-             for lag in lags]
+    found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change,
+                              white) for lag in lags]
     least = min(1.0 - each.coherence for each in found)
     # a periodic motion agrees again a period later
     near = [place for place, each in enumerate(found)
@@ -636,7 +647,7 @@ def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading
     return found[min(near, key=lambda place: abs(lags[place]))]
 
 
-def _regress_changes(gyro: Array, steps: Array, change: Array) -> Agreement:
+def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> Agreement:
     """Return the agreement without outlying spans."""
     scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
@@ -657,7 +668,9 @@ def _regress_changes(gyro: Array, steps: Array, change: Array) -> Agreement:
     coherence = max(1.0 - left / variance, 0.0) if variance > 0.0 else 0.0
     deviation = math.sqrt(
         left / max(kept.sum() - 2, 1) / max(float(np.var(columns[kept, 0])), 1e-300))
-    return Agreement(float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left))
+    noise_share = white * float(steps[kept].mean()) / max(float(np.var(gyro[kept])), 1e-300)
+    return Agreement(float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left),
+                     min(noise_share, 1.0))
 
 
 #: Gate that failed -> its meaning, for people.
