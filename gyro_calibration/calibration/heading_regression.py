@@ -205,7 +205,16 @@ class Spans:
         first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
                                       self.log.time[self.rests]]).T
         begin, end = self.holes[:, :, None].transpose(1, 0, 2)
-        return np.asarray(~((begin < last) & (end > first)).any(axis=0))
+        outside = np.append(self.time_outside[:-1] < 0.0, np.zeros(len(self.rests), bool))
+        outside[:len(at) - 1] |= self.time_outside[1:] > 0.0
+        return np.asarray(~((begin < last) & (end > first)).any(axis=0) & ~outside)
+
+    @property
+    def time_outside(self) -> Array:
+        """Return the time of each point before the log of the gyro, or after it, s, (n + 1,)."""
+        assert self.log.time is not None
+        at = self.gyro_stamps(self.time)
+        return at - np.clip(at, self.log.time[0], self.log.time[-1])
 
     @property
     def stretch_numbers(self) -> NDArray[np.intp]:
@@ -652,7 +661,7 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
     low, high = spans.treatment.walk_range
     rates = spans.point_means(np.asarray(spans.channels.rate))
-    in_motion = spans.point_means(spans.time_in_motion)
+    in_motion = spans.point_means(spans.time_in_motion) + spans.time_outside
     durations = spans.rest_durations
     prior = spans.treatment.prior
     deviation = np.append(prior, np.full(columns.shape[1] - len(prior), np.inf))

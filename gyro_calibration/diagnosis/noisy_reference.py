@@ -126,6 +126,8 @@ FOLD_COUNT = 5
 _MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
 #: Most steps of the search for the k of a sine response, each of which multiplies its error.
 _SHAPE_STEPS = 20
+#: Correlation of the columns of two steps of the bias above which spans do not distinguish them.
+_MAX_ALIKENESS = 0.999
 #: Variables whose causes are similar to errors of an encoder that repeat with its position.
 _MOTION_VARIABLES = frozenset({'rate', 'heading'})
 
@@ -698,11 +700,11 @@ def _best_pair(fit: SpanFit, data: WhitenedRegression,
     """Return the largest gain in log-likelihood by two steps of the bias, and their places."""
     columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
     step, left = _given_design(data, data.whiten_columns(np.column_stack(columns)))
-    size = np.sqrt(np.sum(step ** 2, axis=0)) + 1e-300
+    size = np.sqrt(np.sum(step ** 2, axis=0)) + 1e-100
     alone, alike = left @ step / size, step.T @ step / np.outer(size, size)
     gains = 0.5 * (alone ** 2 + alone[:, None] ** 2 - 2.0 * alike * np.outer(alone, alone)) / (
         1.0 - np.minimum(np.abs(alike), 1.0 - 1e-6) ** 2)
-    gains[np.abs(alike) > 0.999] = 0.0  # steps that these spans do not distinguish
+    gains[np.abs(alike) > _MAX_ALIKENESS] = 0.0
     first, second = np.unravel_index(int(gains.argmax()), gains.shape)
     return float(gains.max()), (int(min(first, second)), int(max(first, second)))
 
@@ -710,9 +712,12 @@ def _best_pair(fit: SpanFit, data: WhitenedRegression,
 def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> tuple[Array, Array]:
     """Return the gain in log-likelihood by a step of the bias at each time, and its size."""
     columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
-    step, left = _given_design(data, data.whiten_columns(np.column_stack(columns)))
+    whole = data.whiten_columns(np.column_stack(columns))
+    step, left = _given_design(data, whole)
     score, information = left @ step, np.maximum(np.sum(step ** 2, axis=0), 1e-300)
-    return 0.5 * score ** 2 / information, score / information
+    # a step that these spans do not distinguish from another explains nothing
+    distinct = information > (1.0 - _MAX_ALIKENESS ** 2) * np.sum(whole ** 2, axis=0)
+    return 0.5 * distinct * score ** 2 / information, distinct * score / information
 
 
 def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:

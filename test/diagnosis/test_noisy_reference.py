@@ -20,10 +20,11 @@ from gyro_calibration.calibration.heading_regression import (
     find_drift,
     fit_spans,
     lay_out_spans,
+    whiten_regression,
 )
 from gyro_calibration.calibration.reference_noise import rate_noise_share
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
-from gyro_calibration.diagnosis.noisy_reference import search_causes
+from gyro_calibration.diagnosis.noisy_reference import _step_gains, search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
@@ -531,3 +532,19 @@ def test_rests_determine_the_bias_beside_odometry_that_drifts_in_motion(seed, dr
 def test_what_the_gyro_does_in_motion_is_no_drift_of_the_reference(hidden):
     drifts = [find_drift(odometry(seed, 0.0, **hidden)[0]) for seed in range(10)]
     assert sum(each is not None for each in drifts) <= 1
+
+
+def test_a_second_step_at_the_time_of_the_first_explains_nothing():
+    spans = lay_out_spans(drive(3), 'course')
+    fit = fit_spans(spans, [CauseTerm('bias_step', (spans.time[40],))])
+    data = whiten_regression(fit, fit.causes)
+    gains, sizes = _step_gains(fit, data, spans.time[[40, 80]])
+    assert gains[0] == sizes[0] == 0.0 < gains[1]
+
+
+@pytest.mark.parametrize('delay', [-4.0, 0.0, 4.0])
+def test_spans_before_and_after_the_log_of_the_gyro_are_not_compared(delay):
+    spans = replace(lay_out_spans(drive(4), 'course'), delay=delay)
+    covered = spans.is_measured[:len(spans.time) - 1]
+    assert covered[10:-10].all()
+    assert covered[0] == (delay >= 0.0) and covered[-1] == (delay <= 0.0)
