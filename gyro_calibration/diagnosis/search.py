@@ -237,8 +237,8 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
 
     """
     found = search.candidate_evidence(fit)
-    # A second cause without a free size would only correct the shape of the first.
-    taken = {each.cause for each in fit.causes if each.amplitude is not None}
+    # A second cause of this kind would only correct the shape of the first.
+    taken = {each.cause for each in fit.causes if each.amplitude is not None or is_lasting(each)}
     first = []
     for cause, own in indices_by_cause(search.candidates).items():
         if cause not in taken and np.isfinite(found[own]).any():
@@ -568,7 +568,7 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
     """Withdraw names, confirm the others, and take the simplest of what the data allow."""
     search.on_progress(None, 'alternatives')
     named, unnamed = withdraw_names(search, causes)
-    named, removed = _remove_unconfirmed(search, named)
+    named, removed = _remove_unconfirmed(search, named, unnamed)
     named, alternatives = choose_simplest(search, named, unnamed)
     taken = {each.cause for each in named}
     suspected = tuple(each for each in removed if is_lasting(each) and each.cause not in taken)
@@ -577,8 +577,15 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
                      tuple(each for each in removed if not is_lasting(each)))
 
 
-def _remove_unconfirmed(search: Search, causes: Causes) -> tuple[Causes, Causes]:
-    """Separate causes from those that predict no held-out stretches, or may have the size 0."""
+def _remove_unconfirmed(search: Search, causes: Causes,
+                        unnamed: Causes) -> tuple[Causes, Causes]:
+    """
+    Separate causes from those that predict no held-out stretches, or may have the size 0.
+
+    A cause whose shape the data do not determine may have any size: its simplest alternative,
+    which has no such shape, is tested in its place.
+
+    """
     removed: Causes = ()
     while causes:
         sigmas = np.minimum(np.array(held_out_sigmas(search, causes)) / MIN_PREDICTION_SIGMAS,
@@ -586,8 +593,10 @@ def _remove_unconfirmed(search: Search, causes: Causes) -> tuple[Causes, Causes]
         weakest = int(np.argmin(sigmas))
         if sigmas[weakest] > 1.0:
             break
-        removed = (*removed, causes[weakest])
-        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
+        simplest, _ = _alternatives(search, causes, weakest, unnamed)
+        more = () if simplest is causes[weakest] else (simplest,)
+        removed = removed if more else (*removed, causes[weakest])
+        causes = refine_jointly(search, causes[:weakest] + more + causes[weakest + 1:])
     return causes, removed
 
 
@@ -647,20 +656,27 @@ def choose_simplest(search: Search, named: Causes,
     Return the causes, and for each itself and its alternatives, with deficits in log-likelihood.
 
     """
+    sets = []
+    for place in range(len(named)):
+        simplest, members = _alternatives(search, named, place, unnamed)
+        if simplest is not named[place]:
+            named = refine_jointly(search, (*named[:place], simplest, *named[place + 1:]))
+        sets.append(members)
+    return named, sets
+
+
+def _alternatives(search: Search, named: Causes, place: int,
+                  unnamed: Causes) -> tuple[Candidate, list[Scored]]:
+    """Return the simplest alternative of a cause, or itself, and all with their deficits."""
     def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
         return len(fitted_shape_indices(known)) + (
             0 if known.amplitude is not None else len(known.columns(search.problem.replays[0])))
 
-    sets = []
-    for place in range(len(named)):
-        cause = named[place].cause
-        _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
-        mine = max((score for each, score in steps if each.cause == cause), default=math.inf)
-        members = [(each, mine - score) for each, score in steps
-                   if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(named[place], 0.0)]
-        chosen = min((each for each, _ in members), key=size)
-        if size(chosen) < size(named[place]):
-            named = refine_jointly(search, (*named[:place], chosen, *named[place + 1:]))
-        sets.append(members)
-    return named, sets
+    own = named[place]
+    _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
+    mine = max((score for each, score in steps if each.cause == own.cause), default=math.inf)
+    members = [(each, mine - score) for each, score in steps
+               if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(own, 0.0)]
+    simplest = min((each for each, _ in members), key=size)
+    return simplest if size(simplest) < size(own) else own, members
