@@ -66,32 +66,20 @@ _BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
 
 @dataclass(frozen=True)
 class Dwells:
-    """
-    Means over stretches of constant rate (Ojeda et al., eq. 5 to 7), each array of shape (n,).
+    """Means over stretches of constant rate (Ojeda et al., eq. 5 to 7), arrays of shape (n,)."""
 
-    Attributes
-    ----------
-    rate : of the reference, rad/s
-    output : of the gyro, rad/s
-    temperature : degC; None where the log holds none
-    deviation : standard deviation of the mean output against the mean reference, rad/s; nan where
-        it is not known
-    sweep : number of the sweep, or block of time, of each dwell; cross-validation leaves a sweep
-        out as a whole
-    location : of each dwell in its file, for messages
-    remarks : on what was found and left out, one sentence each
-    rows : of the log, whose mean each dwell is
-
-    """
-
-    rate: Array
-    output: Array
-    temperature: Array | None
+    rate: Array  # of the reference, rad/s
+    output: Array  # of the gyro, rad/s
+    temperature: Array | None  # degC; None where the log holds none
+    # standard deviation of the mean output against the mean reference, rad/s; nan where it is not
+    # known
     deviation: Array
+    # number of the sweep, or block of time, of each dwell; cross-validation leaves a sweep out as
+    # a whole
     sweep: Numbers
-    location: tuple[str, ...]
-    remarks: tuple[str, ...] = ()
-    rows: tuple[Numbers, ...] = ()
+    location: tuple[str, ...]  # of each dwell in its file, for messages
+    remarks: tuple[str, ...] = ()  # on what was found and left out, one sentence each
+    rows: tuple[Numbers, ...] = ()  # of the log, whose mean each dwell is
 
     def __len__(self) -> int:
         return len(self.rate)

@@ -66,54 +66,31 @@ MAX_REST_RATE = 0.1 * DEGREE
 
 
 class ColumnTest(NamedTuple):
-    """
-    How much columns explain of the errors of dwells.
+    """How much columns explain of the errors of dwells."""
 
-    Attributes
-    ----------
-    p_value : that errors without them are explained as well
-    gain : reduction of the sum of the whitened squared residuals
-    share : of the variance, from 0 to 1
-
-    """
-
-    p_value: float
-    gain: float
-    share: float
+    p_value: float  # that errors without them are explained as well
+    gain: float  # reduction of the sum of the whitened squared residuals
+    share: float  # of the variance, from 0 to 1
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """
-    A model fitted to dwells, with residuals and cross-validation.
+    """A model fitted to dwells, with residuals and cross-validation."""
 
-    Attributes
-    ----------
-    terms : effects with their values
-    dwells : all of them
-    given : the model that is corrected; an ideal gyro where there is none. Its effects that are
-        not fitted count as known
-    scatter : of the dwells, and which were fitted
-    residual : error of each dwell that the effects do not explain, rad/s, shape (n,)
-    left_out_residual : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at
-        outlying dwells, infinite where the other sweeps do not determine it
-    deviation : standard deviation of each dwell, rad/s, shape (n,)
-    condition_number : number of the columns, each of length one
-    dof : dwells less fitted values
-    misfit : sum of the whitened squared residuals; about `dof` where no effect is missing
-
-    """
-
-    terms: tuple[Term, ...]
-    dwells: Dwells
+    terms: tuple[Term, ...]  # effects with their values
+    dwells: Dwells  # all of them
+    # the model that is corrected; an ideal gyro where there is none. Its effects that are not
+    # fitted count as known
     given: GyroModel
-    scatter: Scatter
-    residual: Array
+    scatter: Scatter  # of the dwells, and which were fitted
+    residual: Array  # error of each dwell that the effects do not explain, rad/s, shape (n,)
+    # the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying dwells,
+    # infinite where the other sweeps do not determine it
     left_out_residual: Array
-    deviation: Array
-    condition_number: float
-    dof: int
-    misfit: float
+    deviation: Array  # standard deviation of each dwell, rad/s, shape (n,)
+    condition_number: float  # number of the columns, each of length one
+    dof: int  # dwells less fitted values
+    misfit: float  # sum of the whitened squared residuals; about `dof` where no effect is missing
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -558,26 +535,17 @@ def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> DataRefused
 
 @dataclass(frozen=True)
 class Bin:
-    """
-    Dwells of nearly one rate, or nearly one temperature.
+    """Dwells of nearly one rate, or nearly one temperature."""
 
-    Attributes
-    ----------
-    low, high : ends of the bin, in the unit of what was binned
-    count : of dwells
-    uncorrected, residual : mean error without the model and with it, rad/s
-    deviation : standard deviation of the mean residual, rad/s
-    rms : of the residual, rad/s
-
-    """
-
+    # low, high: ends of the bin, in the unit of what was binned
     low: float
     high: float
-    count: int
+    count: int  # of dwells
+    # uncorrected, residual: mean error without the model and with it, rad/s
     uncorrected: float
     residual: float
-    deviation: float
-    rms: float
+    deviation: float  # standard deviation of the mean residual, rad/s
+    rms: float  # of the residual, rad/s
 
 
 def bin_errors(fit: Calibration, values: Array, max_bins: int = 8) -> list[Bin]:
@@ -605,21 +573,12 @@ def equal_bins(values: Array, max_bins: int) -> Iterator[tuple[float, float, Mas
 
 @dataclass(frozen=True)
 class TurnErrors:
-    """
-    Errors of full turns, counter-clockwise positive as the heading is.
+    """Errors of full turns, counter-clockwise positive as the heading is."""
 
-    Attributes
-    ----------
-    turns : their dwells
-    static : with the static bias only, rad per turn, shape (n,)
-    modelled : with the model, and the static bias after it, rad per turn, shape (n,)
-    remarks : on the source of the static bias, and on turns without an error, one sentence each
-
-    """
-
-    turns: Dwells
-    static: Array
-    modelled: Array
+    turns: Dwells  # their dwells
+    static: Array  # with the static bias only, rad per turn, shape (n,)
+    modelled: Array  # with the model, and the static bias after it, rad per turn, shape (n,)
+    # on the source of the static bias, and on turns without an error, one sentence each
     remarks: tuple[str, ...] = ()
 
 

@@ -67,21 +67,14 @@ class Scatter:
     The surface is as smooth as the number of dwells allows. The scatter does not depend on the
     effects that are fitted: one found with too few of them would include what they leave.
 
-    Attributes
-    ----------
-    dwell_bias : of a dwell, beyond its own deviation, rad/s
-    dwell_scale : of the scale factor from dwell to dwell, 1, such as that of a table's speed
-    sweep_bias : of the bias from sweep to sweep, rad/s
-    sweep_scale : of the scale factor from sweep to sweep, 1
-    inliers : which dwells are not outlying, shape (n,)
-
     """
 
-    dwell_bias: float
+    dwell_bias: float  # of a dwell, beyond its own deviation, rad/s
+    # of the scale factor from dwell to dwell, 1, such as that of a table's speed
     dwell_scale: float
-    sweep_bias: float
-    sweep_scale: float
-    inliers: Mask
+    sweep_bias: float  # of the bias from sweep to sweep, rad/s
+    sweep_scale: float  # of the scale factor from sweep to sweep, 1
+    inliers: Mask  # which dwells are not outlying, shape (n,)
 
     def deviation(self, dwells: Dwells) -> Array:
         """
@@ -317,21 +310,14 @@ class Uncertainty:
     are sweeps more than values. The maximum of the likelihood alone would be at zero in about half
     of the cases, and its intervals would be too narrow.
 
-    Attributes
-    ----------
-    weights : of possible scatters, shape (k,)
-    offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
-    covariances : scale matrices of the distribution, shape (k, m, m)
-    dof : of Student's distribution
-    sweep_deviations : standard deviations of the bias of a sweep, rad/s, and of its scale factor,
-        1, shape (k, 2)
-
     """
 
-    weights: Array
+    weights: Array  # of possible scatters, shape (k,)
+    # from the values that were fitted to the middle of their distribution, shape (k, m)
     offsets: Array
-    covariances: Array
-    dof: int
+    covariances: Array  # scale matrices of the distribution, shape (k, m, m)
+    dof: int  # of Student's distribution
+    # standard deviations of the bias of a sweep, rad/s, and of its scale factor, 1, shape (k, 2)
     sweep_deviations: Array
 
     @classmethod

@@ -64,48 +64,31 @@ BASIC_EFFECTS = BIAS, SCALE_FACTOR_ERROR
 
 @dataclass(frozen=True)
 class EffectChoice:
-    """
-    Why an effect was taken or not.
+    """Why an effect was taken or not."""
 
-    Attributes
-    ----------
-    effect : its name
-    taken : whether it is in the model
-    error_without, error_with : error of left-out sweeps, rad/s; nan where a fit was not possible
-    p_value : p-value of the effect; nan as before
-    reason : one sentence
-
-    """
-
-    effect: str
-    taken: bool
+    effect: str  # its name
+    taken: bool  # whether it is in the model
+    # error_without, error_with: error of left-out sweeps, rad/s; nan where a fit was not possible
     error_without: float
     error_with: float
-    p_value: float
-    reason: str
+    p_value: float  # p-value of the effect; nan as before
+    reason: str  # one sentence
 
 
 @dataclass(frozen=True)
 class ConfoundedPair:
-    """
-    Two effects that explain the same errors.
+    """Two effects that explain the same errors."""
 
-    Attributes
-    ----------
-    taken, other : their names
-    sigmas : standard deviations by which the data prefer the one that was taken; negative where
-        they prefer the other
-    distinguishing_rate : slowest rate, rad/s, at which two dwells each way would distinguish them;
-        None if it is above three times the fastest
-    reason : why it was taken, one sentence
-
-    """
-
+    # taken, other: their names
     taken: str
     other: str
+    # standard deviations by which the data prefer the one that was taken; negative where they
+    # prefer the other
     sigmas: float
+    # slowest rate, rad/s, at which two dwells each way would distinguish them; None if it is above
+    # three times the fastest
     distinguishing_rate: float | None
-    reason: str
+    reason: str  # why it was taken, one sentence
 
     @property
     def is_distinguishable(self) -> bool:

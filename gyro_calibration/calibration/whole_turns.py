@@ -50,22 +50,12 @@ _FALSE_REFUSAL_RATE = 1e-4
 
 @dataclass(frozen=True)
 class TurnCalibration:
-    """
-    The result of a calibration by whole turns.
+    """The result of a calibration by whole turns."""
 
-    Attributes
-    ----------
-    fit : s and b with their covariance
-    turns : number, counter-clockwise positive
-    duration : from rest to rest, s
-    rest_durations : durations of the rests at both ends, s
-
-    """
-
-    fit: ScaleBiasFit
-    turns: int
-    duration: float
-    rest_durations: tuple[float, float]
+    fit: ScaleBiasFit  # s and b with their covariance
+    turns: int  # number, counter-clockwise positive
+    duration: float  # from rest to rest, s
+    rest_durations: tuple[float, float]  # durations of the rests at both ends, s
 
 
 def calibrate_turns(time: Array, rate: Array, turns: int | None = None,

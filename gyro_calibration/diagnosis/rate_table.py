@@ -223,20 +223,11 @@ def _outlier_findings(fit: Calibration, level: float) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class NamedCauses:
-    """
-    Causes that dwells support on top of a model.
+    """Causes that dwells support on top of a model."""
 
-    Attributes
-    ----------
-    fit : of causes, bias and scale factor to the dwells
-    causes : the named effects of the fit
-    false_alarm_rate : of the diagnosis
-
-    """
-
-    fit: Calibration
-    causes: tuple[Effect, ...]
-    false_alarm_rate: float
+    fit: Calibration  # of causes, bias and scale factor to the dwells
+    causes: tuple[Effect, ...]  # the named effects of the fit
+    false_alarm_rate: float  # of the diagnosis
 
     @classmethod
     def of(cls, fit: Calibration, model: GyroModel | None, false_alarm_rate: float,
