@@ -33,6 +33,7 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pair
+from gyro_calibration.files import to_printable
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions,
@@ -305,8 +306,9 @@ class Pipeline:
             if before is None:
                 self._first_frame = frame
             else:
-                self._note_jump(
-                    now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
+                self._note_jump(now, to_printable(
+                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
+                    'imu/data_raw'))
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
@@ -359,9 +361,10 @@ class Pipeline:
         """Return that the samples are not in the frame of the first one; ''."""
         if self._frame == self._first_frame:
             return ''
-        return (f'the samples on imu/data_raw have the frame {self._frame}, and had '
-                f'{self._first_frame}: the calibration may be that of another gyro; restart this '
-                'node, and calibrate another gyro')
+        return to_printable(
+            f'the samples on imu/data_raw have the frame {self._frame:.99}, and had '
+            f'{self._first_frame:.99}: the calibration may be that of another gyro; restart this '
+            'node, and calibrate another gyro')
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""

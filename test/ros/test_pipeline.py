@@ -329,7 +329,7 @@ def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, report
     """The calibration may be that of another gyro, or of another mount."""
     rig = Rig(tmp_path)
     for frame, fault, is_known in (('gyro', '', True), ('gyro', '', True),
-                                   ('other', 'have the frame other, and had gyro', False),
+                                   ('other\n', 'the frame other\\n, and had gyro', False),
                                    ('gyro', '', False)):
         for _ in range(250):
             rig.clock.now += INTERVAL
