@@ -216,6 +216,15 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
+def keep_aside(path: Path) -> str:
+    """Rename a file, so that it is not replaced by the next one; return a sentence on it."""
+    number = 1
+    while (other := path.with_name(f'{path.name}.kept-{number}')).exists():
+        number += 1
+    path.rename(other)
+    return to_printable(f'what was in {path} is now in {other}')
+
+
 def _create_temporary(path: Path, mode: int) -> tuple[int, str]:
     while True:
         temporary = str(path.parent / f'{_temporary_prefix(path)}{secrets.token_hex(4)}')

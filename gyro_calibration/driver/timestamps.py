@@ -184,7 +184,7 @@ class _LatenessTest:
         self.step, self._least = 0.0, math.inf
         # least lateness of arrivals that were not late, since the start of a window
         self._least_on_time, self._window_start = math.inf, -math.inf
-        self._first_number = self._last_arrival = 0.0
+        self._first_number = self._last_arrival = self._last_silence = 0.0
 
     def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
                        period: float) -> bool:
@@ -196,8 +196,10 @@ class _LatenessTest:
             self._least_on_time = min(self._least_on_time, lateness)
             return False
         silence, self._last_arrival = arrival - self._last_arrival, arrival
-        # Lateness before a silence does not show losses in the silence.
-        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
+        # Lateness before a silence does not show losses in the silence. Silences of one length
+        # are the period of samples whose rate fell.
+        usual, self._last_silence = max(period, self._last_silence), silence
+        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * usual):
             self.late_since, self._first_number, self._least = arrival, number, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
         # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly

@@ -42,7 +42,7 @@ import math
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gyro_calibration.files import describe_error, to_printable, write_atomically
+from gyro_calibration.files import describe_error, keep_aside, to_printable, write_atomically
 from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.settings_file import format_settings, read_settings
@@ -501,11 +501,7 @@ def _keep_aside(path: Path, digest: str) -> str:
             return ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError):
         pass  # a file of unknown content is not overwritten
-    number = 1
-    while (other := path.with_name(f'{path.name}.kept-{number}')).exists():
-        number += 1
-    path.rename(other)
-    return to_printable(f'what was in {path} is now in {other}')
+    return keep_aside(path)
 
 
 def _read_file(path: Path) -> tuple[str, list[Entry], list[Jump]]:

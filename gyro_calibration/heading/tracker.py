@@ -142,8 +142,9 @@ class HeadingTracker:
         self._interval, self._last_time, self.intervals = math.inf, 0.0, Intervals()
         self._last_sample: tuple[float, float, float, Array] | None = None
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
-        # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump.
-        self._before_last_jump = -math.inf, 0.0
+        # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump, and turn
+        # since then beyond that rate, rad.
+        self._before_jump, self._erroneous_turn = (-math.inf, 0.0), 0.0
         self._recent_rates = deque[tuple[float, float]]()  # stamps, s, and rates, rad/s
         self._rest_scatter, self._state_version = RestScatter(), 0
         self.refused_count = self.outlier_count = self.rebuild_count = 0
@@ -236,23 +237,24 @@ class HeadingTracker:
     def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
         self._advance_to_last_sample()
-        self.heading, self._suspected_turn, self._filtered_turn = heading, None, 0.0
+        self.heading, self._suspected_turn = heading, None
+        self._filtered_turn = self._erroneous_turn = 0.0
         self._state = self._state.with_heading(heading, variance)
         self._begin_anew()
 
     @property
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
+        unknown = self._pending_correction ** 2 + self._erroneous_turn ** 2
         if self.is_resting:
-            return (float(self._state.covariance[HEADING_INDEX, HEADING_INDEX])
-                    + self._pending_correction ** 2)
+            return float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]) + unknown
         if self._open_variance is None:
             self._open_variance = self._state.heading_variance(
                 self._with_unbiased_sensitivity(self._open_integral))
         part = self._block_integral
         return (self._open_variance + self._filtered_turn ** 2
                 + self._state.noise.angle_random_walk ** 2 * part.duration
-                + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
+                + part.lost_variance + part.extra_noise_variance + unknown)
 
     # Samples
 
@@ -277,14 +279,10 @@ class HeadingTracker:
             if spike is None:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
-            # the jump is permanent; its time between the samples is not known
-            turned = 0.5 * (spike[1] - self._last_sample[1]) * (spike[0] - self._last_sample[0])
-            self._block_integral.lost_variance += turned ** 2
-            begun, before = self._before_last_jump
-            if 0.0 < spike[0] - begun < _JUMP_DURATION:
-                turned = (self._last_sample[1] - before) * (spike[0] - begun)
-                self._block_integral.lost_variance += turned ** 2
-            self._before_last_jump = self._last_sample[:2]
+            if not self._may_be_erroneous(spike[0]):
+                self._before_jump = self._last_sample[:2]
+            elif abs(spike[1] - self._before_jump[1]) < abs(spike[1] - self._last_sample[1]):
+                self._before_jump = -math.inf, 0.0  # the rate is as before
             self._take_sample(*spike)
         elif spike is not None:
             self.outlier_count += 1
@@ -295,6 +293,10 @@ class HeadingTracker:
         return (abs(step) > MAX_RATE_STEP
                 and abs(step) > MAX_RATE_STEP + MAX_ACCELERATION * interval
                 and 0.0 <= interval <= self._settings.maximum_gap)
+
+    def _may_be_erroneous(self, time: float) -> bool:
+        """Tell whether the rate has jumped so shortly before that it may be erroneous."""
+        return 0.0 <= time - self._before_jump[0] < _JUMP_DURATION
 
     def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
                      still: Array | None, gap: tuple[int, float] | None = None) -> str:
@@ -337,6 +339,11 @@ class HeadingTracker:
                 self._advance_state()
         self.rate = (0.0 if self.is_resting or filtered != rate
                      else rate - self._rate_error(sensitivity))
+        if self._may_be_erroneous(time):
+            self._erroneous_turn += (rate - self._before_jump[1]) * (time - last[0])
+        elif self._erroneous_turn:
+            self._advance_to_last_sample()
+            self._add_unobserved_turn(self._erroneous_turn ** 2)
         if not -math.inf < self.heading + self.rate < math.inf:
             self._rebuild_state()
         message, self._rebuild_message = self._rebuild_message, ''
@@ -378,7 +385,8 @@ class HeadingTracker:
 
     def _count_even(self, time: Array, rate: Array) -> int:
         """Return how many samples come without a jump of stamps or rates."""
-        if not self._detects_rest or self._last_sample is None or self._held_jump is not None:
+        if (not self._detects_rest or self._last_sample is None or self._held_jump is not None
+                or self._may_be_erroneous(float(time[0]))):
             return 0
         intervals = np.diff(time, prepend=self._last_sample[0])
         with np.errstate(invalid='ignore'):
@@ -748,11 +756,17 @@ class HeadingTracker:
         if interval > 0.0:
             self.intervals.count_lost(interval)
         lost = (fastest * duration) ** 2 + may_have_turned * math.tau ** 2
-        self._propagate_state(replace(self._zero_integral, duration=duration, lost_variance=lost,
-                                      is_unobserved=True), self._last_time)
-        self._adopt_state()
+        self._add_unobserved_turn(lost + self._erroneous_turn ** 2, duration)
         return (f'no samples for {interval:.3f} s' if interval > 0.0
                 else f'the stamp jumps back by {-interval:.3f} s')
+
+    def _add_unobserved_turn(self, variance: float, duration: float = 0.0) -> None:
+        """Add a turn that was not measured in a time, s, after the last sample."""
+        self._erroneous_turn = 0.0
+        self._propagate_state(replace(self._zero_integral, duration=duration,
+                                      lost_variance=variance, is_unobserved=True),
+                              self._last_time)
+        self._adopt_state()
 
     def _advance_to_last_sample(self) -> None:
         """Propagate the state to the last sample."""

@@ -304,7 +304,7 @@ class CalibrationSession:
         if self.run:
             self.run.odometry.append((time, heading, rate))
         late = self._clock.steady() - self._stop_time
-        alone = self._last_foreign_command < self._stop_time
+        alone = self._last_foreign_command < self._stop_time and not self._drive
         if (alone and STOPPING_DURATION < late < 2.0 * STOPPING_DURATION
                 and abs(rate) > 1.0 * DEGREE):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '

@@ -337,10 +337,11 @@ class CompensationNode(Node):
         self._velocity.publish(message)
 
     def destroy_node(self) -> None:
-        """Stop the robot if it is driven, store the bias table, and destroy the node."""
+        """Stop the robot, store the bias table, answer a run, and destroy the node."""
         if hasattr(self, '_pipeline'):  # not where a parameter was refused
-            if self._pipeline.session.stop_robot():
-                assert self._velocity is not None
+            self._pipeline.session.end('this node was ended: start it, and run again')
+            self._answer_finished_run()
+            if self._velocity:
                 self._velocity.wait_for_all_acked(Duration(seconds=1.0))
             self._pipeline.run_periodic_tasks(is_final=True)
         super().destroy_node()
@@ -422,9 +423,9 @@ class CompensationReport:
                 yield (f'the model needs the {channel.replace("_", " ")}, which no message '
                        'contains; that effect is left out')
         yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-                    pipeline.odometry_fault, store.calibration_hint, store.shared_hint,
-                    monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,
-                    store.table_hint)
+                    pipeline.turn_fault, pipeline.odometry_fault, store.calibration_hint,
+                    store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
+                    estimator.calibration_message, store.table_hint)
 
     def _sample_values(self, rate: float) -> dict[str, object]:
         """Return counts, heading and temperature; `rate` is the sample rate, Hz."""

@@ -28,6 +28,7 @@ from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
+from gyro_calibration.ros.inputs import MIN_TURN_RATE
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
@@ -36,7 +37,6 @@ _MAX_NOISE_RATIO = 1.25  # largest accepted one to the noise of the model; figur
 #: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
-_MIN_TURN_RATE = 0.05  # rad/s; least rate of a turn by odometry
 #: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
 #: path may vibrate for some time.
 _DECIDING_STRETCHES = 3
@@ -83,7 +83,7 @@ class RepeatedOutputDetector:
             self._step = min(step, self._step)
         toggles = self._toggles(time, output, has_noise_at_rest)
         if output != self._value:
-            self._had_sudden_stop = step > _MIN_TURN_RATE + 20.0 * abs(time - self._since)
+            self._had_sudden_stop = step > MIN_TURN_RATE + 20.0 * abs(time - self._since)
             self._value, self._since, self._count = output, time, 0
             self._changes += 1
             return toggles
@@ -91,7 +91,7 @@ class RepeatedOutputDetector:
         lasts = time - self._since
         if toggles or self._count < 20 or lasts < 0.25:
             return toggles
-        if (lasts > _PART_DURATION and abs(odometry_rate) > _MIN_TURN_RATE
+        if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)

@@ -176,6 +176,8 @@ MAX_VELOCITY_AGE = 1.0
 COASTING_DURATION = 0.5
 #: Largest speeds of wheels at standstill, m/s and rad/s.
 STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
+#: Least rate of a turn by odometry, rad/s.
+MIN_TURN_RATE = 0.05
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
 
@@ -191,6 +193,42 @@ class Velocity:
         """Tell whether it exceeds the speeds at standstill."""
         return (any(abs(part) > STANDSTILL_SPEED for part in self.linear)
                 or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
+
+
+class TurnComparison:
+    """
+    Comparison of the turns by the gyro with those by odometry, a radian at a time.
+
+    Turns contradict each other where two in a row have opposite signs, or a ratio beyond the
+    geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the wheels.
+
+    """
+
+    def __init__(self) -> None:
+        """Start without turns."""
+        self.ratio = math.nan  # of the last turns
+        self._last = math.nan, math.nan
+        self._by_odometry = self._by_gyro = 0.0
+        self._contradictions = 0
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Tell whether the last turns contradict each other."""
+        return self._contradictions > 1
+
+    def add(self, time: float, rate: float, heading: float) -> None:
+        """Add time, s, and rate, rad/s, of an odometry, and the heading by the gyro, rad."""
+        (then, before), self._last = self._last, (time, heading)
+        # at slower rates the bias of a gyro may be larger
+        if not (0.0 < time - then <= MAX_VELOCITY_AGE and abs(rate) > MIN_TURN_RATE):
+            return
+        self._by_odometry += rate * (time - then)
+        self._by_gyro += heading - before
+        if abs(self._by_odometry) > 1.0:  # rad
+            self.ratio = self._by_gyro / self._by_odometry
+            is_wrong = not -0.5 < self.ratio < math.sqrt(180.0 / math.pi)
+            self._contradictions = is_wrong * (self._contradictions + 1)
+            self._by_odometry = self._by_gyro = 0.0
 
 
 class Wheels:

@@ -33,6 +33,7 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pair
+from gyro_calibration.files import to_printable
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions,
@@ -60,6 +61,7 @@ from gyro_calibration.ros.inputs import (
     Parameter,
     RosTime,
     StampDelay,
+    TurnComparison,
     Velocity,
     Wheels,
 )
@@ -195,6 +197,7 @@ class Pipeline:
         self._suspect_temperature = math.nan  # a temperature, degC
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
+        self._turns = TurnComparison()
         self._recent_rates, self._known_beginnings = deque[tuple[float, float]](), 0
 
     # Time
@@ -266,6 +269,7 @@ class Pipeline:
                 and (velocity.is_moving or not self.odometry_fault)):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
+            self._turns.add(time, rate, self.estimator.tracker.heading)
             self.session.add_odometry(time, heading, rate)
 
     @property
@@ -275,6 +279,13 @@ class Pipeline:
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
                 'which it does not show that the robot stands')
+
+    @property
+    def turn_fault(self) -> str:
+        """Return that the turns by the gyro and by odometry contradict each other; ''."""
+        return (f'the gyro turns by {self._turns.ratio:.1f} times what odom shows: check the unit '
+                'and the sense of rotation of the gyro, and those of odom'
+                if self._turns.is_contradictory else '')
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel, also one of this node."""
@@ -305,8 +316,9 @@ class Pipeline:
             if before is None:
                 self._first_frame = frame
             else:
-                self._note_jump(
-                    now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
+                self._note_jump(now, to_printable(
+                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
+                    'imu/data_raw'))
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
@@ -359,9 +371,10 @@ class Pipeline:
         """Return that the samples are not in the frame of the first one; ''."""
         if self._frame == self._first_frame:
             return ''
-        return (f'the samples on imu/data_raw have the frame {self._frame}, and had '
-                f'{self._first_frame}: the calibration may be that of another gyro; restart this '
-                'node, and calibrate another gyro')
+        return to_printable(
+            f'the samples on imu/data_raw have the frame {self._frame:.99}, and had '
+            f'{self._first_frame:.99}: the calibration may be that of another gyro; restart this '
+            'node, and calibrate another gyro')
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
@@ -534,7 +547,7 @@ class Pipeline:
         before = self._suspected_clock_fault
         self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
-        if self.clock_fault or self.frame_fault:
+        if self.clock_fault or self.frame_fault or self.turn_fault:
             self._add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):

@@ -24,6 +24,7 @@ from pathlib import Path
 from gyro_calibration.files import (
     describe_error,
     file_version,
+    keep_aside,
     remedy,
     remove_leftovers,
     to_printable,
@@ -56,6 +57,7 @@ class StateStore:
         self.problem = self.calibration_hint = ''
         self.table_written_time: float | None = None
         self.model = self._load_model(model_file)
+        self._is_unused = bool(self.calibration_hint)  # what the calibration file contains
         self.table, self.table_hint = BiasTable(self.model, prior), ''
         if not self.problem:
             self.table, self.table_hint = read_bias_table(bias_file, self.model, prior)
@@ -96,9 +98,18 @@ class StateStore:
         return with_self_calibration(model, stored.self_calibration)
 
     def store_calibration(self, calibration: SelfCalibration) -> str:
-        """Use and store a calibration; return the fault of the storage, '' without one."""
+        """
+        Use and store a calibration; return the fault of the storage, '' without one.
+
+        A file in its place that was not used, such as that of another gyro, is kept under another
+        name, in a sentence that is returned.
+
+        """
         self.model, self.calibration_hint = with_self_calibration(self.model, calibration), ''
+        kept = ''
         try:
+            if self._is_unused and self._calibration_file.is_file():
+                kept, self._is_unused = keep_aside(self._calibration_file), False
             self._file_versions[self._calibration_file] = write_model(self._calibration_file,
                                                                       self.model)
             self.shared_hint = ''
@@ -108,7 +119,7 @@ class StateStore:
             self.calibration_hint = to_printable(
                 f'the calibration is in use but NOT STORED ({describe_error(error)}): {wanted}, '
                 'and calibrate again')
-        return self.calibration_hint
+        return self.calibration_hint or kept
 
     def store_table(self, now: float, is_final: bool = False) -> None:
         """Write the bias table if it is due, and at the end; `now` in s since 1970."""

@@ -254,6 +254,16 @@ def test_a_gyro_that_becomes_ten_times_slower_or_faster_has_lost_nothing(generat
         assert (np.diff(run.stamps) > 0.0).all()
 
 
+@pytest.mark.parametrize(('before', 'after'), [(100, 5), (500, 5), (10, 2)])
+def test_stamps_follow_the_samples_of_a_gyro_that_becomes_as_slow_as_silences(
+        before, after, generator):
+    first, second = true_times(before, 0.0, 20.0), true_times(after, 0.0, 20.0)
+    times = np.concatenate([first, first[-1] + second])
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator))
+    assert abs(run.stamps - times).max() < 0.5 and run.error(25.0) < 0.02
+    assert not run.clock.lost_count
+
+
 def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(generator):
     """Compared with every line through two of the points."""
     x = np.arange(30.0)

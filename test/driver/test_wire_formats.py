@@ -18,12 +18,22 @@ from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 import pytest
 
 GRAVITY = 9.80665
-FIZOPTIKA, KVH_1750, RAZOR, WITMOTION = map(
-    find_protocol, ('fizoptika', 'kvh_1750', 'razor', 'witmotion'))
+ECORE, FIZOPTIKA, KVH_1750, RAZOR, WITMOTION = map(
+    find_protocol, ('kvh_ecore', 'fizoptika', 'kvh_1750', 'razor', 'witmotion'))
 
 
 def decoded(protocol, *frames, **settings):
     return protocol.decoder(Settings(**settings)).feed(b''.join(frames))
+
+
+def test_a_frame_of_the_ecore_among_other_bytes_counts_where_another_one_follows():
+    """One of 65536 places in other bytes is a frame by chance."""
+    encode, decoder = ECORE.encoder(), ECORE.decoder()
+    frames = [encode(Sample(rate)) for rate in (0.1, 0.2, 0.3)]
+    assert decoder.feed(b'other' + frames[0] + b'bytes') == []
+    found = [sample.output for byte in b''.join(frames) for sample in decoder.feed(bytes([byte]))]
+    assert found == pytest.approx([0.1, 0.2, 0.3], abs=1e-4)
+    assert decoder.discarded_bytes == len(b'other' + frames[0] + b'bytes')
 
 
 # Fizoptika: values that are spread over two frames

@@ -175,6 +175,21 @@ def test_a_rate_that_jumps_and_stays_is_followed_and_less_sure():
     assert math.sqrt(tracker.variance) > 0.1 and tracker.outlier_count == 0
 
 
+@pytest.mark.parametrize('duration', [0.03, 0.2, 1.5, 3.0])
+@pytest.mark.parametrize('detects_rest', [True, False])
+def test_while_a_rate_may_be_erroneous_the_turn_by_it_is_in_the_deviation(duration, detects_rest):
+    tracker = HeadingTracker(NOISE, np.zeros((0, 0)), Settings(0.1 * detects_rest))
+    generator, true = np.random.default_rng(6), 0.0
+    for index in range(1000):
+        time, rate = index * INTERVAL, 0.3 * (index >= 200)
+        true += rate * INTERVAL
+        noise = NOISE.angle_random_walk / math.sqrt(INTERVAL) * generator.standard_normal()
+        tracker.add(time, rate + noise + 5.0 * (5.0 < time < 5.0 + duration), np.zeros(0))
+        if time < 7.0:
+            assert abs(tracker.heading - true) < 3.0 * math.sqrt(tracker.variance) + 0.01, time
+    assert math.sqrt(tracker.variance) == pytest.approx(tracker.heading - true, rel=0.2)
+
+
 def scores(gyro, kind, minutes, seeds):
     """Return the ratio of the error to the oracle's and the share inside, live and later."""
     found = [score(GYROS[gyro], kind, minutes, np.random.default_rng(seed))

@@ -337,6 +337,11 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_lat
     late.stop()
     late.go(5.0)
     assert not late.session.warning
+    assert not late.begin()
+    late.stop()
+    late.drive_to()
+    late.go(1.0)
+    assert not late.session.warning, 'the next drive turns it'
 
 
 # Load

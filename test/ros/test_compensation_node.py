@@ -394,10 +394,11 @@ def test_a_caller_that_is_ended_in_mid_run_leaves_a_robot_that_stops(stage, numb
     stage.wait_until(answer.done, what='the answer')
 
 
-def test_a_node_that_is_ended_in_mid_run_commands_zero_first(stage):
+def test_a_node_that_is_ended_in_mid_run_commands_zero_first_and_answers(stage):
     robot = stage.robot()
     node = stage.node()
     stage.drive()
     assert node.stop(signal.SIGTERM) == 0
+    assert 'refused: this node was ended' in node.output
     stage.wait_until(lambda: robot.commands[-1][1] == 0.0, what='a zero')
     stage.wait_until(lambda: abs(robot.robot.rate) < 0.01, what='the robot to stand')

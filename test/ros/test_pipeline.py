@@ -245,6 +245,27 @@ def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill
     assert abs(error) < 4.0 * deviation, (error, deviation)
 
 
+@pytest.mark.parametrize('gyro, wheels, warns', [
+    (1.0 / DEGREE, 1.0, True), (-1.0, 1.0, True), (1.0, -1.0, True), (1.0, 1.0, False),
+    (1.0, 3.0, False), (3.0, 1.0, False), (1e-3, 1.0, False)],
+    ids=['deg/s', 'sense', 'sense of odom', 'right', 'odom three times', 'gyro three times',
+         'wheels that slip'])
+def test_turns_that_contradict_odometry_are_a_warning_and_the_heading_claims_nothing(
+        tmp_path, reported, gyro, wheels, warns):
+    rig = rested(tmp_path)
+    begin, odometry = len(rig.outputs) - 1, rig.pipeline.add_odometry
+    rig.pipeline.add_odometry = lambda stamp, heading, velocity: odometry(
+        stamp, heading, Velocity(angular=(0.0, 0.0, wheels * velocity.angular[2])))
+    rig.robot.distort = lambda output: gyro * output
+    rig.robot.command(0.7)
+    rig.go(10.0)
+    rig.robot.command(-0.7)
+    rig.go(10.0)
+    level, message, _ = reported(rig)
+    assert (level == WARN and 'times what odom shows: check the unit' in message) == warns
+    assert (rig.error(begin)[1] > math.tau) == warns
+
+
 # What odometry and commands of the last second show of the wheels
 
 
@@ -329,7 +350,7 @@ def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, report
     """The calibration may be that of another gyro, or of another mount."""
     rig = Rig(tmp_path)
     for frame, fault, is_known in (('gyro', '', True), ('gyro', '', True),
-                                   ('other', 'have the frame other, and had gyro', False),
+                                   ('other\n', 'the frame other\\n, and had gyro', False),
                                    ('gyro', '', False)):
         for _ in range(250):
             rig.clock.now += INTERVAL

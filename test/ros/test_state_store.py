@@ -111,6 +111,17 @@ def test_a_calibration_that_cannot_be_used_is_reported_and_that_of_the_model_is_
     assert (memory.model.self_calibration is None) == (bool(hint) and STORED not in model)
 
 
+@pytest.mark.parametrize('model, calibration', [(ONE + SEVEN, ONE + EIGHT + STORED),
+                                                (OTHER, ONE + STORED), ('', 'of somebody else')])
+def test_a_calibration_that_cannot_be_used_is_kept_when_the_next_one_is_stored(
+        remember, tmp_path, model, calibration):
+    memory, old = remember(model, calibration=calibration), tmp_path / 'calibration.yaml.kept-1'
+    assert memory.store_calibration(SelfCalibration(0.01)).endswith(f'is now in {old}')
+    assert memory.store_calibration(SelfCalibration(0.02)) == '' == memory.calibration_hint
+    assert old.read_text() == calibration
+    assert remember(model).model.self_calibration == SelfCalibration(0.02)
+
+
 def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path):
     memory = remember('effects: {bias: {bias:')
     assert memory.problem.startswith('uncalibrated: ')

@@ -13,10 +13,11 @@ KVH E-Core 2000 family, fibre-optic gyros with one axis: frames of 8 bytes.
 
 Only the first byte has bit 7 set. Their low seven bits, most significant first, are seven bytes
 with the sum 0 modulo 256. The last two are the rate, a signed 16-bit number, most significant byte
-first; the meaning of bytes two to five is not known. A unit for 60 deg/s has 0.00183 deg/s a
-count, a unit for 30 deg/s half of that: set ``sensitivity: 1.597e-5``. The RD2100 is assumed to
-have the same format. Baud and sense of rotation were inferred, not read in a manual: check sign
-and scale on your unit.
+first; the meaning of bytes two to five is not known. One of 65536 places in other bytes looks like
+a frame, so that a frame after other bytes counts only if another one follows directly. A unit for
+60 deg/s has 0.00183 deg/s a count, a unit for 30 deg/s half of that: set
+``sensitivity: 1.597e-5``. The RD2100 is assumed to have the same format. Baud and sense of
+rotation were inferred, not read in a manual: check sign and scale on your unit.
 
 ``8A 40 00 00 00 00 07 68`` is a count of 1000, which is 1.83 deg/s.
 
@@ -57,7 +58,7 @@ KVH_ECORE = Protocol(
     text=__doc__, baud=9600,
     rate=10.0, sensitivity=math.radians(0.00183),
     splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8,
-                     lambda frame: sum(_unpack_content(frame)) % 256 == 0),
+                     lambda frame: sum(_unpack_content(frame)) % 256 == 0, is_weak=True),
     parser=lambda settings: lambda frame: Reading(
         int.from_bytes(_unpack_content(frame)[5:], 'big', signed=True)),
     writer=stateless(_write), largest_count=0x8000)

@@ -130,7 +130,7 @@ class Frame(NamedTuple):
 
 
 class Splitter:
-    """Finds frames in bytes that come in any pieces; buffers at most one frame."""
+    """Finds frames in bytes that come in any pieces; buffers less than two frames."""
 
     def __init__(self) -> None:
         self._tail, self._skipped_bytes, self.discarded_bytes = b'', 0, 0
@@ -251,7 +251,7 @@ class Protocol:
 
 class Decoder:
     """
-    Decodes the bytes of one gyro to samples; never raises, and buffers at most one frame.
+    Decodes the bytes of one gyro to samples; never raises, and buffers less than two frames.
 
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
@@ -364,25 +364,37 @@ class FrameSplitter(Splitter):
     """
     Splits bytes into frames that match a pattern and pass their check, from any byte on.
 
-    In the pattern, a regular expression, ``.`` is any byte; the length is in bytes.
+    In the pattern, a regular expression, ``.`` is any byte; the length is in bytes. If other bytes
+    often pass the check, which is then weak, a frame after other bytes counts only if another one
+    follows directly.
 
     """
 
-    def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool]):
+    def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool],
+                 is_weak: bool = False):
         super().__init__()
         self._pattern = re.compile(pattern, re.DOTALL)
-        self._length, self._is_intact = length, is_intact
+        self._length, self._is_intact, self._is_weak = length, is_intact, is_weak
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
         data, position, end, frames = self._tail + data, 0, 0, []
         while match := self._pattern.search(data, position):
             position = match.start() + 1
-            if self._is_intact(match.group()):
-                self._discard(match.start() - end)
-                frames.append(self._make_frame(match.group()))
-                position = end = match.end()
-        kept = max(position, len(data) - self._length + 1)
-        self._discard(kept - end)
-        self._tail = data[kept:]
+            if not self._is_intact(match.group()):
+                continue
+            if self._is_weak and (match.start() > end or self._skipped_bytes):
+                following = data[match.end():match.end() + self._length]
+                if len(following) < self._length:
+                    position = match.start()
+                    break
+                if not (self._pattern.match(following) and self._is_intact(following)):
+                    continue
+            self._discard(match.start() - end)
+            frames.append(self._make_frame(match.group()))
+            position = end = match.end()
+        else:
+            position = max(position, len(data) - self._length + 1)
+        self._discard(position - end)
+        self._tail = data[position:]
         return frames
