@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.dwells import (
+    Dwells,
     extract_dwells,
     format_list,
     join_dwells,
@@ -39,7 +40,7 @@ from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_li
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import display_unit
 from gyro_calibration.files import suggest_nearest
-from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
     polynomial_to_matrix,
@@ -139,8 +140,9 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     if by_dwells:
         is_settled = effects or method or len(logs) > 1
         try:
-            table = join_dwells([extract_dwells(log, name=Path(path).name if len(logs) > 1 else '')
-                                 for path, log in logs.items()])
+            table = join_dwells([
+                _extract_named_dwells(Path(path).name, log) if len(logs) > 1
+                else extract_dwells(log) for path, log in logs.items()])
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
                 return (Selection(fit_effects(table, effects), (), ()) if effects
@@ -155,6 +157,13 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         raise UsageError(_HEADING_ALONE)
     (log,) = logs.values()
     return calibrate_encoder(log, method, technology=technology or 'mems')
+
+
+def _extract_named_dwells(name: str, log: Log) -> Dwells:
+    try:
+        return extract_dwells(log, name)
+    except DataRefused as error:
+        raise type(error)(f'{name}: {error}') from None
 
 
 def _answer_dwells(given: argparse.Namespace, model: GyroModel,

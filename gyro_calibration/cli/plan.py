@@ -30,6 +30,7 @@ from gyro_calibration.calibration.motion_design import (
     Prediction,
     RobotLimits,
 )
+from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_motion
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
@@ -155,6 +156,7 @@ def _answer(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
     rate, planned, plain = plan.motion.rate_at(time), rows['planned'], rows['plain']
     scale_gain = plain.scale_deviation / planned.scale_deviation
     heading_gain = 1.0 - planned.heading_error / plain.heading_error
+    wheels = default_reference_errors(plan.motion).scale_deviation
     labels = {'planned': 'planned', 'plain': 'one turn there and back',
               'built_in': 'built-in profile, 20 s' + (
                   '' if is_built_in_feasible else ', beyond the limits')}
@@ -168,7 +170,9 @@ def _answer(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
              f'times as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
              f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
              f'Angle random walk contributes {planned.floor / DEGREE:.3f} deg to the error, '
-             'independent of the calibration.']
+             'independent of the calibration.',
+             'The scale is that by an exact reference. For wheels that follow the profile, '
+             f'self-calibrate adds {100 * wheels:.2f} %, or --reference-scale-deviation.']
     data = {'duration_s': plan.motion.duration, 'time_s': time.tolist(),
             'rate_rad_s': rate.tolist(), **{name: asdict(row) for name, row in rows.items()},
             'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,

@@ -19,13 +19,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-import os
 import secrets
 from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.files import suggest_nearest
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import motion_by_name, NAMED_MOTIONS, simulate
@@ -64,10 +62,6 @@ def run(given: argparse.Namespace) -> Answer:
 
 def simulate_log(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
-    if given.motion not in NAMED_MOTIONS and not os.path.exists(given.motion):
-        raise UsageError(f'{given.motion}: there is no such motion; '
-                         f'give a file, or one of {", ".join(NAMED_MOTIONS)}'
-                         f'{suggest_nearest(given.motion, NAMED_MOTIONS)}')
     motion = motion_by_name(given.motion)
     if motion.duration * given.sample_rate > MAX_SAMPLES:
         raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '

@@ -113,7 +113,8 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
     names = [term.effect.name for term in model.terms]
     clipped, beyond = (int(np.count_nonzero(each))
                        for each in (result.temperature_clipped, result.beyond_range))
-    remarks = [f'the model is {given.model}: {", ".join(names) or "no effects"}'
+    used = [*names, *(['self-calibration'] if model.self_calibration else [])]
+    remarks = [f'the model is {given.model}: {", ".join(used) or "no effects"}'
                f'{_describe_fit_data(model, given.log)}']
     if found.temperature is None and model.uses_channel('temperature'):
         remarks.append('the log has no temperature: '

@@ -173,7 +173,7 @@ def positive_number(text: str) -> float:
 
 
 def non_negative_number(text: str) -> float:
-    return 0.0 if float(text) == 0.0 else positive_number(text)
+    return _bounded(float(text), 0.0, MAX_MAGNITUDE)
 
 
 def degrees_celsius(text: str) -> float:
@@ -191,8 +191,8 @@ def non_negative_integer(text: str) -> int:
 
 def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -> float:
     if not low <= value <= high:
-        wanted = ('above 0' if high == MAX_MAGNITUDE else f'from {low:g} to {high:g}'
-                  if high < math.inf else f'of {low:g} or more')
+        wanted = (f'from {low:g} to {high:g}' if high < MAX_MAGNITUDE
+                  else 'above 0' if 0.0 < low < 1.0 else f'of {low:g} or more')
         raise argparse.ArgumentTypeError(f'{value:g}{unit} is out of range; give a number '
                                          f'{wanted}{unit}')
     return value

@@ -53,14 +53,15 @@ _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: windows beyond that of the energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
-                        for shared in (0.0, 0.25, 0.5) for fast in (0.0, 1.0, 4.0))]).T
+                        for shared in (0.0, 0.25, 0.5, 0.75) for fast in (0.0, 1.0, 4.0))]).T
 _MAX_SCATTER_RATIO = 64.0
 #: The same of sums of many means, relative to that of white noise, for a process of first order.
 _SUM_RATIOS = SCATTER_RATIOS * (1.0 + SCATTER_CORRELATIONS) / (1.0 - SCATTER_CORRELATIONS)
-#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1;
-#: largest total.
-_PRIOR_COUNTS = np.append(3.0, np.full(
-    len(SCATTER_RATIOS) - 1, 1.0 / (np.count_nonzero(SCATTER_RATIOS <= _MAX_SCATTER_RATIO) - 1)))
+#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1,
+#: by which each correlation adds the same to the mean ratio of a sum; largest total.
+_PRIOR_COUNTS = (1.0 - SCATTER_CORRELATIONS) / (1.0 + SCATTER_CORRELATIONS)
+_PRIOR_COUNTS /= _PRIOR_COUNTS[1:] @ (SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO)
+_PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
 
 

@@ -833,9 +833,11 @@ class HeadingTracker:
         if (self._sensitivity_slope is None or self._still_sensitivity is None
                 or turn.is_unobserved):
             return turn
-        bias, _ = self._state.rate_error(self._still_sensitivity)
-        return replace(
-            turn, sensitivity=turn.sensitivity - turn.duration * bias * self._sensitivity_slope)
+        bias = self._state.wander_rate[0] - float(
+            self._still_sensitivity @ self._state.calibration_errors[0])
+        unbiased = turn + self._zero_integral
+        unbiased.sensitivity = turn.sensitivity - turn.duration * bias * self._sensitivity_slope
+        return unbiased
 
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""

@@ -17,9 +17,16 @@ import csv
 from dataclasses import dataclass, replace
 import io
 import math
+import os
 from pathlib import Path
 
-from gyro_calibration.files import describe_error, InputError, MAX_MAGNITUDE, read_bytes
+from gyro_calibration.files import (
+    describe_error,
+    InputError,
+    MAX_MAGNITUDE,
+    read_bytes,
+    suggest_nearest,
+)
 from gyro_calibration.logs.columns import COLUMNS
 from gyro_calibration.logs.log import (
     Array,
@@ -140,7 +147,13 @@ NAMED_MOTIONS = {
 
 def motion_by_name(motion: str | Path) -> Motion:
     """Return a motion of `NAMED_MOTIONS`, or that of a profile; raise as `read_motion`."""
-    return NAMED_MOTIONS.get(str(motion)) or read_motion(motion)
+    if str(motion) in NAMED_MOTIONS:
+        return NAMED_MOTIONS[str(motion)]
+    if not os.path.exists(motion):
+        raise MotionError(f'{motion}: there is no such motion; '
+                          f'give a file, or one of {", ".join(NAMED_MOTIONS)}'
+                          f'{suggest_nearest(str(motion), NAMED_MOTIONS)}')
+    return read_motion(motion)
 
 
 _COLUMN_UNITS = {name: factor for column, (quantity, factor) in COLUMNS.items()

@@ -169,7 +169,7 @@ def export_model(parameters: SimulatorParameters, model: GyroModel,
     text, names = _FORMATTERS[simulator](parameters)
     run, noise = model.self_calibration, model.noise
     found = {term.effect.name: ', '.join(
-        f'{parameter.name} = {value:.6g} {parameter.unit}'
+        f'{parameter.name} = {value:.6g} {parameter.unit}'.removesuffix(' 1')
         for parameter, value in zip(term.effect.parameters, term.values)) for term in model.terms}
     if run and run.scale_factor_error:
         found['scale_factor_error'] = f'{run.scale_factor_error:.6g} by the self-calibration'

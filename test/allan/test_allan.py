@@ -10,16 +10,24 @@
 
 """Allan deviation and its noise figures, against definitions, simulated truth and recordings."""
 
+from dataclasses import replace
 import json
 import math
 
 from chance import fewest, mean_bound, most, rms_bounds
+from gyro_calibration.allan import noise_fit
 from gyro_calibration.allan.deviation import allan_deviation, build_rest_record
 from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.cli.allan import figure_labels
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, NOISE_TERMS, simulate_noise
+from gyro_calibration.model.noise import (
+    ALLAN_FLOOR_RATIO,
+    GaussMarkov,
+    Noise,
+    NOISE_TERMS,
+    simulate_noise,
+)
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -128,6 +136,18 @@ def test_a_gauss_markov_process_is_found_and_a_flicker_or_random_walk_is_not_tak
     assert np.median(found, axis=0) == pytest.approx((1e-3, 20.0), rel=0.5)
     for noise in (Noise(1e-3, 3e-4), Noise(1e-3, 0.0, 1e-4)):
         assert fit_noise(simulate_noise(noise, 200_000, 0.01, generator), 0.01).process is None
+
+
+def test_the_lower_bound_of_a_flicker_allows_for_a_process_beside_it(monkeypatch):
+    """Both make the hump of the chart, here without chance."""
+    size, process = 2.0 ** np.arange(15), GaussMarkov(0.04 * math.sqrt(2e-3), 1000.0)
+    true = Noise(1.0, 0.02).allan_variance(size) + process.allan_variance(size)
+    chart = allan_deviation(simulate_noise(Noise(1.0), 200_000, 1.0, np.random.default_rng(1)),
+                            1.0, size)
+    monkeypatch.setattr(noise_fit, 'allan_deviation',
+                        lambda *_: replace(chart, deviation=np.sqrt(true)))
+    flicker = fit_noise(np.zeros(200_000), 1.0).figures['B']
+    assert flicker.lower < 0.02 < flicker.value < flicker.upper < 0.06
 
 
 def test_white_noise_alone_shows_nothing_else():

@@ -199,6 +199,11 @@ def test_a_model_that_was_fitted_to_the_log_is_distinguished_from_others(
             and f'; {said}' in remark + '; ')
 
 
+def test_a_model_of_a_self_calibration_alone_is_not_one_without_effects(run, log, model):
+    model.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.008, bias: 0.0}')
+    assert 'model.yaml: self-calibration' in run(log, '--model', model)[1]
+
+
 def test_the_table_gives_degrees_and_per_cent_and_what_is_beyond_the_range_of_the_model(
         run, log, model):
     code, text, _ = run(log, '--model', model)

@@ -192,6 +192,7 @@ WRONG = {
     'reproduce newton': 'hong_park', 'diagnose LOG --seed -1': '-1 is out of range',
     'diagnose LOG --model missing.yaml --out found': 'missing.yaml: there is no such file',
     'simulate --model MODEL --motion waltz --out x.csv': 'waltz: there is no such motion',
+    'compensate LOG --model MODEL --out x.csv --threshold -1': 'give a number of 0 or more',
     'simulate --model MODEL --motion rest --out ""': EMPTY,
     **{f'simulate --model MODEL --motion rest --out x.csv {option}': said for option, said in {
         '--seed -1': '-1 is out of range', '--sample-rate 1e-300': '', '--sample-rate 1e300': '',

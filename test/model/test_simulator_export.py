@@ -101,6 +101,7 @@ def test_each_effect_is_held_or_listed(simulator):
         listed = any(each.startswith(f'{name}:') for each in left_out)
         assert listed or f'{0.011:.9g}' in text.rpartition('-->')[2], name
         assert all(each in text for each in left_out), name
+        assert not any(each.endswith('0.011 1') for each in left_out), 'a number has no unit'
 
 
 def test_isaac_is_given_python():
