@@ -15,6 +15,7 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 
 """
 
+from dataclasses import replace
 from functools import cache
 import json
 import math
@@ -29,6 +30,7 @@ from gyro_calibration.calibration.likelihood import (
 )
 from gyro_calibration.calibration.run_faults import split_run
 from gyro_calibration.calibration.self_calibration import (
+    check_end,
     check_rest,
     describe_implausible_scale,
     find_rest_after,
@@ -265,6 +267,34 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
     rest = find_rest_after(time, rate, fit, CALIBRATION_MOTION)
     with pytest.raises(DataRefused, match='the corrected rate is'):
         check_rest(time[rest], rate[rest], fit, XV3500.noise)
+
+
+def ended(seed, yaw, rest):
+    """Return a fit of a run with a steady turn until its end, whose log ends soon after it."""
+    time = np.arange(0.0, 20.0 + rest, 0.01)
+    rate = output(seed, time=time) + np.where(time < 20.0, yaw, 0.0)
+    fit = self_calibrate(time, rate, CALIBRATION_MOTION, noise=XV3500.noise)
+    return check_end(time, rate, fit, CALIBRATION_MOTION, XV3500.noise)
+
+
+@pytest.mark.parametrize('degrees', [0.05, -0.1, 0.2, 0.3, -0.5, 1.0])
+def test_a_steady_turn_in_a_log_without_a_rest_is_refused_or_in_the_interval(degrees):
+    for seed in range(4):
+        try:
+            fit = ended(seed, degrees * DEGREE, 0.4)
+        except DataRefused as refused:
+            assert 'the robot turned throughout the run' in str(refused)
+        else:
+            assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
+            assert abs(degrees) < 0.6
+
+
+def test_a_short_rest_leaves_the_bias_known_and_none_lets_it_be_a_steady_turn():
+    short, none = ended(0, 0.0, 0.4), ended(0, 0.0, 0.0)
+    assert abs(short.bias - B) < 1.96 * math.sqrt(short.covariance[1, 1]) < 0.3 * DEGREE
+    assert math.sqrt(none.covariance[1, 1]) == pytest.approx(1.0 * DEGREE, rel=0.1)
+    measured = replace(CALIBRATION_MOTION, name='reference')
+    assert check_end(TIME, output(0), calibrated(0), measured) is calibrated(0)
 
 
 @pytest.mark.parametrize('off', [0.0, 3.0, -10.0])
