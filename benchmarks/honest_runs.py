@@ -250,8 +250,9 @@ def tried(kind: str, gyro: Gyro, seed: tuple[int, ...]) -> tuple[Array, Array] |
             (heading + draw.uniform(0, step)) / step))
     try:
         noise = Noise(gyro.white, gyro.flicker)
-        known = (20.5 if kind.endswith(SHORT) else 24.0) > TIME
-        run = known & (21.0 > TIME)
+        end = 20.5 if kind.endswith(SHORT) else 24.0
+        known = end > TIME
+        run = known & (TIME < 21.0)
         fit = self_calibrate(TIME[run], output[run], motion, noise=noise)
         rest = find_rest_after(TIME[known], output[known], fit, motion)
         fit = (check_end(TIME[known], output[known], fit, motion, noise) if rest is None else
