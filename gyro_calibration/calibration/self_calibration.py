@@ -491,7 +491,8 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
     bias. The samples after the motion show it, even where the robot still settles: its response
     to the profile is fitted together with the rest. A turn that they do not show, of a prior
-    deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias.
+    deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
+    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn.
 
     Parameters
     ----------
@@ -524,7 +525,10 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
         variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
                     + float(noise.mean_change_variance(duration, duration)))
         sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
-        if sigmas > MIN_SLIP_SIGMAS:
+        stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
+        if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
+            change, variance = 0.0, variance + change ** 2
+        elif sigmas > MIN_SLIP_SIGMAS:
             raise DataRefused(
                 f'after the run the corrected rate is {change / DEGREE:.3f} deg/s ({sigmas:.0f} '
                 'standard deviations): the robot turned throughout the run, or still turned after '
