@@ -498,8 +498,8 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     ----------
     time : s since the start of the motion, shape (n,)
     rate : of the gyro as it went into the fit, rad/s, shape (n,)
-    fit : without a check by a rest; returned unchanged if of a measured reference, or without a
-        covariance
+    fit : without a check by a rest; returned unchanged where fewer than 10 samples follow the
+        motion or the robot drives on, of a measured reference, or without a covariance
     reference : as in `self_calibrate`
 
     Raises
@@ -509,31 +509,31 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     limits, noise = limits or RunLimits(), noise or Noise()
     reference = default_reference_errors(motion) if reference is None else reference
-    if (motion.rate is None or motion.name != 'profile'
-            or not np.isfinite(fit.covariance).all()):
+    end = motion.duration + max(fit.time_offset, 0.0)
+    duration = float(time[-1]) - end
+    if (motion.rate is None or motion.rate[-1] != 0.0 or motion.name != 'profile'
+            or not np.isfinite(fit.covariance).all() or np.count_nonzero(time > end) < 10
+            or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
         return fit
-    change, variance = 0.0, limits.max_bias ** 2
-    duration = float(time[-1]) - motion.duration - max(fit.time_offset, 0.0)
-    if motion.rate[-1] == 0.0 and 0.0 < duration < SETTLING_TIME + 0.9 * limits.rest_duration:
-        with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
-                                      np.append(motion.rate, 0.0))
-        at_rest = _fit_likelihood(time, rate, with_rest, limits.max_time_offset,
-                                  reference.scale_deviation, (motion.duration, limits.max_bias))
-        change = at_rest.bias - fit.bias
-        # the few increments of the rest may by chance have less than the noise of the gyro
-        known_ratio = max(noise.angle_random_walk / at_rest.angle_random_walk, 1.0)
-        variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
-                    + float(noise.mean_change_variance(duration, duration)))
-        sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
-        stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
-        if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
-            change, variance = 0.0, variance + change ** 2
-        elif sigmas > MIN_SLIP_SIGMAS:
-            raise DataRefused(
-                f'after the run the corrected rate is {change / DEGREE:.3f} deg/s ({sigmas:.0f} '
-                'standard deviations): the robot turned throughout the run, or still turned after '
-                'it; run again and leave it at rest for '
-                f'{SETTLING_TIME + limits.rest_duration:g} s after it')
+    with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
+                                  np.append(motion.rate, 0.0))
+    at_rest = _fit_likelihood(time, rate, with_rest, limits.max_time_offset,
+                              reference.scale_deviation, (motion.duration, limits.max_bias))
+    change = at_rest.bias - fit.bias
+    # the few increments of the rest may by chance have less than the noise of the gyro
+    known_ratio = max(noise.angle_random_walk / at_rest.angle_random_walk, 1.0)
+    variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
+                + float(noise.mean_change_variance(duration, duration)))
+    sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
+    stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
+    if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
+        change, variance = 0.0, variance + change ** 2
+    elif sigmas > MIN_SLIP_SIGMAS:
+        raise DataRefused(
+            f'after the run the corrected rate is {change / DEGREE:.3f} deg/s ({sigmas:.0f} '
+            'standard deviations): the robot turned throughout the run, or still turned after '
+            'it; run again and leave it at rest for '
+            f'{SETTLING_TIME + limits.rest_duration:g} s after it')
     gain, covariance = combine_with_rest(fit.covariance, change, variance)
     s, b = (gain * change + (fit.scale_factor_error, fit.bias)).tolist()
     # a turn that the rest does not show

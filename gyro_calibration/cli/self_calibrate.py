@@ -260,6 +260,5 @@ def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,
         yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
                f'limit: {check.limit / DEGREE:.4f} deg/s.')
     elif reference == 'profile' and method == 'likelihood':
-        yield ('There is no rest of 3 s after the run, so the interval of the bias includes a '
-               'steady turn of the robot, which has the same effect: leave it at rest after the '
-               'run.')
+        yield ('There is no rest of 3 s after the run. A steady turn of the robot throughout it '
+               'has the effect of a bias: leave it at rest after the run.')
