@@ -260,5 +260,5 @@ def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,
         yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
                f'limit: {check.limit / DEGREE:.4f} deg/s.')
     elif reference == 'profile' and method == 'likelihood':
-        yield ('There is no rest of 3 s after the run. A steady turn of the robot throughout it '
+        yield ('There is no rest of 3 s after the run. A steady turn of the robot throughout '
                'has the effect of a bias: leave it at rest after the run.')
