@@ -19,7 +19,8 @@ turns), and 4 s of rest, at 100 Hz, by one of three gyros (`GYROS`). It prints, 
 robot and each gyro, how many runs were refused, the share of scale factor errors s and biases b
 within their 95 % intervals, the median standard deviations, and how many were accepted more than 5
 standard deviations off. The bias is compared with its mean over the rest after
-the profile. A run is checked by the rest after it, as the command line does.
+the profile. A run is checked by the rest after it, as the command line does; of the kinds named
+so, the log ends 0.5 s after the profile.
 
 """
 
@@ -31,6 +32,7 @@ import math
 import sys
 
 from gyro_calibration.calibration.self_calibration import (
+    check_end,
     check_rest,
     find_rest_after,
     self_calibrate,
@@ -50,6 +52,8 @@ TIME = np.arange(-100, 2400) * STEP
 #: Duration, s, and rate, deg/s, of each leg; a ramp of 0.5 s is at its beginning.
 LEGS = ((1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0))
 RAMP = 0.5
+#: Ending of the kinds whose log ends soon after the profile.
+SHORT = ', ends 0.5 s after'
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,12 @@ def steady_yaw(draw: np.random.Generator) -> Array:
     return exact(draw) + np.where((TIME > 0.0) & (TIME < 20.5), yaw, 0.0)
 
 
+def steady_yaw_until_the_end(draw: np.random.Generator) -> Array:
+    """Yaw at 0.05 to 1 deg/s more until the end of the profile, with no rest before."""
+    yaw = draw.uniform(0.05, 1.0) * draw.choice([-1.0, 1.0]) * DEGREE
+    return delayed(commanded(), draw.uniform(0.0, 0.2)) + np.where(TIME < 20.0, yaw, 0.0)
+
+
 def yaw_for_a_while(draw: np.random.Generator) -> Array:
     """Yaw at 0.1 to 2 deg/s more for 5 to 18 s."""
     begin, yaw = draw.uniform(0.0, 10.0), draw.uniform(0.1, 2.0) * draw.choice([-1, 1]) * DEGREE
@@ -214,11 +224,12 @@ HONEST: dict[str, Robot] = {
     'ramps softer than commanded': soft_ramps, 'encoder of 0.5 deg': follower,
     'slip up to 1 % of each turn': slipping, 'even slip up to 1 %': slipping_evenly,
     'wobble, lag and slip': everything,
+    f'lag{SHORT}': lag, f'second order{SHORT}': follower,
 }
 DISHONEST: dict[str, Robot] = {
     'steady yaw': steady_yaw, 'yaw for a while': yaw_for_a_while,
     'slip above a speed': slip_above_a_speed, 'slip of 0.5 to 1.5 deg': small_slip,
-    'turn by hand': hand_turn,
+    'turn by hand': hand_turn, f'steady yaw{SHORT}': steady_yaw_until_the_end,
 }
 
 
@@ -238,11 +249,14 @@ def tried(kind: str, gyro: Gyro, seed: tuple[int, ...]) -> tuple[Array, Array] |
         motion = motion_from_headings(at, step * np.floor(
             (heading + draw.uniform(0, step)) / step))
     try:
-        noise, run = Noise(gyro.white, gyro.flicker), TIME < 21.0
+        noise = Noise(gyro.white, gyro.flicker)
+        end = 20.5 if kind.endswith(SHORT) else 24.0
+        known = end > TIME
+        run = known & (TIME < 21.0)
         fit = self_calibrate(TIME[run], output[run], motion, noise=noise)
-        rest = find_rest_after(TIME, output, fit, motion)
-        if rest is not None:
-            fit = check_rest(TIME[rest], output[rest], fit, noise).fit
+        rest = find_rest_after(TIME[known], output[known], fit, motion)
+        fit = (check_end(TIME[known], output[known], fit, motion, noise) if rest is None else
+               check_rest(TIME[rest], output[rest], fit, noise).fit)
     except DataRefused as reason:
         return str(reason)
     later = b + float(drift[TIME > 20.0].mean())

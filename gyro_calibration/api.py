@@ -432,7 +432,8 @@ def _to_motion(motion: MotionLike) -> tuple[Motion, float]:
     if isinstance(motion, (str, Path)):
         return motion_by_name(motion), 0.0
     if isinstance(motion, tuple) and len(motion) == 2:
-        return motion_from_log(Log(motion[0], reference_rate=motion[1]))[0], 0.0
+        return replace(motion_from_log(Log(motion[0], reference_rate=motion[1]))[0],
+                       name='profile'), 0.0
     if not isinstance(motion, Log):
         raise InputError(f'{reprlib.repr(motion)} is no motion; wanted calibration, robot or '
                          'rest, a profile file, (time, rate), or a log with a reference')

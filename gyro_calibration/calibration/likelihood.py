@@ -167,14 +167,15 @@ class _RunAlignment:
     """A run and a motion, aligned at any time offset and lag."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
-                 slip_deviation: float):
+                 slip_deviation: float, excess_turn: tuple[float, float] | None):
         self._time, self._rate = time, rate
         self._prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
         self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
         self.is_measured = motion.rate is None
         self._block_duration = block_duration(motion)
-        self._points = _select_reference_points(motion, self._block_duration, slip_deviation)
+        self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
+                                                excess_turn)
 
     def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
         """
@@ -294,13 +295,13 @@ def block_duration(motion: Motion) -> float:
     return block / 2.0 ** halvings
 
 
-def _select_reference_points(motion: Motion, block: float,
-                             slip_deviation: float) -> _ReferencePoints:
+def _select_reference_points(motion: Motion, block: float, slip_deviation: float,
+                             excess_turn: tuple[float, float] | None) -> _ReferencePoints:
     """Return where a motion is known: at its samples, or for an encoder where it steps."""
     if motion.rate is not None:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
-                                *tracking_error_columns(motion, time, slip_deviation))
+                                *tracking_error_columns(motion, time, slip_deviation, excess_turn))
     step = encoder_step(motion.heading)
     if not step:
         return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
@@ -328,8 +329,9 @@ _RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.2 * np.arange(1, 5), 0.3
 _PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
 
 
-def tracking_error_columns(motion: Motion, time: Array,
-                           slip_deviation: float) -> tuple[Array, Array, Array]:
+def tracking_error_columns(
+        motion: Motion, time: Array, slip_deviation: float,
+        excess_turn: tuple[float, float] | None = None) -> tuple[Array, Array, Array]:
     """
     Return the deviations from a profile that scale, bias, delay and lag do not describe.
 
@@ -341,6 +343,8 @@ def tracking_error_columns(motion: Motion, time: Array,
     ----------
     time : s, shape (n,)
     slip_deviation : largest standard deviation of the slip of a turn, as a fraction of it
+    excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides the
+        profile; None without one
 
     Returns
     -------
@@ -379,6 +383,10 @@ def tracking_error_columns(motion: Motion, time: Array,
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(heading_change), axis=0))
         deviations.append(np.array([ASYMMETRY_DEVIATION]))
+        prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
+    if excess_turn is not None:
+        columns.append(np.minimum(time, excess_turn[0])[:, None])
+        deviations.append(np.array([excess_turn[1]]))
         prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
     return np.hstack(columns), np.concatenate(deviations), prior_factors
 
@@ -601,8 +609,8 @@ def _nonzero_scale(scale: float) -> float:
 
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
-                   lag_deviation: float = LAG_DEVIATION,
-                   slip_deviation: float = 0.0) -> ScaleBiasFit:
+                   lag_deviation: float = LAG_DEVIATION, slip_deviation: float = 0.0,
+                   excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
@@ -629,13 +637,15 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         scale
     slip_deviation : largest standard deviation of the slip of each turn of a profile, as a
         fraction of it
+    excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides a profile;
+        the bias is then that of the rest after it. None without one
 
     Raises
     ------
     DataRefused : gyro and motion hardly overlap
 
     """
-    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation)
+    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn)
     offset, data, averages, averaged_covariance, estimate = _fit_offset(
         alignment, largest_time_offset)
     values, covariance = estimate.values[:2], averaged_covariance[:2, :2]

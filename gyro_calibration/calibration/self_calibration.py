@@ -24,6 +24,7 @@ import math
 
 from gyro_calibration.calibration.likelihood import (
     ASYMMETRY_DEVIATION,
+    EXCESS_RATE_DEVIATION,
     fit_likelihood,
     GoodnessOfFit,
     MAX_NOISE_SIGMAS,
@@ -44,7 +45,7 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise_deviation
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
-from gyro_calibration.model.motion import Motion
+from gyro_calibration.model.motion import Motion, motion_from_rates
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
@@ -225,12 +226,13 @@ def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise | N
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
-                    slip_deviation: float) -> ScaleBiasFit:
+                    slip_deviation: float,
+                    excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
     """Fit on the stamps, or on an even grid if that leaves less."""
     even_stamps = even_times(time)
     jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
     fit = min((fit_likelihood(stamps, rate, motion, largest_time_offset,
-                              slip_deviation=slip_deviation)
+                              slip_deviation=slip_deviation, excess_turn=excess_turn)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
     return fit if motion.rate is not None else add_asymmetry_variance(fit, rate)
@@ -478,6 +480,65 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None 
                           f'{check.limit / DEGREE:.4f} deg/s: the robot still turned, or '
                           'the run was disturbed; run again and leave it at rest')
     return check
+
+
+def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
+              noise: Noise | None = None, reference: ReferenceErrors | None = None,
+              limits: RunLimits | None = None) -> ScaleBiasFit:
+    """
+    Return a calibration by a profile whose log has too short a rest after it for `check_rest`.
+
+    A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
+    bias. The samples after the motion show it, even where the robot still settles: its response
+    to the profile is fitted together with the rest. A turn that they do not show, of a prior
+    deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
+    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn.
+
+    Parameters
+    ----------
+    time : s since the start of the motion, shape (n,)
+    rate : of the gyro as it went into the fit, rad/s, shape (n,)
+    fit : without a check by a rest; returned unchanged where fewer than 10 samples follow the
+        motion or the robot drives on, of a measured reference, or without a covariance
+    reference : as in `self_calibrate`
+
+    Raises
+    ------
+    DataRefused : the robot turned throughout the motion, or goes on turning after it
+
+    """
+    limits, noise = limits or RunLimits(), noise or Noise()
+    reference = default_reference_errors(motion) if reference is None else reference
+    end = motion.duration + max(fit.time_offset, 0.0)
+    duration = float(time[-1]) - end
+    if (motion.rate is None or motion.rate[-1] != 0.0 or motion.name != 'profile'
+            or not np.isfinite(fit.covariance).all() or np.count_nonzero(time > end) < 10
+            or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
+        return fit
+    with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
+                                  np.append(motion.rate, 0.0))
+    at_rest = _fit_likelihood(time, rate, with_rest, limits.max_time_offset,
+                              reference.scale_deviation, (motion.duration, limits.max_bias))
+    change = at_rest.bias - fit.bias
+    # the few increments of the rest may by chance have less than the noise of the gyro
+    known_ratio = max(noise.angle_random_walk / at_rest.angle_random_walk, 1.0)
+    variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
+                + float(noise.mean_change_variance(duration, duration)))
+    sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
+    stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
+    if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
+        change, variance = 0.0, variance + change ** 2
+    elif sigmas > MIN_SLIP_SIGMAS:
+        raise DataRefused(
+            f'after the run the corrected rate is {change / DEGREE:.3f} deg/s ({sigmas:.0f} '
+            'standard deviations): the robot turned throughout the run, or still turned after '
+            'it; run again and leave it at rest for '
+            f'{SETTLING_TIME + limits.rest_duration:g} s after it')
+    gain, covariance = combine_with_rest(fit.covariance, change, variance)
+    s, b = (gain * change + (fit.scale_factor_error, fit.bias)).tolist()
+    # a turn that the rest does not show
+    covariance[1, 1] += 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
+    return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
 
 
 def rest_variance(noise: Noise, duration: float, white_deviation: float,

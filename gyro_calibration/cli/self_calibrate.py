@@ -28,6 +28,7 @@ from typing import Any
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import (
+    check_end,
     check_rest,
     default_reference_errors,
     describe_implausible_scale,
@@ -172,7 +173,9 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
     rest = find_rest_after(time[known], rate[known], fit, motion)
     check = (None if rest is None
              else check_rest(time[known][rest], rate[known][rest], fit, model.noise))
-    return CalibratedRun(fit if check is None else check.fit, check, run, time[run], rate[run],
+    fit = (check.fit if check is not None else
+           check_end(time[known], rate[known], fit, motion, model.noise, reference))
+    return CalibratedRun(fit, check, run, time[run], rate[run],
                          motion)
 
 
@@ -256,3 +259,6 @@ def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,
     if check:
         yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
                f'limit: {check.limit / DEGREE:.4f} deg/s.')
+    elif reference == 'profile' and method == 'likelihood':
+        yield ('There is no rest of 3 s after the run. A steady turn of the robot throughout '
+               'has the effect of a bias: leave it at rest after the run.')

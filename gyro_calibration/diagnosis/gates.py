@@ -637,7 +637,9 @@ def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading
                          span: float, white: float) -> Agreement:
     """Return the agreement at the best lag, up to 25 spans; white noise in rad²/s."""
     change, steps = np.diff(heading), np.diff(point_times)
-    lags = span * np.arange(-25, 26)
+    # at fractions of a span, of which a delay may be a swing's phase of some degrees: where no lag
+    # near zero agrees, one half a period later does, in the opposite sense
+    lags = 0.25 * span * np.arange(-100, 101)
     found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change,
                               white) for lag in lags]
     least = min(1.0 - each.coherence for each in found)

@@ -15,6 +15,7 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 
 """
 
+from dataclasses import replace
 from functools import cache
 import json
 import math
@@ -29,6 +30,7 @@ from gyro_calibration.calibration.likelihood import (
 )
 from gyro_calibration.calibration.run_faults import split_run
 from gyro_calibration.calibration.self_calibration import (
+    check_end,
     check_rest,
     describe_implausible_scale,
     find_rest_after,
@@ -265,6 +267,47 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
     rest = find_rest_after(time, rate, fit, CALIBRATION_MOTION)
     with pytest.raises(DataRefused, match='the corrected rate is'):
         check_rest(time[rest], rate[rest], fit, XV3500.noise)
+
+
+#: The built-in profile, and one that ends with 1.5 s of rest.
+PROFILES = {each.duration: each for each in (CALIBRATION_MOTION, constant_rate_motion(
+    [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]))}
+
+
+def ended(seed, yaw, rest, motion=CALIBRATION_MOTION):
+    """Return a fit of a run with a steady turn until its end, whose log ends soon after it."""
+    time = np.arange(0.0, motion.duration + rest, 0.01)
+    rate = (output(seed, motion=motion, time=time)
+            + np.where(time < motion.duration, yaw, 0.0))
+    fit = self_calibrate(time, rate, motion, noise=XV3500.noise)
+    return check_end(time, rate, fit, motion, XV3500.noise)
+
+
+@pytest.mark.parametrize('motion', PROFILES.values(), ids=PROFILES)
+@pytest.mark.parametrize('degrees', [0.05, -0.1, 0.2, 0.3, -0.5])
+def test_a_steady_turn_in_a_log_without_a_rest_is_refused_or_in_the_interval(degrees, motion):
+    for seed in range(4):
+        try:
+            fit = ended(seed, degrees * DEGREE, 0.4, motion)
+        except DataRefused as refused:
+            assert 'the robot turned throughout the run' in str(refused)
+        else:
+            assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
+
+
+def test_a_steady_turn_is_seen_in_a_short_rest_of_a_robot_that_has_settled():
+    built_in, settled = PROFILES.values()
+    with pytest.raises(DataRefused, match='the robot turned throughout the run'):
+        ended(0, 1.0 * DEGREE, 0.4, settled)
+    fit = ended(0, 1.0 * DEGREE, 0.4, built_in)
+    assert abs(fit.bias - B) < 1.96 * math.sqrt(fit.covariance[1, 1])
+
+
+def test_a_short_rest_leaves_the_bias_known_and_nothing_is_checked_without_one():
+    short = ended(0, 0.0, 0.4)
+    assert abs(short.bias - B) < 1.96 * math.sqrt(short.covariance[1, 1]) < 0.3 * DEGREE
+    for motion in (CALIBRATION_MOTION, replace(CALIBRATION_MOTION, name='reference')):
+        assert check_end(TIME, output(0), calibrated(0), motion) is calibrated(0)
 
 
 @pytest.mark.parametrize('off', [0.0, 3.0, -10.0])

@@ -48,6 +48,17 @@ def tumbling(log):
         log, output=log.output * tilt + 1.5 * np.sin(0.13 * TIME) * np.sqrt(1.0 - tilt**2))
 
 
+@pytest.mark.parametrize('frequency, delay', [(0.265, 0.083), (0.307, 0.064), (0.344, 0.055)])
+def test_a_swing_that_agrees_half_a_period_later_has_the_sense_of_its_small_delay(
+        frequency, delay):
+    time = np.arange(0.0, 150.0, 0.02)
+    phase, turns = 2.0 * np.pi * frequency * time, 2.0 * np.pi * frequency * delay
+    log = Log(output=np.cos(phase - turns), time=time,
+              reference_heading=np.sin(phase) / (2.0 * np.pi * frequency))
+    (gate,) = [each for each in check_gates(log) if each.name == 'sense']
+    assert gate.passed and check_gates(replace(log, output=-log.output))[-1].name == 'sense'
+
+
 WRONG = {
     'sense': lambda log: replace(log, output=-log.output),
     'output in deg': lambda log: replace(log, output=log.output / DEGREE),
