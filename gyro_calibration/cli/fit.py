@@ -156,23 +156,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     if others:
         raise UsageError(_HEADING_ALONE)
     (log,) = logs.values()
-    found = calibrate_encoder(log, method, technology=technology or 'mems')
-    left_out = ([] if method or found.method != 'likelihood' else
-                _list_other_effects(log, technology))
-    return replace(found, remarks=(
-        *found.remarks, 'at steady rates the log also shows '
-        f'{format_list(left_out)}, which a fit by the heading leaves out: use --method dwells')
-    ) if left_out else found
-
-
-def _list_other_effects(log: Log, technology: str | None) -> list[str]:
-    """Return the effects but bias and scale factor error that the steady rates of a log show."""
-    try:
-        selection = select_effects(extract_dwells(log), technology)
-    except DataRefused:
-        return []
-    return [term.effect.name for term in selection.calibration.model.terms
-            if term.effect.name not in ('bias', 'scale_factor_error')]
+    return calibrate_encoder(log, method, technology=technology or 'mems')
 
 
 def _extract_named_dwells(name: str, log: Log) -> Dwells:

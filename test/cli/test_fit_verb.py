@@ -12,8 +12,7 @@
 
 import json
 
-from gyro_calibration import fit
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
@@ -184,18 +183,3 @@ def test_what_does_not_work_ends_with_one_sentence(run, tmp_path, rows, words, c
     (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n' + rows)
     ended, text, error = run('fit', tmp_path / 'table.csv', *words)
     assert ended == code and not text and said in error and 'Traceback' not in error
-
-
-@pytest.mark.parametrize('cubic', [0.0, 0.02])
-def test_a_rate_table_with_a_heading_names_the_effects_that_a_heading_leaves_out(cubic):
-    levels = np.linspace(-60.0, 60.0, 11) * DEGREE
-    rate = np.repeat(np.concatenate([levels, levels[::-1]] * 2), 200)
-    time, generator = np.arange(len(rate)) * 0.05, np.random.default_rng(0)
-    output = (1.01 * rate + cubic * rate ** 3
-              + 2e-3 * generator.standard_normal(len(time)))
-    heading = np.cumsum(np.append(0.0, 0.5 * (rate[1:] + rate[:-1]))) * 0.05
-    found = fit(Log(time=time, output=output,
-                    reference_heading=np.round(heading / (0.5 * DEGREE)) * 0.5 * DEGREE)).found
-    assert found.method == 'likelihood'
-    assert any('cubic_nonlinearity' in each and '--method dwells' in each
-               for each in found.remarks) == bool(cubic)
