@@ -13,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 import math
 
@@ -31,6 +31,7 @@ from gyro_calibration.diagnosis.candidates import (
     is_named,
     observed_range,
     PART_OF_LOG,
+    RESPONSE,
     unnamed_variable,
 )
 from gyro_calibration.diagnosis.causes import (
@@ -82,6 +83,7 @@ from gyro_calibration.diagnosis.gates import (
 )
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.rate_table import diagnose_table
+from gyro_calibration.diagnosis.reference_lag import follow_reference, HIDDEN_CAUSES
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
     build_problem,
@@ -187,8 +189,9 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                                             on_progress)
     else:
         try:
-            found = _diagnose_by_exact_reference(logs, generator, model, false_alarm_rate, names,
-                                                 on_progress)
+            found = _diagnose_by_exact_reference(
+                logs, generator, model, false_alarm_rate, names, on_progress,
+                reference_kind == 'rate_command')
         finally:
             forget_fits()
         found = replace(found, reference=references[0] if len(logs) == 1 else None)
@@ -200,7 +203,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                                  model: GyroModel | None, rate: float, names: Sequence[str],
-                                 on_progress: OnProgress) -> Diagnosis:
+                                 on_progress: OnProgress, is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
     on_progress(None, 'data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
@@ -222,6 +225,11 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         dwells, of_changes = settled
         table = diagnose_table(dwells, model, rate, on_progress)
         return replace(table, unexplained=(*table.unexplained, of_changes))
+    followed = follow_reference(search, everything, is_command)
+    if followed:
+        search = start_search(followed.replays, SEARCH_ALARM_SHARE * rate, on_progress,
+                              {RESPONSE.cause, *HIDDEN_CAUSES}, RESPONSE)
+        everything = search_causes(search)
     selection = confirm_causes(search, everything)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
@@ -246,7 +254,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed)]
     if len(logs) == 1:
         findings = mark_parts_of_log(findings)
-    if model is not None:
+    if followed and followed.finding:
+        findings.append(followed.finding)
+    if model is not None and not followed:  # a motion that follows has noise of its own
         findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
@@ -265,10 +275,12 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         [heading_contributions(found, run, plain if model is None else None)
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
-    return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
-                     tuple(unexplained_structures(search, found, selection.unnamed)), noise,
-                     simulated, gain,
-                     before, after, _untestable_causes(search, logs), residual_curves(left, shown),
+    unexplained = unexplained_structures(search, found, selection.unnamed)
+    if followed and followed.unexplained:
+        unexplained.append(followed.unexplained)
+    return Diagnosis(tuple(add_remedies(findings, of_heading, after)), tuple(unexplained), noise,
+                     simulated, gain, before, after,
+                     _untestable_causes(search, logs, HIDDEN_CAUSES if followed else ()), residual_curves(left, shown),
                      heading_error_curve(left, shown), allan_curves(found, noise, simulated),
                      tuple(_remarks(quality, names, found, selection, out, gain, model)),
                      rate, heading_shares=of_heading)
@@ -382,8 +394,9 @@ def _noise_findings(figures: NoiseParameters, model: GyroModel, false_alarm_rate
                                f'the log {format_amount(value, unit, name)}')
 
 
-def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
-    """Return the reason for each cause that these logs cannot show."""
+def _untestable_causes(search: Search, logs: Sequence[Log],
+                       hidden: Collection[str]) -> dict[str, str]:
+    """Return the reason for each cause that these logs cannot show, or a lag of motion hides."""
     replays, of_motion = search.problem.replays, {'reference', *REFERENCES}
     has = common_channels(replays) | {'time', 'output'}
     if any(getattr(log, name) is not None for log in logs for name in REFERENCES):
@@ -394,6 +407,8 @@ def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     def reason(cause: Cause) -> str:
         if not moves and cause.required_channels & of_motion:
             return 'the reference shows no motion'
+        if cause.name in hidden:
+            return 'the motion follows the reference with a lag of its own'
         if unchanging := sorted(cause.required_channels & constant):
             return _CONSTANT_REASONS[unchanging[0]]
         return ('in these logs it cannot be distinguished from a bias or a scale factor error'
