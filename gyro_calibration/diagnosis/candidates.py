@@ -366,7 +366,7 @@ def _spline_columns(variable: Variable) -> ColumnFunction:
 
 
 def response_edges(interval: float) -> Array:
-    """Return the lags between which a response is constant, at whole samples, s, shape (k + 1,)."""
+    """Return the lags between which a response is constant, whole samples, s, shape (k + 1,)."""
     return np.unique(np.rint(np.array(_RESPONSE_LAGS) / interval)) * interval
 
 

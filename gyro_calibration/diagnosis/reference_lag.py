@@ -111,7 +111,7 @@ def _mean_lag(fit: RegressionFit, places: Sequence[int]) -> Estimate:
 
 
 def _followed(fit: RegressionFit, run: int) -> Replay:
-    """Return a log with the rate of the motion that follows as reference, and as that of effects."""
+    """Return a log with the motion that follows as the reference, and as that of effects."""
     each = fit.problem.replays[run]
     parts = fit.contributions(each, run)
     change = (parts.get('time_offset', 0.0) + parts.get('bandwidth', 0.0)

@@ -186,8 +186,9 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
-    return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate, columns_cache={},
-                   step_cache={}, scanned_causes=search.scanned_causes & frozenset(causes),
+    return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate,
+                   columns_cache={}, step_cache={},
+                   scanned_causes=search.scanned_causes & frozenset(causes),
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
 
 
