@@ -181,8 +181,9 @@ def rate_noise_share(log: Log) -> float:
     """
     Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
 
-    It is estimated where the reference is quietest, by the updates of a held one. White noise is detected by third differences
-    of alternating sign, other noise by changes from sample to sample that the gyro does not show.
+    It is estimated where the reference is quietest, by the updates of a held one. White noise is
+    detected by third differences of alternating sign, other noise by changes from sample to sample
+    that the gyro does not show.
 
     """
     assert log.output is not None and log.reference_rate is not None

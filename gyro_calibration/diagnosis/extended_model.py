@@ -469,8 +469,8 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     if not square > 0.0:
         return {}
     part_of = {name: float(np.mean(part * total)) / square for name, part in found.items()}
-    left = part_of.pop('left')
-    return {**part_of, 'reference': min(reference_square / square, max(left, 0.0)),
+    left, response = part_of.pop('left'), part_of.pop('reference', 0.0)
+    return {**part_of, 'reference': response + min(reference_square / square, max(left, 0.0)),
             'left': max(left - reference_square / square, 0.0)}
 
 

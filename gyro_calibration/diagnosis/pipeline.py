@@ -253,7 +253,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         findings = mark_parts_of_log(findings)
     if followed and followed.finding:
         findings.append(followed.finding)
-    if model is not None and not (followed or settled):  # a motion that follows has noise of its own
+    # a motion that follows has noise of its own
+    if model is not None and not (followed or settled):
         findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
@@ -281,8 +282,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      simulated, gain, before, after,
                      _untestable_causes(search, logs,
                                         HIDDEN_CAUSES if followed or settled else ()),
-                     residual_curves(left, shown),
-                     heading_error_curve(left, shown), allan_curves(found, noise, simulated),
+                     residual_curves(left, shown), heading_error_curve(left, shown),
+                     allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
                       *[_SETTLED_REMARK] * bool(settled)),
                      rate, heading_shares=of_heading)

@@ -298,7 +298,7 @@ class RegressionFit:
     # contributions to the output
 
     def contributions(self, replay: Replay, log_index: int) -> dict[str, Array]:
-        """Return the contributions of scale and causes to the output of a log, rad/s, (n,)."""
+        """Return the contributions of scale, causes and nuisance to a log, rad/s, shape (n,)."""
         found: dict[str, Array] = {}
         new = replay
         for known in self.causes:
@@ -306,6 +306,11 @@ class RegressionFit:
                 before, new = new, with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
+        if self.problem.nuisance is not None:
+            columns = self.problem.nuisance.columns(replay)
+            found['reference'] = np.asarray(sum(
+                self._column_value(-1, 1 + number).value * column
+                for number, column in enumerate(columns)))
         for place, known in enumerate(self.causes):
             if (is_rate_distortion(known.cause) or known.log_index not in (None, log_index)
                     or not self.is_included(place)):
@@ -340,11 +345,13 @@ class RegressionFit:
     @property
     def bias_variance(self) -> float:
         """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
-        means = np.zeros(len(self.columns))
+        means, nuisance = np.zeros(len(self.columns)), self.problem.nuisance
         for rank, (place, number) in enumerate(self.column_owners):
-            if (place, number) == (-1, 0):
-                parts = [each.channels.rate for each in self.distorted]
-            elif place >= 0 and number >= 0 and self.is_included(place):
+            if place < 0:
+                parts = ([each.channels.rate for each in self.distorted] if nuisance is None
+                         or number == 0 else [nuisance.columns(each)[number - 1]
+                                              for each in self.problem.replays])
+            elif number >= 0 and self.is_included(place):
                 parts = [self.causes[place].columns(each)[number]
                          for each in self.distorted]
             else:
