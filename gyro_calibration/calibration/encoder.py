@@ -227,10 +227,14 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
            fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
                           lag_deviation=_GYRO_LAG_DEVIATION))
+    response_variance = 0.0
     if motion.rate is not None and method == 'likelihood':
         # the variance of the times by which a motion is late is seldom above their mean squared
+        exact = fit.scale_factor_error
         fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
             0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION))
+        # the shape of the response is not known: what it changes is uncertain
+        response_variance = (fit.scale_factor_error - exact) ** 2
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
     refuse_scale(fit.scale_factor_error, 'reference',
                  'give or omit --invert, or turn the gyro over')
@@ -249,6 +253,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
                           f'wanted {100 * limits.max_scale_deviation:g} %: '
                           'turn further, faster, or more often')
+    fit = replace(fit, covariance=fit.covariance + np.diag([response_variance, 0.0]))
     if method == 'rate':
         return replace(fit, angle_random_walk=drift.angle_random_walk), {}
     # the steps of an encoder hide white noise
