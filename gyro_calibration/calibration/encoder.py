@@ -60,6 +60,7 @@ from gyro_calibration.calibration.reference_noise import (
     drop_held_values,
     is_course,
     MAX_ROUNDING_STEP,
+    rate_noise_share,
 )
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import (
@@ -88,7 +89,7 @@ from gyro_calibration.logs.quality import (
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import Motion, motion_from_headings
+from gyro_calibration.model.motion import Motion, motion_from_headings, motion_from_rates
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,8 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 #: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
 _WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
+#: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
+_GYRO_LAG_DEVIATION = 2e-4
 #: Places of a shaft in a revolution whose errors are independent.
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
@@ -221,8 +224,17 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     refuse_dead(output)
     _refuse_turn_in_hole(time, output, motion)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
-    fit = (fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=2e-4)
-           if method == 'likelihood' else _fit_by_rate(time, output, motion))
+    fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
+           fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
+                          lag_deviation=_GYRO_LAG_DEVIATION))
+    response_variance = 0.0
+    if motion.rate is not None and method == 'likelihood':
+        # the variance of the times by which a motion is late is seldom above their mean squared
+        exact = fit.scale_factor_error
+        fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
+            0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION))
+        # the shape of the response is not known: what it changes is uncertain
+        response_variance = (fit.scale_factor_error - exact) ** 2
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
     refuse_scale(fit.scale_factor_error, 'reference',
                  'give or omit --invert, or turn the gyro over')
@@ -241,6 +253,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
                           f'wanted {100 * limits.max_scale_deviation:g} %: '
                           'turn further, faster, or more often')
+    fit = replace(fit, covariance=fit.covariance + np.diag([response_variance, 0.0]))
     if method == 'rate':
         return replace(fit, angle_random_walk=drift.angle_random_walk), {}
     # the steps of an encoder hide white noise
@@ -313,8 +326,11 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               f'at least {fewest} are needed: {remedy}')
     start = log.time[reference_known][0]
-    motion = replace(motion_from_headings(log.time[reference_known], heading[reference_known]),
-                     name='reference')
+    motion = motion_from_headings(log.time[reference_known], heading[reference_known])
+    if log.reference_heading is None and rate is not None and not rate_noise_share(log):
+        # a rate without noise may be a command, which the motion follows
+        motion = motion_from_rates(log.time[reference_known], rate[reference_known])
+    motion = replace(motion, name='reference')
     if motion.duration < 10.0:
         raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: '
                           'record longer')
@@ -451,6 +467,8 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     covariance = scatter * np.outer(widening, widening)
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
+    if motion.rate is not None:  # what priors on the response of the motion leave open
+        covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(fit.covariance[0, 0])))
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
         covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error

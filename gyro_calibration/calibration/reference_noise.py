@@ -181,13 +181,18 @@ def rate_noise_share(log: Log) -> float:
     """
     Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
 
-    It is estimated where the reference is quietest. White noise is detected by third differences
-    of alternating sign, other noise by changes from sample to sample that the gyro does not show.
+    It is estimated where the reference is quietest, by the updates of a held one. White noise is
+    detected by third differences of alternating sign, other noise by changes from sample to sample
+    that the gyro does not show.
 
     """
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
     rate, output = log.reference_rate[known], log.output[known]
+    if log.time is not None and update_interval(log.time[known], rate, 0.0) is not None:
+        begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
+        counts = np.diff(begins, append=len(rate))
+        rate, output = rate[begins], np.add.reduceat(output, begins) / counts
     if len(rate) < 100 or not np.ptp(rate) > 0.0:
         return 0.0
     line = np.polyfit(rate, output, 1)

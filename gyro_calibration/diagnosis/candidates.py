@@ -25,6 +25,7 @@ from itertools import combinations, product
 import math
 
 from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
 import numpy as np
@@ -155,7 +156,7 @@ def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidat
 def depends_on_rate(candidate: Candidate) -> bool:
     """Tell whether the columns of a candidate depend on the rate that the gyro senses."""
     if not is_named(candidate):
-        return 'rate' in unnamed_variable(candidate).split(' and ')
+        return bool({'rate', 'rate_change'} & {*unnamed_variable(candidate).split(' and ')})
     effect = CATALOGUE.get(candidate.cause)
     return effect is None or effect.distortion is not None or 'rate' in effect.inputs
 
@@ -265,6 +266,8 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
 WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
+#: Lags between which the response of a motion to its reference is constant, s.
+_RESPONSE_LAGS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 1.6, 2.4)
 #: Widths of a bump in time as shares of the duration.
 BUMP_WIDTHS = (0.01, 0.05)
 
@@ -299,6 +302,8 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
             if name in variables:
                 yield _unnamed_term(f'{name} and heading',
                                     _wave_columns(heading, number, variables[name]))
+    if 'rate' in variables and 'reference_rate' in common_channels(replays):
+        yield RESPONSE
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
@@ -358,6 +363,23 @@ def _spline_columns(variable: Variable) -> ColumnFunction:
     knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, SPLINE_KNOTS - 2), [1.0] * 3])
     # their sum is constant, as the bias is
     return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
+
+
+def response_edges(interval: float) -> Array:
+    """Return the lags between which a response is constant, whole samples, s, shape (k + 1,)."""
+    return np.unique(np.rint(np.array(_RESPONSE_LAGS) / interval)) * interval
+
+
+def _response_columns(each: Replay) -> Sequence[Array]:
+    """Return the mean rate between two lags less the rate, for each pair of neighbouring lags."""
+    time, rate = each.channels.time, each.channels.rate
+    edges, turned = response_edges(each.interval), integrate(time, rate)
+    late = np.interp(time - edges[:, None], time, turned)
+    return [*((late[:-1] - late[1:]) / np.diff(edges)[:, None] - rate)]
+
+
+#: Linear response of a motion to its reference rate.
+RESPONSE = Candidate(f'{UNNAMED_PREFIX}rate_change', (), _response_columns)
 
 
 def _part_of_log(first: float, last: float, log_index: int | None,

@@ -78,6 +78,8 @@ _OTHER_CAUSES = (
     ('reference_drift', 'The reference drifts in motion, and stands at rest, as odometry does.',
      'rad/s', 'reference', 'time reference_heading', 'time',
      CATALOGUE['vibration_rectification'].experiment),
+    ('reference_lag', 'The motion follows the reference rate with a lag of its own, as a robot '
+     'follows its command.', 's', 'reference', 'time reference_rate', 'rate_change', ''),
     ('reference_quantization', 'The reference heading is quantized, so that its rate between '
      'samples is coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
     ('unit_error', 'The output has another unit, or the other sign, than its name states.', '1',

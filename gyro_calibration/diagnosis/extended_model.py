@@ -343,7 +343,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
                    for each, block in zip(replays, blocks))):
         return None
     reduced_search = restrict_search(
-        search, [_drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
+        search, [drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
         _REPEATED_ALARM_RATE)
     named = search_causes(reduced_search)
     straight, plain, extended = (
@@ -395,11 +395,12 @@ def _held_out_blocks(replay: Replay, block_duration: float) -> NDArray[np.intp]:
     return np.where(held_out, number, -1)
 
 
-def _drop_samples(replay: Replay, dropped: Mask) -> Replay:
+def drop_samples(replay: Replay, dropped: Mask) -> Replay:
+    """Return a log with fewer samples that are used."""
     left = (replay.valid & ~dropped)[replay.valid]
     place = replay.grid_index[left]
     return replace(replay, valid=replay.valid & ~dropped, grid_index=place - place[0],
-                   fill_noise=replay.fill_noise[place[0]:])
+                   fill_noise=replay.fill_noise[place[0]:place[-1] + 1])
 
 
 def _rate_residuals(replay: Replay, log_index: int,
@@ -468,8 +469,8 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     if not square > 0.0:
         return {}
     part_of = {name: float(np.mean(part * total)) / square for name, part in found.items()}
-    left = part_of.pop('left')
-    return {**part_of, 'reference': min(reference_square / square, max(left, 0.0)),
+    left, response = part_of.pop('left'), part_of.pop('reference', 0.0)
+    return {**part_of, 'reference': response + min(reference_square / square, max(left, 0.0)),
             'left': max(left - reference_square / square, 0.0)}
 
 

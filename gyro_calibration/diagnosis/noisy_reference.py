@@ -100,7 +100,7 @@ _SAME_CLOCK = ('rate_command', 'encoder')
 #: Standard deviations of a value that is found in 95 % of logs.
 DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
-_MAX_GYRO_LAG = 0.1
+MAX_GYRO_LAG = 0.1
 _CLOCK_REMEDY = ('synchronize the clocks of gyro and reference; the model does not contain it')
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
@@ -236,7 +236,7 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                    NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place])
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         if name == 'time_offset':
-            of_gyro = 0.0 < value < _MAX_GYRO_LAG
+            of_gyro = 0.0 < value < MAX_GYRO_LAG
             confounders = [other for other, might in (('bandwidth', of_gyro), ('clock_rate', True))
                            if might and _is_possible_instead(fit, other)]
             if own_clock and not of_gyro:

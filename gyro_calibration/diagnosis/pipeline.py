@@ -13,16 +13,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    find_dwells,
-    LIKELIHOOD_HINT,
-    require_output,
-)
+from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
@@ -31,6 +26,7 @@ from gyro_calibration.diagnosis.candidates import (
     is_named,
     observed_range,
     PART_OF_LOG,
+    RESPONSE,
     unnamed_variable,
 )
 from gyro_calibration.diagnosis.causes import (
@@ -49,6 +45,7 @@ from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record,
 from gyro_calibration.diagnosis.extended_model import (
     add_causes,
     add_origin_notes,
+    drop_samples,
     extend_model,
     heading_contributions,
     heading_error_shares,
@@ -81,7 +78,7 @@ from gyro_calibration.diagnosis.gates import (
     refuse_unusable,
 )
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
-from gyro_calibration.diagnosis.rate_table import diagnose_table
+from gyro_calibration.diagnosis.reference_lag import follow_reference, HIDDEN_CAUSES
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
     build_problem,
@@ -116,7 +113,7 @@ from gyro_calibration.diagnosis.search import (
     start_search,
 )
 from gyro_calibration.diagnosis.words import format_amount
-from gyro_calibration.logs.log import DataRefused, Log, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
@@ -126,6 +123,10 @@ from scipy.stats import mannwhitneyu, norm
 
 #: Probability that an effect of the minimum detectable size is found.
 _DETECTION_POWER = 0.95
+_SETTLED_REMARK = (
+    'Between the dwells, gyro and reference differ by more than the causes explain, as where a '
+    'robot follows its command with a lag and overshoot; the log is diagnosed by its dwells '
+    'alone: use a measured rate or heading as the reference to see more.')
 #: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
@@ -187,8 +188,9 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                                             on_progress)
     else:
         try:
-            found = _diagnose_by_exact_reference(logs, generator, model, false_alarm_rate, names,
-                                                 on_progress)
+            found = _diagnose_by_exact_reference(
+                logs, generator, model, false_alarm_rate, names, on_progress,
+                reference_kind == 'rate_command')
         finally:
             forget_fits()
         found = replace(found, reference=references[0] if len(logs) == 1 else None)
@@ -200,7 +202,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                                  model: GyroModel | None, rate: float, names: Sequence[str],
-                                 on_progress: OnProgress) -> Diagnosis:
+                                 on_progress: OnProgress, is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
     on_progress(None, 'data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
@@ -216,12 +218,15 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     if averaged is not search.problem.replays:
         search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
         everything = search_causes(search)
-    if (len(logs) == 1 and logs[0].reference_rate is not None
-            and (settled := _settled_dwells(logs[0], fit_causes(search.problem, everything),
-                                            rate))):
-        dwells, of_changes = settled
-        table = diagnose_table(dwells, model, rate, on_progress)
-        return replace(table, unexplained=(*table.unexplained, of_changes))
+    followed = follow_reference(search, everything, is_command)
+    settled = (_find_settled(logs[0], fit_causes(search.problem, everything), rate)
+               if len(logs) == 1 and logs[0].reference_rate is not None else None)
+    if followed or settled:
+        moved = search.problem.replays if followed is None else followed.replays
+        search = start_search(
+            [drop_samples(moved[0], ~settled[0])] if settled else moved, SEARCH_ALARM_SHARE * rate,
+            on_progress, {RESPONSE.cause, *HIDDEN_CAUSES}, RESPONSE)
+        everything = search_causes(search)
     selection = confirm_causes(search, everything)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
@@ -246,7 +251,10 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed)]
     if len(logs) == 1:
         findings = mark_parts_of_log(findings)
-    if model is not None:
+    if followed and followed.finding:
+        findings.append(followed.finding)
+    # a motion that follows has noise of its own
+    if model is not None and not (followed or settled):
         findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
@@ -265,24 +273,32 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         [heading_contributions(found, run, plain if model is None else None)
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
-    return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
-                     tuple(unexplained_structures(search, found, selection.unnamed)), noise,
-                     simulated, gain,
-                     before, after, _untestable_causes(search, logs), residual_curves(left, shown),
-                     heading_error_curve(left, shown), allan_curves(found, noise, simulated),
-                     tuple(_remarks(quality, names, found, selection, out, gain, model)),
+    unexplained = unexplained_structures(search, found, selection.unnamed)
+    if settled:
+        unexplained.append(settled[1])
+    elif followed and followed.unexplained:
+        unexplained.append(followed.unexplained)
+    return Diagnosis(tuple(add_remedies(findings, of_heading, after)), tuple(unexplained), noise,
+                     simulated, gain, before, after,
+                     _untestable_causes(search, logs,
+                                        HIDDEN_CAUSES if followed or settled else ()),
+                     residual_curves(left, shown), heading_error_curve(left, shown),
+                     allan_curves(found, noise, simulated),
+                     (*_remarks(quality, names, found, selection, out, gain, model),
+                      *[_SETTLED_REMARK] * bool(settled)),
                      rate, heading_shares=of_heading)
 
 
-def _settled_dwells(log: Log, fit: RegressionFit,
-                    false_alarm_rate: float) -> tuple[Dwells, Unexplained] | None:
+def _find_settled(log: Log, fit: RegressionFit,
+                  false_alarm_rate: float) -> tuple[Mask, Unexplained] | None:
     """
-    Return the dwells of a log whose residual is larger between them, and that; otherwise None.
+    Return the samples of a log in dwells if the residual is larger between them; otherwise None.
 
     The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
     with dynamics that no cause describes. The mean squares of the whitened residual are compared
-    stretch by stretch (Mann and Whitney), and have to be twice as large between dwells. Dwells of
-    less than half the range of rates, such as rests alone, do not show what the motion does.
+    stretch by stretch (Mann and Whitney). Unless the response of the motion is among the causes,
+    they have to be twice as large between dwells. Dwells of less than half the range of rates,
+    such as rests alone, do not show what the motion does.
 
     """
     try:
@@ -300,20 +316,16 @@ def _settled_dwells(log: Log, fit: RegressionFit,
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
     squares = np.add.reduceat(white ** 2, begin) / np.diff(np.append(begin, len(white)))
     steady, between = squares[inside[begin]], squares[~inside[begin]]
+    follows = RESPONSE.cause in {each.cause for each in fit.causes}
     if (min(len(steady), len(between)) < MIN_STRETCHES
-            or np.median(between) < 2.0 * np.median(steady)):
+            or not follows and np.median(between) < 2.0 * np.median(steady)):
         return None
     chance = float(mannwhitneyu(between, steady, alternative='greater').pvalue)
-    if chance > VALUE_ALARM_SHARE * false_alarm_rate:
+    if chance > (1.0 if follows else VALUE_ALARM_SHARE) * false_alarm_rate:
         return None
     excess = white[~inside] ** 2 - np.median(steady)
-    found = Unexplained('rate_change', float(max(excess.sum(), 0.0) / (white @ white)), chance)
-    return replace(dwells, remarks=(
-        *(each.removesuffix(LIKELIHOOD_HINT) for each in dwells.remarks),
-        'between the dwells, gyro and reference differ by more than the causes explain, '
-        'as where a robot follows its command with a lag and overshoot; the log is '
-        f'diagnosed by its {len(dwells)} dwells alone: use a measured rate or heading as the '
-        'reference to see more')), found
+    return within, Unexplained(
+        'rate_change', float(max(excess.sum(), 0.0) / (white @ white)), chance)
 
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
@@ -382,7 +394,8 @@ def _noise_findings(figures: NoiseParameters, model: GyroModel, false_alarm_rate
                                f'the log {format_amount(value, unit, name)}')
 
 
-def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
+def _untestable_causes(search: Search, logs: Sequence[Log],
+                       hidden: Collection[str]) -> dict[str, str]:
     """Return the reason for each cause that these logs cannot show."""
     replays, of_motion = search.problem.replays, {'reference', *REFERENCES}
     has = common_channels(replays) | {'time', 'output'}
@@ -394,6 +407,8 @@ def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     def reason(cause: Cause) -> str:
         if not moves and cause.required_channels & of_motion:
             return 'the reference shows no motion'
+        if cause.name in hidden:
+            return 'the motion follows the reference with a lag of its own'
         if unchanging := sorted(cause.required_channels & constant):
             return _CONSTANT_REASONS[unchanging[0]]
         return ('in these logs it cannot be distinguished from a bias or a scale factor error'

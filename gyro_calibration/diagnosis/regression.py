@@ -75,6 +75,8 @@ class RegressionProblem:
     noise_shapes: tuple[NoiseShape, ...]  # noises that are tried
     weights: Array  # one over the variance of each band relative to the first noise, shape (g, b)
     log_determinants: Array  # of the relative variances, and of the prior probability, shape (g,)
+    # columns of the undistorted rate that are fitted with any causes, and belong to none
+    nuisance: Candidate | None = None
 
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
@@ -104,8 +106,9 @@ class RegressionProblem:
         return self.weights @ np.add.reduceat(rows ** 2, self.band_starts, axis=1).T
 
 
-def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
-    """Set up the regression of logs with a grid of noises."""
+def build_problem(replays: Sequence[Replay],
+                  nuisance: Candidate | None = None) -> RegressionProblem:
+    """Set up the regression of logs with a grid of noises, and a nuisance if any."""
     logs, rounding_ratio = tuple(replays), 0.0
     if any(each.heading_step for each in logs):
         # the most likely variance of the rounding of a heading, relative to white noise
@@ -113,9 +116,10 @@ def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
             NoiseShape(walk, rounding_ratio=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))
             for walk in (0.0, 1e-4, 1e-2)])
         rounding_ratio = tried.noise_shapes[fit_causes(tried, []).best_noise].rounding_ratio
-    return _assemble_problem(logs, NoiseShape(rounding_ratio=rounding_ratio),
-                             noise_grid(min(each.point_interval for each in logs),
-                                        max(each.duration for each in logs), rounding_ratio))
+    return replace(_assemble_problem(
+        logs, NoiseShape(rounding_ratio=rounding_ratio),
+        noise_grid(min(each.point_interval for each in logs),
+                   max(each.duration for each in logs), rounding_ratio)), nuisance=nuisance)
 
 
 def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
@@ -165,8 +169,8 @@ class RegressionFit:
     # whitened and independent: scale factor error, those of the causes, and derivatives with
     # respect to their shapes, shape (q, m)
     columns: Array
-    # of each column: (index of the cause, or -1 for the scale factor error; index of its value, or
-    # -1 less index of its shape)
+    # of each column: (index of the cause; index of its value, or -1 less index of its shape); -1
+    # and 0 for the scale factor error, -1 and more for the nuisance
     column_owners: tuple[tuple[int, int], ...]
     column_counts: tuple[int, ...]  # number of columns with free values of each cause
     # information, scores: of the columns under each noise, shapes (g, q, q) and (g, q)
@@ -294,7 +298,7 @@ class RegressionFit:
     # contributions to the output
 
     def contributions(self, replay: Replay, log_index: int) -> dict[str, Array]:
-        """Return the contributions of scale and causes to the output of a log, rad/s, (n,)."""
+        """Return the contributions of scale, causes and nuisance to a log, rad/s, shape (n,)."""
         found: dict[str, Array] = {}
         new = replay
         for known in self.causes:
@@ -302,6 +306,11 @@ class RegressionFit:
                 before, new = new, with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
+        if self.problem.nuisance is not None:
+            columns = self.problem.nuisance.columns(replay)
+            found['reference'] = np.asarray(sum(
+                self._column_value(-1, 1 + number).value * column
+                for number, column in enumerate(columns)))
         for place, known in enumerate(self.causes):
             if (is_rate_distortion(known.cause) or known.log_index not in (None, log_index)
                     or not self.is_included(place)):
@@ -336,10 +345,12 @@ class RegressionFit:
     @property
     def bias_variance(self) -> float:
         """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
-        means = np.zeros(len(self.columns))
+        means, nuisance = np.zeros(len(self.columns)), self.problem.nuisance
         for rank, (place, number) in enumerate(self.column_owners):
             if place < 0:
-                parts = [each.channels.rate for each in self.distorted]
+                parts = ([each.channels.rate for each in self.distorted] if nuisance is None
+                         or number == 0 else [nuisance.columns(each)[number - 1]
+                                              for each in self.problem.replays])
             elif number >= 0 and self.is_included(place):
                 parts = [self.causes[place].columns(each)[number]
                          for each in self.distorted]
@@ -407,6 +418,9 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
     distorted = tuple(with_distorted_rate(each, distortions) for each in problem.replays)
     residual, rate = _transforms_without_causes(problem.replays, distorted)
     columns, owners, widths = [rate[None]], [(-1, 0)], []
+    if problem.nuisance is not None:
+        columns.append(_transforms(problem.nuisance, problem.replays))
+        owners += [(-1, 1 + number) for number in range(len(columns[-1]))]
     for place, known in enumerate(causes):
         distorts = is_rate_distortion(known.cause)
         replays = problem.replays if distorts else distorted
@@ -570,8 +584,8 @@ def average_filtered_noise(fit: RegressionFit,
             and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME
             for each, part in zip(fit.problem.replays, fit.residual_transforms())]):
         fit = fit_causes(build_problem([replace(each, decimation=each.decimation * (1 + more))
-                                        for each, more in zip(fit.problem.replays, is_filtered)]),
-                         fit.causes)
+                                        for each, more in zip(fit.problem.replays, is_filtered)],
+                                       fit.problem.nuisance), fit.causes)
     return fit
 
 

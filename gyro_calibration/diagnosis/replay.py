@@ -252,8 +252,9 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
                          else np.zeros(len(time)))
     channels = replace(channels_from_log(prepared_log), rate=smooth, time=time, heading=heading,
                        output=log.output - expected_rounding)
-    has = frozenset(name for name in ('temperature', 'specific_force', 'supply')
-                    if getattr(log, name) is not None)
+    has = frozenset(name for name, known in (
+        ('temperature', log), ('specific_force', log), ('supply', log),
+        ('reference_rate', prepared_log)) if getattr(known, name) is not None)
     rounded = heading_step if prepared_log.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
     plain = Replay(channels, reference, kept, place, interval, every, filling, rounded, has,

@@ -165,16 +165,19 @@ class Search:
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
-                 on_progress: OnProgress = lambda share, words: None) -> Search:
-    """Set up a search: candidates and noises."""
+                 on_progress: OnProgress = lambda share, words: None,
+                 without: Collection[str] = (), nuisance: Candidate | None = None) -> Search:
+    """Set up a search: candidates, some causes left out, noises, and a nuisance if any."""
     on_progress(None, 'candidate causes')
-    found = (*propose_candidates(replays), *generic_terms(replays))
-    problem, places = build_problem(replays), indices_by_cause(found)
+    found = tuple(each for each in (*propose_candidates(replays), *generic_terms(replays))
+                  if each.cause not in without)
+    problem, places = build_problem(replays, nuisance), indices_by_cause(found)
     fit = fit_causes(problem, [])
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
-    search = Search(problem, found, rate / len(places), on_progress=on_progress)
+    search = Search(problem, found, rate / len(places), on_progress=on_progress,
+                    scanned_causes=frozenset(MAX_PER_LOG).difference(without))
     shown = search.candidate_evidence(fit)
     return replace(search, unidentifiable=frozenset(
         cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
@@ -183,8 +186,9 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
-    return replace(search, problem=build_problem(replays), rate=rate, columns_cache={},
-                   step_cache={}, scanned_causes=search.scanned_causes & frozenset(causes),
+    return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate,
+                   columns_cache={}, step_cache={},
+                   scanned_causes=search.scanned_causes & frozenset(causes),
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
 
 

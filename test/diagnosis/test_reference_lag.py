@@ -1,0 +1,101 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""What a motion does beside its commanded rate is not named as an effect of the gyro."""
+
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.reference_noise import rate_noise_share
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.logs.log import DEGREE, Log
+import numpy as np
+import pytest
+
+INTERVAL, SUBSTEPS, COUNT = 0.05, 20, 3000
+SCALE, BIAS = 0.012, 0.3 * DEGREE
+
+
+def commanded(kind, generator):
+    """Return a commanded rate in steps, trapezoids or a swing, at fine steps, rad/s."""
+    time = np.arange(COUNT * SUBSTEPS) * INTERVAL / SUBSTEPS
+    if kind == 'swing':
+        ends = np.linspace(0.0, time[-1], 12)
+        size, frequency = (np.interp(time, ends, generator.uniform(*between, 12))
+                           for between in ((0.5, 1.5), (0.05, 0.3)))
+        return size * np.sin(2.0 * np.pi * np.cumsum(frequency) * INTERVAL / SUBSTEPS)
+    ramp = 0.01 if kind == 'steps' else 0.8
+    stops, rates = [0.0, 4.0], [0.0, 0.0]
+    while stops[-1] < time[-1]:
+        rate = generator.choice([-1, 1]) * generator.uniform(0.2, 1.5)
+        hold, rest = generator.uniform((2.0, 1.0), (6.0, 4.0))
+        stops += np.add(stops[-1], np.cumsum([ramp, hold, ramp, rest])).tolist()
+        rates += [rate, rate, 0.0, 0.0]
+    return np.interp(time, stops, rates)
+
+
+def followed(command, delay, frequency, damping):
+    """Return the rate of a robot that follows a command late, as a system of second order."""
+    late = round(delay * SUBSTEPS / INTERVAL)
+    step, rate, change, rates = INTERVAL / SUBSTEPS, 0.0, 0.0, []
+    for wanted in np.concatenate([np.zeros(late), command]).tolist()[:len(command)]:
+        change += step * (frequency ** 2 * (wanted - rate) - 2.0 * damping * frequency * change)
+        rate += step * change
+        rates.append(rate)
+    return np.array(rates)
+
+
+def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0):
+    """Return a log of a robot with its command as the reference rate."""
+    generator = np.random.default_rng(seed)
+    command = commanded(kind, generator)
+    rate = followed(command, 0.08, 8.0, 0.7)[::SUBSTEPS]
+    time = np.arange(COUNT) * INTERVAL
+    output = ((1.0 + SCALE) * rate + BIAS + added(rate, time)
+              + noise / np.sqrt(INTERVAL) * generator.standard_normal(COUNT))
+    return Log(output=output, time=time, reference_rate=command[::SUBSTEPS])
+
+
+@pytest.mark.parametrize('kind, noise', [('steps', 3e-4), ('trapezoids', 3e-4), ('swing', 3e-4),
+                                         ('trapezoids', 3e-5)])
+def test_the_lag_of_a_robot_is_no_effect_of_its_gyro(kind, noise):
+    found = diagnose([commanded_log(kind, noise, 1)], np.random.default_rng(0))
+    named = {each.effect: each for each in found.findings if each.status == 'established'}
+    assert {*named} == {'reference_lag'}
+    lag = named['reference_lag'].parameters['reference_lag']
+    assert lag.estimate == pytest.approx(0.08 + 2.0 * 0.7 / 8.0, abs=0.03)
+    assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
+    assert 'lag of its own' in found.cannot_show['time_offset']
+    values = {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
+    for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
+        assert abs(values[name][0] - true) < 4.0 * values[name][1]
+
+
+@pytest.mark.parametrize('kind, effect, added', [
+    ('trapezoids', 'cubic_nonlinearity', lambda rate, time: 0.006 * rate ** 3),
+    ('swing', 'bias_step', lambda rate, time: 4e-3 * (time > 80.0)),
+    ('steps', 'bias_step', lambda rate, time: 4e-3 * (time > 80.0))])
+def test_an_effect_of_the_gyro_is_found_beside_the_lag(kind, effect, added):
+    found = diagnose([commanded_log(kind, 2e-4, 2, added)], np.random.default_rng(0))
+    assert {each.effect for each in found.findings if each.status == 'established'} == {
+        'reference_lag', effect}
+
+
+def test_a_command_that_is_held_between_updates_has_no_noise():
+    log = commanded_log('swing', 3e-4, 3)
+    held = log.reference_rate[np.arange(COUNT) // 4 * 4]
+    assert rate_noise_share(Log(output=log.output, time=log.time, reference_rate=held)) == 0.0
+
+
+def test_a_scale_is_fitted_beside_the_lag_of_a_swing():
+    """A lag attenuates a swing, by 2 % at 0.2 Hz here."""
+    errors = []
+    for seed in range(4):
+        fit = calibrate_encoder(commanded_log('swing', 3e-4, seed)).fit
+        errors.append((fit.scale_factor_error - SCALE) / np.sqrt(fit.covariance[0, 0]))
+    assert np.abs(errors).max() < 4.0
