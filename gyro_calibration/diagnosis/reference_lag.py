@@ -79,7 +79,8 @@ def follow_reference(search: Search, causes: Sequence[Candidate],
         finding = make_finding(
             'reference_lag', {'reference_lag': lag}, chance, evidence=f'the motion is '
             f'{1e3 * lag.estimate:.0f} ms behind the reference rate on average, and the output is '
-            'compared with the motion that follows')
+            'compared with the motion that follows',
+            remedy='use a measured rate or heading as the reference')
     elif all(map(is_named, (kept[place] for place in places))):
         return None
     replays = tuple(_followed(fit, run) for run in range(len(fit.problem.replays)))
