@@ -54,9 +54,10 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
 )
 from gyro_calibration.calibration.reference_noise import (
-    drop_held_values,
     find_rests,
     heading_difference,
+    interpolate_by_splines,
+    keep_own_instants,
     MAX_ROUNDING_STEP,
     rate_noise_share,
 )
@@ -274,10 +275,20 @@ class Spans:
         """Return the stamps of the gyro at times of the reference, s."""
         return (time + self.delay) / (1.0 + self.clock_rate)
 
-    def point_means(self, values: Array) -> Array:
-        """Return the means of a signal at the points, corrected for the delay, shape (n + 1,)."""
-        assert self.log.time is not None
-        delayed_values = np.interp(self.gyro_stamps(self.value_times), self.log.time, values)
+    def point_means(self, values: Array, curvature: Array | None = None) -> Array:
+        """
+        Return the means of a signal at the points, corrected for the delay, shape (n + 1,).
+
+        Between samples it is a line, or a parabola by its second derivative at each sample.
+
+        """
+        time, at = self.log.time, self.gyro_stamps(self.value_times)
+        assert time is not None
+        delayed_values = np.interp(at, time, values)
+        if curvature is not None:
+            after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+            apart = np.maximum((at - time[after - 1]) * (time[after] - at), 0.0)
+            delayed_values -= 0.5 * apart * np.interp(at, time, curvature)
         return np.bincount(self.point_index, delayed_values) / np.bincount(self.point_index)
 
     def span_integrals(self, rate: Array) -> Array:
@@ -286,7 +297,8 @@ class Spans:
         rate = np.broadcast_to(rate, self.log.time.shape)
         whole, in_motion = (integrate_with_curvature(self.log.time, each)
                             for each in (rate, rate * self.is_in_motion))
-        return self.is_measured * np.append(np.diff(self.point_means(in_motion)),
+        bend = np.gradient(rate * self.is_in_motion, self.log.time)
+        return self.is_measured * np.append(np.diff(self.point_means(in_motion, bend)),
                                             np.diff(whole[self.rests])[:, 0])
 
     def span_changes(self, values: Array) -> Array:
@@ -322,6 +334,11 @@ class Spans:
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
+        if cause.cause == 'reference_smoothing':
+            # by the likeliest heading, as the noise of the gyro is in the observations too
+            length = float(np.median(np.diff(self.time)))
+            after, before = (np.interp(time + way, time, heading) for way in (length, -length))
+            return self.span_changes((after - 2.0 * heading + before) / length ** 2)[:, None]
         if cause.cause == 'reference_drift':
             return self.span_changes(self.time_in_motion)[:, None]
         if cause.cause == 'reference_slip':
@@ -358,7 +375,8 @@ class Spans:
         turned = integrate_with_curvature(self.log.time, rate)
         # the heading of the reference, between its points that of the gyro
         at = (1.0 + moved.clock_rate) * self.log.time - moved.delay
-        heading_change: Array = self.heading - moved.point_means(turned)
+        heading_change: Array = self.heading - moved.point_means(
+            turned, np.gradient(rate, self.log.time))
         if self.treatment.is_fine:
             heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
@@ -434,19 +452,26 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
-        log = drop_held_values(log)
+        log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None
     if prior is not None:
         scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
         treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
     time, measured = log.time - log.time[0], log.output
     output, white = bridge_gaps(measured), white_noise_deviation(measured)
-    reference, noisier = log.reference_heading, 0.0
+    reference, noisier, rate = log.reference_heading, 0.0, log.reference_rate
+    measured_rows, is_slow = np.isfinite(measured), False
     if reference is None:
-        assert log.reference_rate is not None
-        noisier = rate_noise_share(log)
-        white = math.hypot(white, white_noise_deviation(log.reference_rate))
-        reference = integrate_with_curvature(time, bridge_gaps(log.reference_rate))
+        assert rate is not None
+        noisier, is_slow = rate_noise_share(log), np.isfinite(rate).mean() < 0.5
+        filled = interpolate_by_splines(time, rate)
+        measured_rows &= np.isfinite(filled)
+        reference = integrate_with_curvature(time, bridge_gaps(filled))
+        if is_slow:  # its integral errs by what happens between its values
+            reference = np.where(np.isfinite(rate), reference, np.nan)
+            treatment = replace(treatment, errs_as_heading=True)
+        else:
+            white = math.hypot(white, white_noise_deviation(rate))
     given = reference if given is None else given
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     walks = [white * math.sqrt(float(np.median(np.diff(time))))]
@@ -486,7 +511,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
-                 find_holes(time[np.isfinite(measured)], length),
+                 find_holes(time[measured_rows], length),
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
 
 

@@ -73,6 +73,9 @@ _OTHER_CAUSES = (
      CATALOGUE['heading_sensitivity'].experiment),
     ('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
      'time reference', 'rate', _LOG_EXPERIMENTS['scale_factor_error']),
+    ('reference_smoothing', 'The reference was smoothed more than the gyro, by a filter without a '
+     'delay, as motion capture is; or less, where it is negative.', 's²', 'reference',
+     'time reference', 'rate_change', 'give the reference as it was before the filter'),
     ('reference_slip', 'The reference slipped: it shows a rotation that the gyro did not make.',
      'rad', 'reference', 'time reference', 'rate_change', ''),
     ('reference_drift', 'The reference drifts in motion, and stands at rest, as odometry does.',

@@ -30,13 +30,14 @@ from typing import NamedTuple
 from gyro_calibration.calibration.dwells import (
     few_values_remedy,
     find_lost_reference,
-    interpolate_reference,
     require_output,
 )
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.reference_noise import (
     heading_difference,
+    interpolate_by_splines,
     is_course,
+    is_smoothed,
     MAX_ROUNDING_RATIO,
     MAX_ROUNDING_STEP,
     rate_noise_share,
@@ -320,10 +321,10 @@ def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
 
 
 def resample_reference(log: Log) -> Log:
-    """Return a log with references interpolated if they have a lower rate than the output."""
+    """Return a log with references on splines if they have a lower rate than the output."""
     if log.time is None:
         return log
-    rate, heading = (None if values is None else interpolate_reference(log.time, values)
+    rate, heading = (None if values is None else interpolate_by_splines(log.time, values)
                      for values in (log.reference_rate, log.reference_heading))
     return replace(log, reference_rate=rate, reference_heading=heading)
 
@@ -502,7 +503,13 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     reference = reference_angle(log)
     by_length = compare_headings(log, reference)
     if not by_length:
-        yield Gate('motion', None, 'the reference turns too little to compare it with the gyro')
+        still = replace(log, reference_rate=None, reference_heading=None, moving=None)
+        differs = not np.ptp(reference) > 0.0 and not is_at_rest(still)
+        evidence, remedy = (('the reference stands, and the gyro turns',
+                             'give a reference of this motion') if differs
+                            else ('the reference turns too little to compare it with the gyro',
+                                  ''))
+        yield Gate('motion', False if differs else None, evidence, remedy)
         return
     best = max(by_length, key=lambda each: each.coherence)
     if best.coherence < _MIN_MOTION_COHERENCE:
@@ -737,18 +744,16 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
-                and rate_noise_share(log) > _MAX_RATE_NOISE_SHARE)
+                and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE or _errs_in_between(log)
+                     or is_smoothed(replace(log, reference_heading=None))))
     if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     interval = float(np.median(np.diff(log.time)))
-    if _is_interpolated(log):
-        # the exact motion between its values is not known, and odometry adds up its errors: more
-        # than half of the variance of the difference in a second is then not of the gyro
-        walk = white_noise_deviation(log.output) * math.sqrt(interval)
-        known = np.isfinite(log.reference_heading).mean()
-        if known < 0.5 or errors.total_walk ** 2 > 2.0 * walk ** 2:
-            return True
+    # the exact motion between its values is not known, or differs
+    if np.isfinite(log.reference_heading).mean() < 0.5 or step == 0.0 and (
+            is_smoothed(replace(log, reference_rate=None))):
+        return True
     # the rounding error of an encoder does not show while its shaft rests
     rounding = step / math.sqrt(12.0)
     rate_rounding = math.sqrt(2.0) * rounding / interval
@@ -761,23 +766,24 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
             or errors.constant_error > MAX_ROUNDING_RATIO * rounding)
 
 
-def _is_interpolated(log: Log) -> bool:
+def _errs_in_between(log: Log) -> bool:
     """
-    Tell whether a heading has its values less often than the gyro, and lies on lines in between.
+    Tell whether the gyro differs from a slow reference rate more between its values than at them.
 
-    In motion most values are on the line through their neighbours, and corners between two
-    straight parts come more often than once in a second, unlike those of rates that are held.
+    The mean squares of the differences are compared, where both are interpolated by splines.
 
     """
-    assert log.reference_heading is not None and log.time is not None
-    known = np.isfinite(log.reference_heading)
-    if known.mean() < 0.5:
-        return True
-    step = np.diff(log.reference_heading[known])
-    moves = np.abs(step[1:]) > 0.0
-    if not moves.any():
-        return False
-    corner = np.abs(np.diff(step)) > 1e-3 * np.median(np.abs(step[1:][moves]))
-    alone = corner[1:-1] & ~corner[:-2] & ~corner[2:] & moves[1:-1]
-    duration = moves.mean() * float(np.ptp(log.time[known]))
-    return bool(corner[moves].mean() < 0.5 and alone.sum() > duration)
+    rate, filled = log.reference_rate, resample_reference(log).reference_rate
+    assert log.time is not None and log.output is not None
+    assert rate is not None and filled is not None
+    rows = np.flatnonzero(np.isfinite(rate))
+    middle = (rows[1:] + rows[:-1]) // 2
+    known = np.isfinite(filled) & np.isfinite(log.output)
+    columns = np.column_stack([np.ones(len(filled)), filled, np.gradient(filled, log.time)])
+    known &= np.isfinite(columns).all(axis=1)
+    values = np.linalg.lstsq(columns[known], log.output[known], rcond=None)[0]
+    squares = (log.output - columns @ values) ** 2
+    more = squares[middle] - 0.5 * (squares[rows[1:]] + squares[rows[:-1]])
+    more = more[np.isfinite(more) & (middle > rows[:-1])]
+    return bool(len(more) > 1 and more.mean() > NORMAL_QUANTILE_975 * more.std()
+                / math.sqrt(len(more)))

@@ -555,15 +555,17 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
     fastest = float(np.abs(fit.spans.channels.rate).max())
     terms += [CauseTerm('clock_rate'),
               *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
-    return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
+    unseen = ({'reference_once_per_rev', 'reference_smoothing'} if not fine
+              else {'reference_smoothing'} if fit.spans.uses_code_changes else ())
+    return [each for each in terms if each.cause not in unseen
             and not (fit.lacks_turns and _follows_the_rate(each.cause))]
 
 
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
-    return (cause in ('reference_once_per_rev', 'clock_rate') or effect is not None
-            and 'rate' in effect.inputs)
+    own = ('reference_once_per_rev', 'reference_smoothing', 'clock_rate')
+    return cause in own or effect is not None and 'rate' in effect.inputs
 
 
 def search_causes(fit: SpanFit, false_alarm_rate: float,
