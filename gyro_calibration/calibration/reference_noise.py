@@ -313,12 +313,15 @@ def is_smoothed(log: Log) -> bool:
     off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag] for each in (
         heading - turned, heading, rate, np.gradient(rate, log.time)))
     columns = np.column_stack(motions)
-    columns = columns / (np.sqrt(np.sum(columns ** 2, axis=0)) + 1e-300)
+    size = np.sqrt(np.sum(columns ** 2, axis=0)) + 1e-300
+    columns = columns / size
     inverse = np.linalg.pinv(columns.T @ columns)
     values = inverse @ columns.T @ off
     # second differences of a random walk over a lag are correlated over 1.5 lags
     variance = 1.5 * lag * inverse[2, 2] * float(np.mean((off - columns @ values) ** 2))
-    return bool(values[2] > _DETECTION_SIGMAS * math.sqrt(variance))
+    # a moving average over a sample is within the accuracy of the derivatives
+    least = size[2] * float(np.median(np.diff(log.time))) ** 2 / 24.0
+    return bool(values[2] > max(_DETECTION_SIGMAS * math.sqrt(variance), least))
 
 
 def rate_noise_share(log: Log) -> float:

@@ -111,8 +111,6 @@ _REFERENCE_EFFECTS: Mapping[str, Callable[..., Sequence[Array]]] = {
     'reference_once_per_rev': lambda each: (
         -each.channels.rate * np.sin(each.channels.heading),
         -each.channels.rate * np.cos(each.channels.heading)),
-    'reference_smoothing': lambda each: (
-        -np.gradient(np.gradient(each.channels.rate, each.channels.time), each.channels.time),),
     'reference_slip': lambda each, width, *moments: tuple(
         -gaussian_pulse(each.channels.time, moment, width) for moment in moments)}
 #: Causes whose columns do not depend smoothly on their shapes.
@@ -221,7 +219,7 @@ def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
     if moves:
         yield from ((name, ()) for name in (
             'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
-            'heading_sensitivity', 'reference_once_per_rev', 'reference_smoothing'))
+            'heading_sensitivity', 'reference_once_per_rev'))
         if 'temperature' in has:
             yield 'scale_factor_temperature', (middle,)
 

@@ -554,10 +554,10 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
                   for name in ('bias_step', 'reference_slip')]
     fastest = float(np.abs(fit.spans.channels.rate).max())
     terms += [CauseTerm('clock_rate'),
-              *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
-    unseen = ({'reference_once_per_rev', 'reference_smoothing'} if not fine
-              else {'reference_smoothing'} if fit.spans.uses_code_changes else ())
-    return [each for each in terms if each.cause not in unseen
+              *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0),
+              # the codes of an encoder are never smoothed
+              *[CauseTerm('reference_smoothing')] * (fine and not fit.spans.uses_code_changes)]
+    return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
             and not (fit.lacks_turns and _follows_the_rate(each.cause))]
 
 
