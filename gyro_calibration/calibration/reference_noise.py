@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.heading.integration import integrate_with_curvature
-from gyro_calibration.logs.log import Array, Log, Mask
+from gyro_calibration.logs.log import Array, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps,
     find_runs,
@@ -95,7 +95,7 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     is_held = usual is not None
     if usual is None:
         at, own = _find_corners(time, values, step)
-        usual = _even_interval(np.diff(at), sample)
+        usual = _even_interval(np.diff(at), sample, are_all_shown=True)
     if usual is None:
         return None
     if is_held and not step > MAX_ROUNDING_STEP:
@@ -114,21 +114,26 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     return OwnInstants(every, all_values, usual, is_held)
 
 
-def _even_interval(gaps: Array, sample: float) -> float | None:
-    """Return the usual interval of instants, s, some of which may be hidden; None if uneven."""
+def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> float | None:
+    """
+    Return the usual interval of instants, s, some of which may be hidden; None if uneven.
+
+    In a motion that is calculated, of steady rates and ramps, only every second gap is the usual.
+
+    """
     if len(gaps) < _MIN_INSTANTS or np.quantile(gaps, 0.1) < 1.5 * sample:
         return None
     usual = float(np.median(gaps))
     single = np.abs(gaps - usual) <= 1.01 * sample
     # an instant with the same value, or on the same line, does not show
-    several = np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual
+    several = (np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual) & (not are_all_shown)
     return float(gaps[single].mean()) if np.mean(single | several) > 0.8 else None
 
 
 def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array]:
     """Return times and values of the corners at which straight lines between samples meet."""
     slope = np.diff(values) / np.diff(time)
-    usual = float(np.median(np.abs(slope[slope != 0.0]))) if slope.any() else 0.0
+    usual = float(np.mean(np.abs(slope)))
     rounding = 2.0 * step / float(np.diff(time).min()) if step < MAX_ROUNDING_STEP else 0.0
     runs = find_runs(np.abs(np.diff(slope)) <= max(_MAX_SLOPE_CHANGE * usual, rounding))
     first, last = np.array([(run.start, run.stop + 1) for run in runs],
@@ -182,6 +187,20 @@ def keep_own_instants(log: Log) -> tuple[Log, float | None]:
                else replace(log, reference_heading=own))
         interval = found.interval
     return log, interval
+
+
+def errs_in_between(log: Log, rate: Array, rows: NDArray[np.intp]) -> bool:
+    """Tell whether the gyro differs from a rate, (n,), more between some rows than at them."""
+    assert log.time is not None and log.output is not None
+    middle = (rows[1:] + rows[:-1]) // 2
+    columns = np.column_stack([np.ones(len(rate)), rate, np.gradient(rate, log.time)])
+    known = np.isfinite(log.output) & np.isfinite(columns).all(axis=1)
+    values = np.linalg.lstsq(columns[known], log.output[known], rcond=None)[0]
+    squares = (log.output - columns @ values) ** 2
+    more = squares[middle] - 0.5 * (squares[rows[1:]] + squares[rows[:-1]])
+    more = more[np.isfinite(more) & (middle > rows[:-1])]
+    return bool(len(more) > 1 and more.mean() > NORMAL_QUANTILE_975 * more.std()
+                / math.sqrt(len(more)))
 
 
 def interpolate_by_splines(time: Array, values: Array) -> Array:
@@ -401,9 +420,9 @@ def drop_repeated_headings(log: Log) -> tuple[Log, tuple[float, float, float] | 
     Also begin and end of the longest of these stretches, s, and how far the gyro turns in it, rad;
     None without one. The gyro turns where its heading deviates from a straight line, which may be
     its bias, by more than a random walk does (Brownian bridge, at 1 %), and the error of the
-    reference and its step; or where it changes beyond its usual bias by that, and the reference
-    then jumps rather by what the gyro turned than not at all. The random walk is that of the
-    difference to the reference elsewhere.
+    reference and its step; or where it changes beyond its usual bias by that. The reference must
+    then jump rather by what the gyro turned than not at all: a bias may drift in a rest. The
+    random walk is that of the difference to the reference elsewhere.
 
     """
     heading = log.reference_heading
@@ -435,7 +454,7 @@ def drop_repeated_headings(log: Log) -> tuple[Log, tuple[float, float, float] | 
                                + 2.0 * usual.constant_error)
         unseen = own[-1] - bias * (end - begin)
         jump = heading[after] - heading[rows[-1]] - (turned[after] - turned[rows[-1]])
-        if np.abs(off).max() > most or abs(unseen) > most and abs(jump - unseen) < abs(jump):
+        if max(np.abs(off).max(), abs(unseen)) > most and abs(jump - unseen) < abs(jump):
             kept[rows[1:]] = np.nan
             lost.append((float(begin), float(end), float(np.ptp(own))))
     if not lost:

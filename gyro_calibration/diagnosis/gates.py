@@ -34,6 +34,7 @@ from gyro_calibration.calibration.dwells import (
 )
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.reference_noise import (
+    errs_in_between,
     heading_difference,
     interpolate_by_splines,
     is_course,
@@ -744,7 +745,9 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
-                and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE or _errs_in_between(log)
+                and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE
+                     or errs_in_between(log, interpolate_by_splines(log.time, log.reference_rate),
+                                        np.flatnonzero(np.isfinite(log.reference_rate)))
                      or is_smoothed(replace(log, reference_heading=None))))
     if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
         return True
@@ -764,26 +767,3 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     return (reference.kind != 'encoder' or step > _FINE_ENCODER_STEP
             or errors.constant_error > MAX_ROUNDING_RATIO * rounding)
-
-
-def _errs_in_between(log: Log) -> bool:
-    """
-    Tell whether the gyro differs from a slow reference rate more between its values than at them.
-
-    The mean squares of the differences are compared, where both are interpolated by splines.
-
-    """
-    rate, filled = log.reference_rate, resample_reference(log).reference_rate
-    assert log.time is not None and log.output is not None
-    assert rate is not None and filled is not None
-    rows = np.flatnonzero(np.isfinite(rate))
-    middle = (rows[1:] + rows[:-1]) // 2
-    known = np.isfinite(filled) & np.isfinite(log.output)
-    columns = np.column_stack([np.ones(len(filled)), filled, np.gradient(filled, log.time)])
-    known &= np.isfinite(columns).all(axis=1)
-    values = np.linalg.lstsq(columns[known], log.output[known], rcond=None)[0]
-    squares = (log.output - columns @ values) ** 2
-    more = squares[middle] - 0.5 * (squares[rows[1:]] + squares[rows[:-1]])
-    more = more[np.isfinite(more) & (middle > rows[:-1])]
-    return bool(len(more) > 1 and more.mean() > NORMAL_QUANTILE_975 * more.std()
-                / math.sqrt(len(more)))
