@@ -182,7 +182,7 @@ def keep_own_instants(log: Log) -> tuple[Log, float | None]:
         rows = known[after - (at - stamps[after - 1] < stamps[after] - at)]
         own = np.full(len(log), np.nan)
         own[rows] = (found.values[inside] if np.isin(at, stamps).all()
-                     else CubicSpline(at, found.values[inside])(log.time[rows]))
+                     else CubicSpline(found.time, found.values)(log.time[rows]))
         log = (replace(log, reference_rate=own) if name == 'reference_rate'
                else replace(log, reference_heading=own))
         interval = found.interval

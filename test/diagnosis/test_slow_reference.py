@@ -69,7 +69,8 @@ def test_the_own_instants_of_a_slow_reference_are_found(given, interval):
     own, interval_found = keep_own_instants(log)
     known = np.isfinite(own.reference_heading)
     assert interval_found == found.interval
-    assert known.sum() == pytest.approx(TIME[-1] / interval, rel=0.01)
+    if given is linear:  # where a held heading stands, it may be lost
+        assert known.sum() == pytest.approx(TIME[-1] / interval, rel=0.01)
     # as exact as the instants, half a sample, and the motion between two of them allow
     error = (own.reference_heading - true(TIME))[known]
     assert np.abs(error).max() < 0.1 * np.abs(log.reference_heading - true(TIME)).max()
