@@ -126,7 +126,9 @@ def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> f
     usual = float(np.median(gaps))
     single = np.abs(gaps - usual) <= 1.01 * sample
     # an instant with the same value, or on the same line, does not show
-    several = (np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual) & (not are_all_shown)
+    several = np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual
+    if are_all_shown and np.mean(single) < 2.0 / 3.0:
+        return None
     return float(gaps[single].mean()) if np.mean(single | several) > 0.8 else None
 
 
