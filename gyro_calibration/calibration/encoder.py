@@ -57,8 +57,8 @@ from gyro_calibration.calibration.noise_grid import (
     TridiagonalMatrix,
 )
 from gyro_calibration.calibration.reference_noise import (
-    drop_held_values,
     is_course,
+    keep_own_instants,
     MAX_ROUNDING_STEP,
     rate_noise_share,
 )
@@ -279,7 +279,7 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     if log.time is None or log.output is None or log.reference_heading is None:
         return log, []
     time, output = log.time, bridge_gaps(log.output)
-    heading = np.asarray(drop_held_values(log).reference_heading)
+    heading = np.asarray(keep_own_instants(log)[0].reference_heading)
     known = np.flatnonzero(np.isfinite(heading))
     apart, turned = np.diff(time[known]), np.diff(heading[known])
     difference = turned - np.diff(integrate(time, output)[known])

@@ -54,9 +54,10 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
 )
 from gyro_calibration.calibration.reference_noise import (
-    drop_held_values,
     find_rests,
     heading_difference,
+    interpolate_by_splines,
+    keep_own_instants,
     MAX_ROUNDING_STEP,
     rate_noise_share,
 )
@@ -443,19 +444,26 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
-        log = drop_held_values(log)
+        log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None
     if prior is not None:
         scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
         treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
     time, measured = log.time - log.time[0], log.output
     output, white = bridge_gaps(measured), white_noise_deviation(measured)
-    reference, noisier = log.reference_heading, 0.0
+    reference, noisier, rate = log.reference_heading, 0.0, log.reference_rate
+    measured_rows, is_slow = np.isfinite(measured), False
     if reference is None:
-        assert log.reference_rate is not None
-        noisier = rate_noise_share(log)
-        white = math.hypot(white, white_noise_deviation(log.reference_rate))
-        reference = integrate_with_curvature(time, bridge_gaps(log.reference_rate))
+        assert rate is not None
+        noisier, is_slow = rate_noise_share(log), np.isfinite(rate).mean() < 0.5
+        filled = interpolate_by_splines(time, rate)
+        measured_rows &= np.isfinite(filled)
+        reference = integrate_with_curvature(time, bridge_gaps(filled))
+        if is_slow:  # its integral errs by what happens between its values
+            reference = np.where(np.isfinite(rate), reference, np.nan)
+            treatment = replace(treatment, errs_as_heading=True)
+        else:
+            white = math.hypot(white, white_noise_deviation(rate))
     given = reference if given is None else given
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     walks = [white * math.sqrt(float(np.median(np.diff(time))))]
@@ -495,7 +503,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
-                 find_holes(time[np.isfinite(measured)], length),
+                 find_holes(time[measured_rows], length),
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
 
 

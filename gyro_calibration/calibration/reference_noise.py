@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.heading.integration import integrate_with_curvature
-from gyro_calibration.logs.log import Array, Log, Mask
+from gyro_calibration.logs.log import Array, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps,
-    encoder_step,
     find_runs,
     quantization_step,
     white_noise_deviation,
@@ -28,6 +28,7 @@ from gyro_calibration.logs.quality import (
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_erosion, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
@@ -51,36 +52,164 @@ MIN_LOST_SHARE, MAX_ROUNDING_STEP, MAX_ROUNDING_RATIO = 0.003, 2e-4, 1.5
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
 #: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
 _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
+#: Chance by which a heading that rests is taken for one that is repeated in motion.
+_DETECTION_LEVEL = 0.01
+#: Largest change of the slope on a straight line as a share of the usual one, and least number of
+#: instants of a slow reference.
+_MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
 
 
-def update_interval(time: Array, values: Array, step: float) -> float | None:
-    """Return the interval between updates of a held reference, s; None if each sample is new."""
+class OwnInstants(NamedTuple):
+    """Where a slow reference has its own values."""
+
+    time: Array  # s, shape (k,)
+    values: Array  # rad or rad/s, shape (k,)
+    interval: float  # the usual one, s
+    is_held: bool  # in between; else interpolated linearly
+
+
+def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
+    """
+    Return where a slow reference has its own values, or None if it has one in each sample.
+
+    Values that are held change in single samples. Straight lines between values meet at corners,
+    which may lie between two samples. Both must come at even intervals.
+
+    Parameters
+    ----------
+    time, values : of the samples, s, and rad or rad/s without nan, shape (n,)
+
+    """
+    step, sample = quantization_step(values), float(np.median(np.diff(time)))
     change = np.diff(values)
-    renewed = np.flatnonzero(np.isfinite(change) & (change != 0.0))
-    # Changes of less than a step may be lost.
-    fast = np.abs(change[renewed[1:]]) > 2.5 * step
-    gaps = np.diff(renewed)[fast]
-    if len(gaps) < 20 or np.quantile(gaps, 0.1) < 2.0:
+    renewed = 1 + np.flatnonzero(change)
+    # changes of less than a step may be lost
+    fast = np.abs(change[renewed[1:] - 1]) > 2.5 * step
+    at, own = time[renewed], values[renewed]
+    usual = _even_interval(np.diff(at)[fast], sample)
+    is_held = usual is not None
+    if usual is None:
+        at, own = _find_corners(time, values, step)
+        usual = _even_interval(np.diff(at), sample, are_all_shown=True)
+    if usual is None:
         return None
-    usual = int(np.median(gaps))
-    one = np.abs(gaps - usual) <= 1
-    # an update with the same value does not show
+    if is_held and not step > MAX_ROUNDING_STEP:
+        # each was taken since the sample before; where all agree, at even intervals
+        number = np.cumsum(np.rint(np.diff(at, prepend=at[0]) / usual))
+        even = np.polyval(np.polyfit(number, at, 1), number)
+        at = (even if np.abs(at - even).max() <= sample else at) - 0.5 * sample
+    between = [np.linspace(begin, end, max(round((end - begin) / usual), 1), endpoint=False)
+               for begin, end in zip(at[:-1], at[1:])]
+    before, after = (usual * np.arange(1, int(max(length, 0.0) / usual) + 1)
+                     for length in (at[0] - time[0], time[-1] - at[-1]))
+    every = np.concatenate([at[0] - before[::-1], *between, at[-1:], at[-1] + after])
+    all_values = (own[np.maximum(np.searchsorted(at, every, 'right') - 1, 0)] if is_held
+                  else np.interp(every, time, values))
+    all_values[np.searchsorted(every, at)] = own
+    return OwnInstants(every, all_values, usual, is_held)
+
+
+def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> float | None:
+    """
+    Return the usual interval of instants, s, some of which may be hidden; None if uneven.
+
+    In a motion that is calculated, of steady rates and ramps, only every second gap is the usual.
+
+    """
+    if len(gaps) < _MIN_INSTANTS or np.quantile(gaps, 0.1) < 1.5 * sample:
+        return None
+    usual = float(np.median(gaps))
+    single = np.abs(gaps - usual) <= 1.01 * sample
+    # an instant with the same value, or on the same line, does not show
     several = np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual
-    return (float(gaps[one].mean() * np.median(np.diff(time)))
-            if np.mean(one | several) > 0.8 else None)
+    if are_all_shown and np.mean(single) < 2.0 / 3.0:
+        return None
+    return float(gaps[single].mean()) if np.mean(single | several) > 0.8 else None
 
 
-def drop_held_values(log: Log) -> Log:
-    """Return a log whose heading is known where it changes, if it is held between updates."""
-    heading = log.reference_heading
-    if log.time is None or heading is None or update_interval(
-            log.time, heading, encoder_step(heading)) is None:
-        return log
-    return replace(log, reference_heading=np.where(np.diff(heading, prepend=np.nan) == 0.0, np.nan,
-                                                   heading))
+def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array]:
+    """Return times and values of the corners at which straight lines between samples meet."""
+    slope = np.diff(values) / np.diff(time)
+    usual = float(np.mean(np.abs(slope)))
+    rounding = 2.0 * step / float(np.diff(time).min()) if step < MAX_ROUNDING_STEP else 0.0
+    runs = find_runs(np.abs(np.diff(slope)) <= max(_MAX_SLOPE_CHANGE * usual, rounding))
+    first, last = np.array([(run.start, run.stop + 1) for run in runs],
+                           dtype=np.intp).reshape(-1, 2).T
+    # two corners within two samples each leave one interval in between on a line of its own
+    alone = 1 + last[:-1][first[1:] - last[:-1] == 3]
+    first, last = np.sort(np.append(first, alone))[1:], np.sort(np.append(last, alone + 1))[:-1]
+    meet = first - last <= 1
+    first, last = first[meet], last[meet]
+    before, after = slope[last - 1], slope[np.minimum(first, len(slope) - 1)]
+    crossing = before != after
+    first, last, before, after = (each[crossing] for each in (first, last, before, after))
+    ahead = (values[first] - values[last] - after * (time[first] - time[last])) / (before - after)
+    ahead = np.clip(ahead, 0.0, time[first] - time[last])
+    return time[last] + ahead, values[last] + before * ahead
+
+
+def keep_own_instants(log: Log) -> tuple[Log, float | None]:
+    """
+    Return a log whose reference is known at its own instants alone, and their interval, s.
+
+    It is nan in between. Where instants lie between samples, the samples next to them get the
+    values of a cubic spline. What is steady for longer than `_COMPARISON_SPAN` is a motion, except
+    a heading that is held. The interval is None where the reference is not slow.
+
+    """
+    interval = None
+    for name in ('reference_heading', 'reference_rate'):
+        given = getattr(log, name)
+        known = np.flatnonzero(np.isfinite([] if given is None else given))
+        if log.time is None or len(known) <= _MIN_INSTANTS:
+            continue
+        stamps = log.time[known]
+        found = find_own_instants(stamps, given[known])
+        if found is None:
+            continue
+        if found.interval > _COMPARISON_SPAN and not (
+                found.is_held and name == 'reference_heading'):
+            continue
+        # not those in gaps
+        after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
+        inside = stamps[after] - stamps[after - 1] < found.interval
+        if found.is_held and name == 'reference_heading':  # it may be lost where it stands
+            inside &= np.diff(found.values, prepend=np.nan) != 0.0
+        at, after = found.time[inside], after[inside]
+        rows = known[after - (at - stamps[after - 1] < stamps[after] - at)]
+        own = np.full(len(log), np.nan)
+        own[rows] = (found.values[inside] if np.isin(at, stamps).all()
+                     else CubicSpline(found.time, found.values)(log.time[rows]))
+        log = (replace(log, reference_rate=own) if name == 'reference_rate'
+               else replace(log, reference_heading=own))
+        interval = found.interval
+    return log, interval
+
+
+def errs_in_between(log: Log, rate: Array, rows: NDArray[np.intp]) -> bool:
+    """Tell whether the gyro differs from a rate, (n,), more between some rows than at them."""
+    assert log.time is not None and log.output is not None
+    middle = (rows[1:] + rows[:-1]) // 2
+    columns = np.column_stack([np.ones(len(rate)), rate, np.gradient(rate, log.time)])
+    known = np.isfinite(log.output) & np.isfinite(columns).all(axis=1)
+    values = np.linalg.lstsq(columns[known], log.output[known], rcond=None)[0]
+    squares = (log.output - columns @ values) ** 2
+    more = squares[middle] - 0.5 * (squares[rows[1:]] + squares[rows[:-1]])
+    more = more[np.isfinite(more) & (middle > rows[:-1])]
+    return bool(len(more) > 1 and more.mean() > NORMAL_QUANTILE_975 * more.std()
+                / math.sqrt(len(more)))
+
+
+def interpolate_by_splines(time: Array, values: Array) -> Array:
+    """Return a slow reference at each sample, on cubic splines; nan where it is lost."""
+    known = np.isfinite(values)
+    if known.all() or known.sum() < 2:
+        return values
+    return np.where(find_lost_reference(known), np.nan,
+                    CubicSpline(time[known], values[known], extrapolate=False)(time))
 
 
 def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np.intp], Mask]:
@@ -155,17 +284,21 @@ def heading_difference(log: Log) -> HeadingDifference:
     beyond its time constant.
 
     """
-    assert log.time is not None and log.output is not None
-    interval, output = float(np.median(np.diff(log.time))), bridge_gaps(log.output)
-    turned, heading = integrate_with_curvature(log.time, output), log.reference_heading
-    slope = np.gradient(output, log.time)
-    assert heading is not None
+    assert log.time is not None and log.output is not None and log.reference_heading is not None
+    output = bridge_gaps(log.output)
+    own = np.isfinite(log.reference_heading)
+    if own.sum() < 2 * _BLOCK_SAMPLES:
+        return HeadingDifference(0.0, 0.0)
+    turned, slope, output, heading, time = (each[own] for each in (
+        integrate_with_curvature(log.time, output), np.gradient(output, log.time), output,
+        log.reference_heading, log.time))
+    interval = float(np.median(np.diff(time)))
     longest = max(round(_COMPARISON_SPAN / interval), 4)
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
         off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
                          for each in (heading - turned, turned, output, slope))
-        known = np.isfinite(off)
+        known = np.abs(time[2 * lag:] - time[:-2 * lag] - 2.0 * lag * interval) < interval
         if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
             columns = np.column_stack(motions)[known]
             left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
@@ -174,7 +307,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     whole = variance.pop(1.0, 0.0)
     error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
                         for part, each in variance.items())])
-    return HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
+    return HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * longest * interval)))
 
 
 def rate_noise_share(log: Log) -> float:
@@ -233,7 +366,7 @@ def _select_quietest(fast: Array, block: int) -> Mask:
 
 def is_course(log: Log) -> bool:
     """Tell whether a heading is lost at times, as a course at low speed, and errs like one."""
-    log = drop_held_values(log)
+    log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
     lost = float(find_lost_reference(known).mean())
@@ -250,3 +383,52 @@ def is_course(log: Log) -> bool:
     rounding = quantization_step(log.reference_heading[known]) / 2.0
     return heading_difference(log).total_walk > max(
         larger * walk, MAX_ROUNDING_RATIO * rounding) > 0.0
+
+
+def drop_repeated_headings(log: Log) -> tuple[Log, tuple[float, float, float] | None]:
+    """
+    Return a log without headings that are repeated while the gyro turns, as of a lost marker.
+
+    Also begin and end of the longest of these stretches, s, and how far the gyro turns in it, rad;
+    None without one. The gyro turns where its heading deviates from a straight line, which may be
+    its bias, by more than a random walk does (Brownian bridge, at 1 %), and the error of the
+    reference and its step; or where it changes beyond its usual bias by that. The reference must
+    then jump rather by what the gyro turned than not at all: a bias may drift in a rest. The
+    random walk is that of the difference to the reference elsewhere.
+
+    """
+    heading = log.reference_heading
+    known = np.flatnonzero(np.isfinite([] if heading is None else heading))
+    if log.time is None or log.output is None or heading is None or len(known) < _BLOCK_SAMPLES:
+        return log, None
+    runs = [known[run.start:run.stop + 1] for run in find_runs(np.diff(heading[known]) == 0.0)
+            if run.stop > run.start + 1]
+    if not runs:
+        return log, None
+    moving = heading.copy()
+    moving[np.concatenate(runs)] = np.nan
+    usual = heading_difference(replace(log, reference_heading=moving))
+    if not usual.total_walk > 0.0:
+        return log, None
+    bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / _DETECTION_LEVEL))
+    step = quantization_step(heading[known])
+    turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
+    seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
+    bias = float(np.median(np.diff((turned - heading)[seconds]) / np.diff(log.time[seconds])))
+    following = np.append(known, known[-1])[
+        np.searchsorted(known, [rows[-1] for rows in runs]) + 1]
+    kept, lost = heading.copy(), []
+    for rows, after in zip(runs, following):
+        begin, end = log.time[rows[[0, -1]]]
+        own = turned[rows[0]:rows[-1] + 1] - turned[rows[0]]
+        off = own - own[-1] * (log.time[rows[0]:rows[-1] + 1] - begin) / (end - begin)
+        most = step + bound * (usual.total_walk * math.sqrt(end - begin)
+                               + 2.0 * usual.constant_error)
+        unseen = own[-1] - bias * (end - begin)
+        jump = heading[after] - heading[rows[-1]] - (turned[after] - turned[rows[-1]])
+        if max(np.abs(off).max(), abs(unseen)) > most and abs(jump - unseen) < abs(jump):
+            kept[rows[1:]] = np.nan
+            lost.append((float(begin), float(end), float(np.ptp(own))))
+    if not lost:
+        return log, None
+    return replace(log, reference_heading=kept), max(lost, key=lambda each: each[1] - each[0])

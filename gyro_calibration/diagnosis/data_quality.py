@@ -30,7 +30,6 @@ import math
 from typing import Any
 
 from gyro_calibration.calibration.dwells import require_output
-from gyro_calibration.calibration.reference_noise import update_interval
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import (
@@ -419,8 +418,6 @@ class DataQuality:
     # quantization step of the output, rad/s after the factor; 0 if it does not matter
     output_step: float = 0.0
     heading_step: float = 0.0  # quantization step of the reference heading, rad; 0 without one
-    # of a reference that is held in between, s; None if it is new in each sample
-    update_interval: float | None = None
 
 
 def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
@@ -457,14 +454,10 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     if log.time is None:
         return DataQuality(tuple(units), notes, has_output, factor)
     lost, remarks = _check_stamps(log.time, has_output)
-    heading_step, update = _reference_steps(log)
-    if update:
-        remarks.append(f'The reference is updated every {1000.0 * update:.4g} ms, and held in '
-                       'between; it is interpolated.')
     expected = (None if rate is None or line is None
                 else factor * (line.factor * rate + line.offset))
     found = DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
-                        heading_step=heading_step, update_interval=update)
+                        heading_step=_reference_step(log))
     return _check_samples(found, compare_output(output * factor, expected), model, log)
 
 
@@ -526,15 +519,11 @@ def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[st
                            stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
-def _reference_steps(log: Log) -> tuple[float, float | None]:
-    """Return the step of a reference heading, rad, and the update interval of a held one, s."""
-    assert log.time is not None
-    is_heading = log.reference_rate is None and log.reference_heading is not None
-    values = log.reference_heading if is_heading else log.reference_rate
-    if values is None or np.count_nonzero(np.isfinite(values)) < 3:
-        return 0.0, None
-    step = encoder_step(values) if is_heading else 0.0
-    return step, update_interval(log.time, values, step)
+def _reference_step(log: Log) -> float:
+    """Return the step of a reference heading, rad; 0 without one."""
+    heading = log.reference_heading if log.reference_rate is None else None
+    return (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
+            else encoder_step(heading))
 
 
 def _check_samples(found: DataQuality, comparison: OutputComparison, model: GyroModel | None,

@@ -30,12 +30,13 @@ from typing import NamedTuple
 from gyro_calibration.calibration.dwells import (
     few_values_remedy,
     find_lost_reference,
-    interpolate_reference,
     require_output,
 )
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.reference_noise import (
+    errs_in_between,
     heading_difference,
+    interpolate_by_splines,
     is_course,
     MAX_ROUNDING_RATIO,
     MAX_ROUNDING_STEP,
@@ -320,10 +321,10 @@ def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
 
 
 def resample_reference(log: Log) -> Log:
-    """Return a log with references interpolated if they have a lower rate than the output."""
+    """Return a log with references on splines if they have a lower rate than the output."""
     if log.time is None:
         return log
-    rate, heading = (None if values is None else interpolate_reference(log.time, values)
+    rate, heading = (None if values is None else interpolate_by_splines(log.time, values)
                      for values in (log.reference_rate, log.reference_heading))
     return replace(log, reference_rate=rate, reference_heading=heading)
 
@@ -508,7 +509,13 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     reference = reference_angle(log)
     by_length = compare_headings(log, reference)
     if not by_length:
-        yield Gate('motion', None, 'the reference turns too little to compare it with the gyro')
+        still = replace(log, reference_rate=None, reference_heading=None, moving=None)
+        differs = not np.ptp(reference) > 0.0 and not is_at_rest(still)
+        evidence, remedy = (('the reference stands, and the gyro turns',
+                             'give a reference of this motion') if differs
+                            else ('the reference turns too little to compare it with the gyro',
+                                  ''))
+        yield Gate('motion', False if differs else None, evidence, remedy)
         return
     best = max(by_length, key=lambda each: each.coherence)
     if best.coherence < _MIN_MOTION_COHERENCE:
@@ -752,18 +759,16 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
-                and rate_noise_share(log) > _MAX_RATE_NOISE_SHARE)
+                and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE
+                     or errs_in_between(log, interpolate_by_splines(log.time, log.reference_rate),
+                                        np.flatnonzero(np.isfinite(log.reference_rate)))))
     if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     interval = float(np.median(np.diff(log.time)))
-    if _is_interpolated(log):
-        # the exact motion between its values is not known, and odometry adds up its errors: more
-        # than half of the variance of the difference in a second is then not of the gyro
-        walk = white_noise_deviation(log.output) * math.sqrt(interval)
-        known = np.isfinite(log.reference_heading).mean()
-        if known < 0.5 or errors.total_walk ** 2 > 2.0 * walk ** 2:
-            return True
+    # the exact motion between its values is not known
+    if np.isfinite(log.reference_heading).mean() < 0.5:
+        return True
     # the rounding error of an encoder does not show while its shaft rests
     rounding = step / math.sqrt(12.0)
     rate_rounding = math.sqrt(2.0) * rounding / interval
@@ -774,25 +779,3 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     return (reference.kind != 'encoder' or step > _FINE_ENCODER_STEP
             or errors.constant_error > MAX_ROUNDING_RATIO * rounding)
-
-
-def _is_interpolated(log: Log) -> bool:
-    """
-    Tell whether a heading has its values less often than the gyro, and lies on lines in between.
-
-    In motion most values are on the line through their neighbours, and corners between two
-    straight parts come more often than once in a second, unlike those of rates that are held.
-
-    """
-    assert log.reference_heading is not None and log.time is not None
-    known = np.isfinite(log.reference_heading)
-    if known.mean() < 0.5:
-        return True
-    step = np.diff(log.reference_heading[known])
-    moves = np.abs(step[1:]) > 0.0
-    if not moves.any():
-        return False
-    corner = np.abs(np.diff(step)) > 1e-3 * np.median(np.abs(step[1:][moves]))
-    alone = corner[1:-1] & ~corner[:-2] & ~corner[2:] & moves[1:-1]
-    duration = moves.mean() * float(np.ptp(log.time[known]))
-    return bool(corner[moves].mean() < 0.5 and alone.sum() > duration)

@@ -19,6 +19,10 @@ import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
+from gyro_calibration.calibration.reference_noise import (
+    drop_repeated_headings,
+    keep_own_instants,
+)
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     common_channels,
@@ -113,7 +117,7 @@ from gyro_calibration.diagnosis.search import (
     start_search,
 )
 from gyro_calibration.diagnosis.words import format_amount
-from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
@@ -160,11 +164,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
     all_gates: list[Gate] = []
+    given = logs
+    remarks: list[str] = []
+    logs = [_use_own_values(log, remarks) for log in logs]
     for place, log in enumerate(logs):
         passed = check_gates(log, model)
         failed = mismatch_finding(passed)
         if failed is None or failed.effect != 'wrapped_heading':
-            refuse_unusable(log)
+            refuse_unusable(given[place])
         if failed is None and model is not None:
             passed = (*passed, check_model_units(log, model))
             failed = mismatch_finding(passed)
@@ -197,7 +204,23 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     if given_model is not None and found.model is model:
         # with its self-calibration separate
         found = replace(found, before=given_model, model=given_model)
-    return replace(found, logs=tuple(names), gates=tuple(all_gates))
+    return replace(found, logs=tuple(names), gates=tuple(all_gates),
+                   remarks=(*dict.fromkeys(remarks), *found.remarks))
+
+
+def _use_own_values(log: Log, remarks: list[str]) -> Log:
+    """Return a log with what its reference measured alone; add remarks on the rest."""
+    log, interval = keep_own_instants(log)
+    if interval is not None:
+        remarks.append(f'The reference has a value of its own every {1000.0 * interval:.3g} ms, '
+                       'and is held or interpolated in between; its own values alone are used.')
+    log, lost = drop_repeated_headings(log)
+    if lost is not None:
+        begin, end, turned = lost
+        remarks.append(f'The reference stands from {begin:.4g} s to {end:.4g} s, where the gyro '
+                       f'turns by {turned / DEGREE:.3g} deg, as if it were lost; it is not used '
+                       'there, nor where the same happens for a shorter time.')
+    return log
 
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
@@ -208,7 +231,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
     on_progress(None, 'replay of the model')
     replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
-                      generator, clean.update_interval, clean.heading_step, clean.output_step,
+                      generator, clean.heading_step, clean.output_step,
                       model)
                for log, clean in zip(logs, quality)]
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)

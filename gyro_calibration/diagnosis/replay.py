@@ -129,9 +129,6 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 MAX_POINTS = 50_000
 #: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
 _SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
-#: Update intervals of a held reference, and steps of its change, from which on a constant value is
-#: a standstill.
-_STANDSTILL_FACTOR = 1.5
 #: Samples next to a gap of at least as many whose rate is not used: the error of a spline is 0.13,
 #: 0.036 and 0.01 of the change of slope over the gap, which is small for shorter gaps.
 _GAP_MARGIN_SAMPLES = 4
@@ -215,20 +212,19 @@ class Replay:
 
 
 def replay(log: Log, usable: Mask, generator: np.random.Generator,
-           update_interval: float | None = None, heading_step: float = 0.0,
-           output_step: float = 0.0, model: GyroModel | None = None) -> Replay:
+           heading_step: float = 0.0, output_step: float = 0.0,
+           model: GyroModel | None = None) -> Replay:
     """
     Prepare a log for the search: its usable samples, under the model of a simulation.
 
-    Gaps are filled with noise of the generator. Steps and update interval are those of
-    `DataQuality`; no model is an ideal gyro. Raises `DataRefused` if too few samples can be used.
+    Gaps are filled with noise of the generator. Steps are those of `DataQuality`; no
+    model is an ideal gyro. Raises `DataRefused` if too few samples can be used.
 
     """
     assert log.time is not None and log.output is not None
     time = _even_time(log.time)
     prepared_log = resample_reference(replace(select_reference(log)[0], time=time))
-    reference, smooth = _reference_rates(prepared_log, time, update_interval is not None,
-                                         heading_step)
+    reference, smooth = _reference_rates(prepared_log, time, heading_step)
     kept = usable & np.isfinite(reference) & np.isfinite(log.output)
     if log.reference_rate is None:
         kept &= (~_find_corners(reference, log.output, kept,
@@ -314,17 +310,12 @@ def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> 
     return total
 
 
-def _reference_rates(log: Log, time: Array, is_held: bool,
-                     heading_step: float) -> tuple[Array, Array]:
+def _reference_rates(log: Log, time: Array, heading_step: float) -> tuple[Array, Array]:
     """Return the reference rate for the comparison, and the smoothed one for effects."""
     if log.reference_rate is not None:
-        rate = (_interpolate_updates(time, log.reference_rate, heading_step) if is_held
-                else log.reference_rate)
-        return rate, _interpolate_gaps(time, rate)
+        return log.reference_rate, _interpolate_gaps(time, log.reference_rate)
     if log.reference_heading is not None:
-        heading = (_interpolate_updates(time, log.reference_heading, heading_step) if is_held
-                   else log.reference_heading)
-        return _heading_rates(time, heading, heading_step)
+        return _heading_rates(time, log.reference_heading, heading_step)
     return np.zeros(len(time)), np.zeros(len(time))
 
 
@@ -369,26 +360,6 @@ def grid_indices(time: Array, valid: Mask) -> tuple[NDArray[np.intp], float]:
     steps = np.maximum(np.rint(np.diff(time) / interval), 1.0)
     place = np.concatenate([[0.0], np.cumsum(steps)]).astype(int)[valid]
     return place - place[0], float((time[valid][-1] - time[valid][0]) / (place[-1] - place[0]))
-
-
-def _interpolate_updates(time: Array, values: Array, step: float) -> Array:
-    """
-    Interpolate a held reference between updates, as a held value is half an interval late.
-
-    An update with the same value does not show. So a value that is constant for longer is held
-    until one update interval before the next change.
-
-    """
-    known = np.isfinite(values)
-    renewed = np.flatnonzero((np.diff(values, prepend=np.nan) != 0.0) & known)
-    update_times, update_values = time[renewed], values[renewed]
-    usual = float(np.median(np.diff(update_times)))
-    held_updates = 1 + np.flatnonzero(
-        (np.diff(update_times) > _STANDSTILL_FACTOR * usual)
-        & (np.abs(np.diff(update_values)) > _STANDSTILL_FACTOR * step))
-    update_times = np.insert(update_times, held_updates, update_times[held_updates] - usual)
-    update_values = np.insert(update_values, held_updates, update_values[held_updates - 1])
-    return np.where(known, np.interp(time, update_times, update_values), np.nan)
 
 
 def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Array, Array]:

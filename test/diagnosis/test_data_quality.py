@@ -16,11 +16,8 @@ import re
 
 from chance import fewest, most, seeded
 from diagnosed import log_of
-from gyro_calibration.diagnosis.data_quality import (
-    FALSE_ALARM_CHANCE,
-    inspect_record,
-    update_interval,
-)
+from gyro_calibration.calibration.reference_noise import keep_own_instants
+from gyro_calibration.diagnosis.data_quality import FALSE_ALARM_CHANCE, inspect_record
 from gyro_calibration.diagnosis.gates import (
     identify_unit_factor,
     is_at_rest,
@@ -370,9 +367,11 @@ def test_a_calculated_motion_has_no_encoder():
 def test_the_update_interval_of_a_held_reference_is_found(every, generator):
     log = swing(generator)
     held = log.reference_rate[np.arange(6000) // every * every]
-    interval = update_interval(log.time, held, 0.0)
+    own, interval = keep_own_instants(replace(log, reference_rate=held))
     assert interval == (None if every == 1 else pytest.approx(every * INTERVAL, rel=1e-6))
-    assert bool(inspect_record(replace(log, reference_rate=held)).remarks) == (every > 1)
+    known = np.isfinite(own.reference_rate)
+    assert (np.flatnonzero(known) % every == 0).all() and known.mean() > 0.99 / every
+    assert (own.reference_rate == log.reference_rate)[known].all()
 
 
 GOOD = swing(np.random.default_rng(1))
