@@ -58,8 +58,6 @@ MIN_TEMPERATURE_SPREAD = 1.0
 #: Minimum share of a log in dwells, as a swing is steady for short times only; and share up to
 #: which another method is proposed.
 _MIN_DWELL_SHARE, _FEW_DWELLS_SHARE = 0.05, 0.25
-#: End of the remark on such a share, for those who can choose the method.
-LIKELIHOOD_HINT = '; --method likelihood uses all of it'
 #: Duration of the blocks in which the heading is averaged, s, and how many of them show a ramp.
 _BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
 
@@ -409,7 +407,8 @@ def find_dwells(log: Log) -> Dwells:
             f'settling, in {100.0 * share:.0f} % of the log; hold each rate for longer, or use '
             '--method likelihood')
     if share <= _FEW_DWELLS_SHARE:
-        remarks.append(f'only {100.0 * share:.0f} % of the time is in dwells' + LIKELIHOOD_HINT)
+        remarks.append(f'only {100.0 * share:.0f} % of the time is in dwells; '
+                       '--method likelihood uses all of it')
     rate, output, deviation = _average(samples, dwells)
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None

@@ -206,9 +206,9 @@ class Spans:
         first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
                                       self.log.time[self.rests]]).T
         begin, end = self.holes[:, :, None].transpose(1, 0, 2)
-        outside = np.append(self.time_outside[:-1] < 0.0, np.zeros(len(self.rests), bool))
-        outside[:len(at) - 1] |= self.time_outside[1:] > 0.0
-        return np.asarray(~((begin < last) & (end > first)).any(axis=0) & ~outside)
+        covered = (self.time_outside[:-1] >= 0.0) & (self.time_outside[1:] <= 0.0)
+        return np.asarray(~((begin < last) & (end > first)).any(axis=0)
+                          & np.append(covered, np.ones(len(self.rests), dtype=bool)))
 
     @property
     def time_outside(self) -> Array:

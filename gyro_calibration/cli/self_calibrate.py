@@ -175,8 +175,7 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
              else check_rest(time[known][rest], rate[known][rest], fit, model.noise))
     fit = (check.fit if check is not None else
            check_end(time[known], rate[known], fit, motion, model.noise, reference))
-    return CalibratedRun(fit, check, run, time[run], rate[run],
-                         motion)
+    return CalibratedRun(fit, check, run, time[run], rate[run], motion)
 
 
 def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:

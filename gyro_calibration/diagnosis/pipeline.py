@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
@@ -234,23 +234,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                       generator, clean.heading_step, clean.output_step,
                       model)
                for log, clean in zip(logs, quality)]
-    plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
-    search = start_search(plain.problem.replays, SEARCH_ALARM_SHARE * rate, on_progress)
-    everything = search_causes(search)
-    averaged = average_filtered_noise(fit_causes(search.problem, everything)).problem.replays
-    if averaged is not search.problem.replays:
-        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
-        everything = search_causes(search)
-    followed = follow_reference(search, everything, is_command)
-    settled = (_find_settled(logs[0], fit_causes(search.problem, everything), rate)
-               if len(logs) == 1 and logs[0].reference_rate is not None else None)
-    if followed or settled:
-        moved = search.problem.replays if followed is None else followed.replays
-        search = start_search(
-            [drop_samples(moved[0], ~settled[0])] if settled else moved, SEARCH_ALARM_SHARE * rate,
-            on_progress, {RESPONSE.cause, *HIDDEN_CAUSES}, RESPONSE)
-        everything = search_causes(search)
-    selection = confirm_causes(search, everything)
+    searched = _search_logs(logs, replays, rate, on_progress, is_command)
+    search = searched.search
+    selection = confirm_causes(search, searched.causes)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
     on_progress(None, 'noise figures')
@@ -274,10 +260,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed)]
     if len(logs) == 1:
         findings = mark_parts_of_log(findings)
-    if followed and followed.finding:
-        findings.append(followed.finding)
+    findings += searched.findings
     # a motion that follows has noise of its own
-    if model is not None and not (followed or settled):
+    if model is not None and not searched.hidden:
         findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
@@ -296,20 +281,51 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         [heading_contributions(found, run, plain if model is None else None)
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
-    unexplained = unexplained_structures(search, found, selection.unnamed)
-    if settled:
-        unexplained.append(settled[1])
-    elif followed and followed.unexplained:
-        unexplained.append(followed.unexplained)
-    return Diagnosis(tuple(add_remedies(findings, of_heading, after)), tuple(unexplained), noise,
-                     simulated, gain, before, after,
-                     _untestable_causes(search, logs,
-                                        HIDDEN_CAUSES if followed or settled else ()),
+    return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
+                     (*unexplained_structures(search, found, selection.unnamed),
+                      *searched.unexplained), noise, simulated, gain, before, after,
+                     _untestable_causes(search, logs, searched.hidden),
                      residual_curves(left, shown), heading_error_curve(left, shown),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
-                      *[_SETTLED_REMARK] * bool(settled)),
-                     rate, heading_shares=of_heading)
+                      *searched.remarks), rate, heading_shares=of_heading)
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """A search, and what is reported of a motion that follows its reference."""
+
+    search: Search
+    causes: tuple[Candidate, ...]
+    hidden: Collection[str] = ()  # causes that cannot be known beside the response of the motion
+    findings: Sequence[Finding] = ()
+    unexplained: Sequence[Unexplained] = ()
+    remarks: Sequence[str] = ()
+
+
+def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
+                 on_progress: OnProgress, is_command: bool) -> _Searched:
+    """Search for causes; again where noise is filtered, or the motion follows its reference."""
+    plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
+    search = start_search(plain.problem.replays, SEARCH_ALARM_SHARE * rate, on_progress)
+    causes = search_causes(search)
+    averaged = average_filtered_noise(fit_causes(search.problem, causes)).problem.replays
+    if averaged is not search.problem.replays:
+        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
+        causes = search_causes(search)
+    followed = follow_reference(search, causes, is_command)
+    settled = (_find_settled(logs[0], fit_causes(search.problem, causes), rate)
+               if len(logs) == 1 and logs[0].reference_rate is not None else None)
+    if not followed and not settled:
+        return _Searched(search, causes)
+    moved = search.problem.replays if followed is None else followed.replays
+    search = start_search(
+        [drop_samples(moved[0], ~settled[0])] if settled else moved, SEARCH_ALARM_SHARE * rate,
+        on_progress, {RESPONSE.cause, *HIDDEN_CAUSES}, RESPONSE)
+    structure = settled[1] if settled else followed and followed.unexplained
+    return _Searched(search, search_causes(search), HIDDEN_CAUSES,
+                     [followed.finding] if followed and followed.finding else [],
+                     [structure] if structure else [], [_SETTLED_REMARK] if settled else [])
 
 
 def _find_settled(log: Log, fit: RegressionFit,
