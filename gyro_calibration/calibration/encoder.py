@@ -56,10 +56,9 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
+from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.reference_noise import (
     is_course,
-    keep_own_instants,
-    MAX_ROUNDING_STEP,
     rate_noise_share,
 )
 from gyro_calibration.calibration.run_faults import refuse_unit_error

@@ -53,12 +53,15 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     SharedNoise,
 )
+from gyro_calibration.calibration.own_instants import (
+    interpolate_by_splines,
+    is_slow,
+    keep_own_instants,
+    MAX_ROUNDING_STEP,
+)
 from gyro_calibration.calibration.reference_noise import (
     find_rests,
     heading_difference,
-    interpolate_by_splines,
-    keep_own_instants,
-    MAX_ROUNDING_STEP,
     rate_noise_share,
 )
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
@@ -452,17 +455,17 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     time, measured = log.time - log.time[0], log.output
     output, white = bridge_gaps(measured), white_noise_deviation(measured)
     reference, noisier, rate = log.reference_heading, 0.0, log.reference_rate
-    measured_rows, is_slow = np.isfinite(measured), False
+    measured_rows = np.isfinite(measured)
     if reference is None:
         assert rate is not None
-        noisier, is_slow = rate_noise_share(log), np.isfinite(rate).mean() < 0.5
         filled = interpolate_by_splines(time, rate)
         measured_rows &= np.isfinite(filled)
         reference = integrate_with_curvature(time, bridge_gaps(filled))
-        if is_slow:  # its integral errs by what happens between its values
+        if is_slow(rate):  # its integral errs by what happens between its values
             reference = np.where(np.isfinite(rate), reference, np.nan)
             treatment = replace(treatment, errs_as_heading=True)
         else:
+            noisier = rate_noise_share(log)
             white = math.hypot(white, white_noise_deviation(rate))
     given = reference if given is None else given
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
+from gyro_calibration.calibration.own_instants import keep_own_instants
 from gyro_calibration.heading.integration import integrate_with_curvature
-from gyro_calibration.logs.log import Array, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps,
     find_runs,
@@ -28,7 +28,6 @@ from gyro_calibration.logs.quality import (
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_erosion, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
@@ -45,171 +44,17 @@ _WHITE_CORRELATION_RATIO = -0.5
 #: this quietest share of the log, in blocks of so many samples.
 _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
 #: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
-#: one in steps of more than this, rad, is taken for an encoder, whose errors are at most so many
-#: times its rounding error.
-MIN_LOST_SHARE, MAX_ROUNDING_STEP, MAX_ROUNDING_RATIO = 0.003, 2e-4, 1.5
+#: the errors of an encoder are at most so many times its rounding error.
+MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
 #: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
 #: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
 _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Chance by which a heading that rests is taken for one that is repeated in motion.
 _DETECTION_LEVEL = 0.01
-#: Largest change of the slope on a straight line as a share of the usual one, and least number of
-#: instants of a slow reference.
-_MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
-
-
-class OwnInstants(NamedTuple):
-    """Where a slow reference has its own values."""
-
-    time: Array  # s, shape (k,)
-    values: Array  # rad or rad/s, shape (k,)
-    interval: float  # the usual one, s
-    is_held: bool  # in between; else interpolated linearly
-
-
-def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
-    """
-    Return where a slow reference has its own values, or None if it has one in each sample.
-
-    Values that are held change in single samples. Straight lines between values meet at corners,
-    which may lie between two samples. Both must come at even intervals.
-
-    Parameters
-    ----------
-    time, values : of the samples, s, and rad or rad/s without nan, shape (n,)
-
-    """
-    step, sample = quantization_step(values), float(np.median(np.diff(time)))
-    change = np.diff(values)
-    renewed = 1 + np.flatnonzero(change)
-    # changes of less than a step may be lost
-    fast = np.abs(change[renewed[1:] - 1]) > 2.5 * step
-    at, own = time[renewed], values[renewed]
-    usual = _even_interval(np.diff(at)[fast], sample)
-    is_held = usual is not None
-    if usual is None:
-        at, own = _find_corners(time, values, step)
-        usual = _even_interval(np.diff(at), sample, are_all_shown=True)
-    if usual is None:
-        return None
-    if is_held and not step > MAX_ROUNDING_STEP:
-        # each was taken since the sample before; where all agree, at even intervals
-        number = np.cumsum(np.rint(np.diff(at, prepend=at[0]) / usual))
-        even = np.polyval(np.polyfit(number, at, 1), number)
-        at = (even if np.abs(at - even).max() <= sample else at) - 0.5 * sample
-    between = [np.linspace(begin, end, max(round((end - begin) / usual), 1), endpoint=False)
-               for begin, end in zip(at[:-1], at[1:])]
-    before, after = (usual * np.arange(1, int(max(length, 0.0) / usual) + 1)
-                     for length in (at[0] - time[0], time[-1] - at[-1]))
-    every = np.concatenate([at[0] - before[::-1], *between, at[-1:], at[-1] + after])
-    all_values = (own[np.maximum(np.searchsorted(at, every, 'right') - 1, 0)] if is_held
-                  else np.interp(every, time, values))
-    all_values[np.searchsorted(every, at)] = own
-    return OwnInstants(every, all_values, usual, is_held)
-
-
-def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> float | None:
-    """
-    Return the usual interval of instants, s, some of which may be hidden; None if uneven.
-
-    In a motion that is calculated, of steady rates and ramps, only every second gap is the usual.
-
-    """
-    if len(gaps) < _MIN_INSTANTS or np.quantile(gaps, 0.1) < 1.5 * sample:
-        return None
-    usual = float(np.median(gaps))
-    single = np.abs(gaps - usual) <= 1.01 * sample
-    # an instant with the same value, or on the same line, does not show
-    several = np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual
-    if are_all_shown and np.mean(single) < 2.0 / 3.0:
-        return None
-    return float(gaps[single].mean()) if np.mean(single | several) > 0.8 else None
-
-
-def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array]:
-    """Return times and values of the corners at which straight lines between samples meet."""
-    slope = np.diff(values) / np.diff(time)
-    usual = float(np.mean(np.abs(slope)))
-    rounding = 2.0 * step / float(np.diff(time).min()) if step < MAX_ROUNDING_STEP else 0.0
-    runs = find_runs(np.abs(np.diff(slope)) <= max(_MAX_SLOPE_CHANGE * usual, rounding))
-    first, last = np.array([(run.start, run.stop + 1) for run in runs],
-                           dtype=np.intp).reshape(-1, 2).T
-    # two corners within two samples each leave one interval in between on a line of its own
-    alone = 1 + last[:-1][first[1:] - last[:-1] == 3]
-    first, last = np.sort(np.append(first, alone))[1:], np.sort(np.append(last, alone + 1))[:-1]
-    meet = first - last <= 1
-    first, last = first[meet], last[meet]
-    before, after = slope[last - 1], slope[np.minimum(first, len(slope) - 1)]
-    crossing = before != after
-    first, last, before, after = (each[crossing] for each in (first, last, before, after))
-    ahead = (values[first] - values[last] - after * (time[first] - time[last])) / (before - after)
-    ahead = np.clip(ahead, 0.0, time[first] - time[last])
-    return time[last] + ahead, values[last] + before * ahead
-
-
-def keep_own_instants(log: Log) -> tuple[Log, float | None]:
-    """
-    Return a log whose reference is known at its own instants alone, and their interval, s.
-
-    It is nan in between. Where instants lie between samples, the samples next to them get the
-    values of a cubic spline. What is steady for longer than `_COMPARISON_SPAN` is a motion, except
-    a heading that is held. The interval is None where the reference is not slow.
-
-    """
-    interval = None
-    for name in ('reference_heading', 'reference_rate'):
-        given = getattr(log, name)
-        known = np.flatnonzero(np.isfinite([] if given is None else given))
-        if log.time is None or len(known) <= _MIN_INSTANTS:
-            continue
-        stamps = log.time[known]
-        found = find_own_instants(stamps, given[known])
-        if found is None:
-            continue
-        if found.interval > _COMPARISON_SPAN and not (
-                found.is_held and name == 'reference_heading'):
-            continue
-        # not those in gaps
-        after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
-        inside = stamps[after] - stamps[after - 1] < found.interval
-        if found.is_held and name == 'reference_heading':  # it may be lost where it stands
-            inside &= np.diff(found.values, prepend=np.nan) != 0.0
-        at, after = found.time[inside], after[inside]
-        rows = known[after - (at - stamps[after - 1] < stamps[after] - at)]
-        own = np.full(len(log), np.nan)
-        own[rows] = (found.values[inside] if np.isin(at, stamps).all()
-                     else CubicSpline(found.time, found.values)(log.time[rows]))
-        log = (replace(log, reference_rate=own) if name == 'reference_rate'
-               else replace(log, reference_heading=own))
-        interval = found.interval
-    return log, interval
-
-
-def errs_in_between(log: Log, rate: Array, rows: NDArray[np.intp]) -> bool:
-    """Tell whether the gyro differs from a rate, (n,), more between some rows than at them."""
-    assert log.time is not None and log.output is not None
-    middle = (rows[1:] + rows[:-1]) // 2
-    columns = np.column_stack([np.ones(len(rate)), rate, np.gradient(rate, log.time)])
-    known = np.isfinite(log.output) & np.isfinite(columns).all(axis=1)
-    values = np.linalg.lstsq(columns[known], log.output[known], rcond=None)[0]
-    squares = (log.output - columns @ values) ** 2
-    more = squares[middle] - 0.5 * (squares[rows[1:]] + squares[rows[:-1]])
-    more = more[np.isfinite(more) & (middle > rows[:-1])]
-    return bool(len(more) > 1 and more.mean() > NORMAL_QUANTILE_975 * more.std()
-                / math.sqrt(len(more)))
-
-
-def interpolate_by_splines(time: Array, values: Array) -> Array:
-    """Return a slow reference at each sample, on cubic splines; nan where it is lost."""
-    known = np.isfinite(values)
-    if known.all() or known.sum() < 2:
-        return values
-    return np.where(find_lost_reference(known), np.nan,
-                    CubicSpline(time[known], values[known], extrapolate=False)(time))
 
 
 def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np.intp], Mask]:
@@ -322,10 +167,6 @@ def rate_noise_share(log: Log) -> float:
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
     rate, output = log.reference_rate[known], log.output[known]
-    if log.time is not None and update_interval(log.time[known], rate, 0.0) is not None:
-        begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
-        counts = np.diff(begins, append=len(rate))
-        rate, output = rate[begins], np.add.reduceat(output, begins) / counts
     if len(rate) < 100 or not np.ptp(rate) > 0.0:
         return 0.0
     line = np.polyfit(rate, output, 1)

@@ -33,13 +33,15 @@ from gyro_calibration.calibration.dwells import (
     require_output,
 )
 from gyro_calibration.calibration.heading_regression import find_drift
-from gyro_calibration.calibration.reference_noise import (
-    errs_in_between,
-    heading_difference,
+from gyro_calibration.calibration.own_instants import (
     interpolate_by_splines,
+    is_slow,
+    MAX_ROUNDING_STEP,
+)
+from gyro_calibration.calibration.reference_noise import (
+    heading_difference,
     is_course,
     MAX_ROUNDING_RATIO,
-    MAX_ROUNDING_STEP,
     rate_noise_share,
     step_evenness,
 )
@@ -759,15 +761,14 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
-                and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE
-                     or errs_in_between(log, interpolate_by_splines(log.time, log.reference_rate),
-                                        np.flatnonzero(np.isfinite(log.reference_rate)))))
+                and (is_slow(log.reference_rate)
+                     or rate_noise_share(log) > _MAX_RATE_NOISE_SHARE))
     if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     interval = float(np.median(np.diff(log.time)))
     # the exact motion between its values is not known
-    if np.isfinite(log.reference_heading).mean() < 0.5:
+    if is_slow(log.reference_heading):
         return True
     # the rounding error of an encoder does not show while its shaft rests
     rounding = step / math.sqrt(12.0)

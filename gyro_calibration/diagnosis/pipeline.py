@@ -19,10 +19,8 @@ import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
-from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings,
-    keep_own_instants,
-)
+from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.reference_noise import drop_repeated_headings
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     common_channels,
