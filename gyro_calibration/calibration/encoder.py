@@ -58,6 +58,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.reference_noise import (
+    drop_repeated_headings,
     is_course,
     rate_noise_share,
 )
@@ -179,6 +180,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
 
     """
     refuse_wrapped(log)
+    log, repeated = drop_repeated_headings(log)
     time, output, motion = _extract_motion(log)
     if method is None:
         method = 'likelihood'
@@ -212,7 +214,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         _heading_residual(on_reference, (output - fit.bias) / (1.0 + fit.scale_factor_error),
                           motion),
         0 if lost is None else int(lost.sum()),
-        (*jumps, *_list_remarks(fit, method, technology)))
+        (*repeated, *jumps, *_list_remarks(fit, method, technology)))
 
 
 def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,

@@ -64,7 +64,8 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
         usual = _even_interval(np.diff(at), sample, are_all_shown=True)
     if usual is None:
         return None
-    if is_held and not step > MAX_ROUNDING_STEP:
+    counts = np.rint(np.diff(at) / sample)
+    if is_held and not step > MAX_ROUNDING_STEP and np.any(counts % round(usual / sample)):
         # each was taken since the sample before; where all agree, at even intervals
         number = np.cumsum(np.rint(np.diff(at, prepend=at[0]) / usual))
         even = np.polyval(np.polyfit(number, at, 1), number)
@@ -74,7 +75,7 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     before, after = (usual * np.arange(1, int(max(length, 0.0) / usual) + 1)
                      for length in (at[0] - time[0], time[-1] - at[-1]))
     every = np.concatenate([at[0] - before[::-1], *between, at[-1:], at[-1] + after])
-    all_values = (own[np.maximum(np.searchsorted(at, every, 'right') - 1, 0)] if is_held
+    all_values = (np.append(values[0], own)[np.searchsorted(at, every, 'right')] if is_held
                   else np.interp(every, time, values))
     all_values[np.searchsorted(every, at)] = own
     return OwnInstants(every, all_values, usual, is_held)
@@ -124,8 +125,8 @@ def keep_own_instants(log: Log) -> tuple[Log, float | None]:
     Return a log whose reference is known at its own instants alone, and their interval, s.
 
     It is nan in between. Where instants lie between samples, the samples next to them get the
-    values of a cubic spline. A rate that is held, and that the gyro follows in steps, is a command
-    and not slow. The interval is None where no reference is slow.
+    values of a cubic spline. A rate that is held as a command is not slow. The interval is None
+    where no reference is slow.
 
     """
     interval = None
@@ -139,7 +140,7 @@ def keep_own_instants(log: Log) -> tuple[Log, float | None]:
         if found is None or found.interval > _LONGEST_INTERVAL and not (
                 found.is_held and is_heading):
             continue
-        if found.is_held and not is_heading and _is_followed_in_steps(log, given, found):
+        if found.is_held and not is_heading and _is_command(log, given):
             continue
         # not those in gaps
         after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
@@ -156,17 +157,21 @@ def keep_own_instants(log: Log) -> tuple[Log, float | None]:
     return log, interval
 
 
-def _is_followed_in_steps(log: Log, held: Array, found: OwnInstants) -> bool:
-    """Tell whether the gyro is closer to a held rate than to lines between its values, late."""
+def _is_command(log: Log, held: Array) -> bool:
+    """
+    Tell whether the gyro is later than a held rate, as a robot that follows its command.
+
+    A rate that was measured, and held, is later than the motion.
+
+    """
     assert log.time is not None and log.output is not None
-    known = np.isfinite(held)
-    shapes = (log.time[known], held[known]), (found.time, found.values)
-    output = bridge_gaps(log.output)
-    # a command is followed later than it is given, lines are half an interval ahead
-    delays = np.arange(-found.interval, _LONGEST_INTERVAL, 0.25 * found.interval)
-    best = [max(abs(np.corrcoef(output, np.interp(log.time - delay, *shape))[0, 1])
-                for delay in delays.tolist()) for shape in shapes]
-    return best[0] > best[1]
+    known, output = np.isfinite(held), bridge_gaps(log.output)
+    sample = float(np.median(np.diff(log.time)))
+    delays = sample * np.arange(-round(_LONGEST_INTERVAL / sample),
+                                round(_LONGEST_INTERVAL / sample) + 1)
+    alike = [np.corrcoef(output, np.interp(log.time - delay, log.time[known], held[known]))[0, 1]
+             for delay in delays.tolist()]
+    return bool(delays[int(np.argmax(alike))] > 0.0)
 
 
 def is_slow(values: Array) -> bool:

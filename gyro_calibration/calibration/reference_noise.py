@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
 from gyro_calibration.heading.integration import integrate_with_curvature
-from gyro_calibration.logs.log import Array, Log, Mask
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps,
     find_runs,
@@ -167,6 +167,11 @@ def rate_noise_share(log: Log) -> float:
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
     rate, output = log.reference_rate[known], log.output[known]
+    slow = None if log.time is None else find_own_instants(log.time[known], rate)
+    if slow is not None and slow.is_held:
+        begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
+        counts = np.diff(begins, append=len(rate))
+        rate, output = rate[begins], np.add.reduceat(output, begins) / counts
     if len(rate) < 100 or not np.ptp(rate) > 0.0:
         return 0.0
     line = np.polyfit(rate, output, 1)
@@ -226,31 +231,30 @@ def is_course(log: Log) -> bool:
         larger * walk, MAX_ROUNDING_RATIO * rounding) > 0.0
 
 
-def drop_repeated_headings(log: Log) -> tuple[Log, tuple[float, float, float] | None]:
+def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     """
     Return a log without headings that are repeated while the gyro turns, as of a lost marker.
 
-    Also begin and end of the longest of these stretches, s, and how far the gyro turns in it, rad;
-    None without one. The gyro turns where its heading deviates from a straight line, which may be
-    its bias, by more than a random walk does (Brownian bridge, at 1 %), and the error of the
-    reference and its step; or where it changes beyond its usual bias by that. The reference must
-    then jump rather by what the gyro turned than not at all: a bias may drift in a rest. The
-    random walk is that of the difference to the reference elsewhere.
+    Also a remark on the longest of these stretches. The gyro turns where its heading deviates from
+    a straight line, which may be its bias, by more than a random walk does (Brownian bridge, at
+    1 %), and the error of the reference and its step; or where it changes beyond its usual bias by
+    that. The reference must then jump rather by what the gyro turned than not at all: a bias may
+    drift in a rest. The random walk is that of the difference to the reference elsewhere.
 
     """
     heading = log.reference_heading
     known = np.flatnonzero(np.isfinite([] if heading is None else heading))
     if log.time is None or log.output is None or heading is None or len(known) < _BLOCK_SAMPLES:
-        return log, None
+        return log, []
     runs = [known[run.start:run.stop + 1] for run in find_runs(np.diff(heading[known]) == 0.0)
             if run.stop > run.start + 1]
     if not runs:
-        return log, None
+        return log, []
     moving = heading.copy()
     moving[np.concatenate(runs)] = np.nan
     usual = heading_difference(replace(log, reference_heading=moving))
     if not usual.total_walk > 0.0:
-        return log, None
+        return log, []
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / _DETECTION_LEVEL))
     step = quantization_step(heading[known])
     turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
@@ -271,5 +275,9 @@ def drop_repeated_headings(log: Log) -> tuple[Log, tuple[float, float, float] | 
             kept[rows[1:]] = np.nan
             lost.append((float(begin), float(end), float(np.ptp(own))))
     if not lost:
-        return log, None
-    return replace(log, reference_heading=kept), max(lost, key=lambda each: each[1] - each[0])
+        return log, []
+    begin, end, angle = max(lost, key=lambda each: each[1] - each[0])
+    return replace(log, reference_heading=kept), [
+        f'The reference stands from {begin:.4g} s to {end:.4g} s, where the gyro turns by '
+        f'{angle / DEGREE:.3g} deg, as if it were lost; it is not used there, nor where the same '
+        'happens for a shorter time.']

@@ -115,7 +115,7 @@ from gyro_calibration.diagnosis.search import (
     start_search,
 )
 from gyro_calibration.diagnosis.words import format_amount
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
@@ -213,11 +213,7 @@ def _use_own_values(log: Log, remarks: list[str]) -> Log:
         remarks.append(f'The reference has a value of its own every {1000.0 * interval:.3g} ms, '
                        'and is held or interpolated in between; its own values alone are used.')
     log, lost = drop_repeated_headings(log)
-    if lost is not None:
-        begin, end, turned = lost
-        remarks.append(f'The reference stands from {begin:.4g} s to {end:.4g} s, where the gyro '
-                       f'turns by {turned / DEGREE:.3g} deg, as if it were lost; it is not used '
-                       'there, nor where the same happens for a shorter time.')
+    remarks += lost
     return log
 
 

@@ -112,7 +112,8 @@ def jumped(seconds):
 
 
 @pytest.mark.parametrize('log', [jumped(12.0 * 86400.0), jumped(1500.0),
-                                 replace(jumped(12.0 * 86400.0), reference_rate=0.0 * RATE)],
+                                 replace(jumped(12.0 * 86400.0), output=LOG.output - RATE,
+                                         reference_rate=0.0 * RATE)],
                          ids=['a clock that was set', 'two drives', 'at rest'])
 def test_a_log_that_is_a_gap_for_the_most_part_is_refused_with_where_it_is(log):
     with pytest.raises(

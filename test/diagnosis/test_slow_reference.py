@@ -13,11 +13,9 @@
 from dataclasses import replace
 
 from chance import seeds
-from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings,
-    find_own_instants,
-    keep_own_instants,
-)
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
+from gyro_calibration.calibration.reference_noise import drop_repeated_headings
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import DEGREE, Log
 import numpy as np
@@ -71,9 +69,10 @@ def test_the_own_instants_of_a_slow_reference_are_found(given, interval):
     assert interval_found == found.interval
     if given is linear:  # where a held heading stands, it may be lost
         assert known.sum() == pytest.approx(TIME[-1] / interval, rel=0.01)
-    # as exact as the instants, half a sample, and the motion between two of them allow
-    error = (own.reference_heading - true(TIME))[known]
-    assert np.abs(error).max() < 0.1 * np.abs(log.reference_heading - true(TIME)).max()
+    # held values were taken since the sample before, those on lines are as exact as the splines
+    error = np.abs(own.reference_heading - true(TIME))[known]
+    fastest = np.abs(np.diff(true(TIME))).max()
+    assert error.max() < (fastest if given is held else 0.1 * interval * RATE * fastest)
 
 
 def test_a_table_that_holds_each_rate_for_seconds_is_not_slow():
@@ -109,11 +108,15 @@ def test_a_slow_reference_shows_the_gyro_and_nothing_else(name, asymmetry, seed)
 def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():
     log, _, heading = turning(5)
     tracked = heading(TIME)
-    assert drop_repeated_headings(replace(log, reference_heading=tracked))[1] is None
+    assert drop_repeated_headings(replace(log, reference_heading=tracked))[1] == []
     moving = np.flatnonzero(np.abs(log.output - BIAS) > 20.0 * DEGREE)
     for start in moving[[200, 600, 1000]].tolist():
         tracked[start:start + 150] = tracked[start]
-    found = diagnose([replace(log, reference_heading=tracked)], np.random.default_rng(0))
+    log = replace(log, reference_heading=tracked)
+    fit = calibrate_encoder(log)
+    assert 'as if it were lost' in fit.remarks[0]
+    assert fit.fit.bias == pytest.approx(BIAS, abs=0.01 * DEGREE)
+    found = diagnose([log], np.random.default_rng(0))
     assert found.verdict == 'adequate', found
     assert 'as if it were lost' in found.remarks[0]
     assert found.model.terms[1].values[0] == pytest.approx(SCALE, abs=2e-3)
