@@ -49,13 +49,16 @@ ENCODER_STEP = 2.0 * math.pi / 65536
 IMPERFECT_REFERENCES = {
     f'{kind}_{size:g}': ImperfectReference(kind, size)
     for kind, sizes in (('rate', (0.1, 0.3, 0.5)), ('capture', (0.02, 0.05, 0.1)),
-                        ('encoder', (0.09, 0.5)), ('course', (1.0, 5.0, 10.0))) for size in sizes}
+                        ('encoder', (0.09, 0.5)), ('course', (1.0, 5.0, 10.0)), ('held', (0.2,)),
+                        ('lines', (0.2,)), ('heldrate', (0.2,)), ('linesrate', (0.2,)),
+                        ('lost', (10.0,))) for size in sizes}
 COMPANION_EFFECTS = ('scale_factor_asymmetry', 'cubic_nonlinearity', 'heading_sensitivity',
                      'bias_temperature', 'scale_factor_temperature', 'warm_up', 'time_offset',
                      'bandwidth', 'reference_once_per_rev', 'reference_slip', 'bias_step',
                      'acceleration_sensitivity')
 #: Correct findings on references that were not hidden.
-TRUE_OF_REFERENCE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
+TRUE_OF_REFERENCE = {'encoder': ('reference_quantization',), 'course': ('time_offset',),
+                     'held': ('time_offset',), 'heldrate': ('time_offset',)}
 #: Effects that are not combined: findings against a model, and a wrong unit, which changes sizes.
 NOT_COMBINED = {*MODEL_FINDINGS, 'unit_error'}
 #: Least share of the multiple of an effect that is independent of the others.

@@ -16,7 +16,10 @@ Two causes are confounded under some conditions, and distinguishable under other
 Of a reference, a kind is a word and a number: `rate` and its white noise as a part of that of the
 gyro, `capture` and the white noise of a heading, deg, `encoder` and its step, deg, `course` and
 the fixes a second. A course is lost at rest, errs by 0.3 deg a fix and by side slip that grows
-with the rate and wanders over 3 s, is straight between fixes, and is late by -0.2 to 0.7 s.
+with the rate and wanders over 3 s, is straight between fixes, and is late by -0.2 to 0.7 s. The
+kinds `held` and `lines` are headings with a value every so many s, held or on straight lines in
+between, `heldrate` and `linesrate` rates; `lost` is a heading that is repeated so many times for
+up to 2 s.
 
 """
 
@@ -126,6 +129,9 @@ FIX_NOISE, SIDE_SLIP, SIDE_SLIP_GROWTH, SIDE_SLIP_TIME = (
     math.radians(0.3), math.radians(0.3), 2.0, 3.0)
 
 
+SLOW_KINDS = ('held', 'lines', 'heldrate', 'linesrate', 'lost')
+
+
 @dataclass(frozen=True)
 class ImperfectReference:
     """A kind of reference and the size of its error."""
@@ -137,6 +143,8 @@ class ImperfectReference:
         """Return the angle random walk, and the step of an encoder, that hide as much as it."""
         if self.kind == 'rate':
             return angle_random_walk * math.hypot(1.0, self.size), 0.0
+        if self.kind in SLOW_KINDS:
+            return angle_random_walk, 0.0
         if self.kind == 'course':
             # neighbouring fixes err alike by side slip: as many as are independent
             slip = SIDE_SLIP * math.sqrt(2.0 * SIDE_SLIP_TIME * sample_rate)
@@ -161,6 +169,10 @@ def hide_with_reference(names: Sequence[str], multiple: float, generator: np.ran
     if reference.kind == 'rate':
         own = reference.size * figures.sample_deviation(1.0 / sample_rate)
         columns['reference_rate_rad_s'] = rate + own * white
+    elif reference.kind in SLOW_KINDS:
+        is_rate = reference.kind.endswith('rate')
+        columns['reference_rate_rad_s' if is_rate else 'reference_heading_rad'] = _slow_values(
+            time, rate if is_rate else heading, reference, generator)
     elif reference.kind == 'capture':
         columns['reference_heading_rad'] = heading + math.radians(reference.size) * white
     elif reference.kind == 'encoder':
@@ -179,3 +191,19 @@ def hide_with_reference(names: Sequence[str], multiple: float, generator: np.ran
         columns['reference_heading_rad'] = course
         del columns['moving']
     return replace(made, columns=columns)
+
+
+def _slow_values(time: np.ndarray, values: np.ndarray, reference: ImperfectReference,
+                 generator: np.random.Generator) -> np.ndarray:
+    """Return the values of a slow reference at the samples, or of one that is lost at times."""
+    if reference.kind == 'lost':
+        lost = values.copy()
+        for begin in generator.integers(0, len(time), int(reference.size)).tolist():
+            end = np.searchsorted(time, time[begin] + generator.uniform(0.2, 2.0))
+            lost[begin:end] = values[begin]
+        return lost
+    at = np.arange(time[0] - generator.uniform(0.0, reference.size), time[-1] + reference.size,
+                   reference.size)
+    own = np.interp(at, time, values)
+    return (np.interp(time, at, own) if reference.kind.startswith('lines')
+            else own[np.searchsorted(at, time, 'right') - 1])
