@@ -54,10 +54,10 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
 )
 from gyro_calibration.calibration.own_instants import (
-    interpolate_by_splines,
     is_slow,
     keep_own_instants,
     MAX_ROUNDING_STEP,
+    OwnInstants,
 )
 from gyro_calibration.calibration.reference_noise import (
     find_rests,
@@ -86,6 +86,7 @@ from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 from scipy.stats import t as student
@@ -437,17 +438,19 @@ class Spans:
         return self.span_changes((after - 2.0 * now + before) / half ** 2)
 
 
-def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
+def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
+                  instants: OwnInstants | None = None) -> Spans:
     """
     Divide a log with a reference of some kind into spans.
 
     The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
-    gyro is known.
+    gyro is known. The instants are those of the known values of a slow reference, by
+    `keep_own_instants`.
 
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
-        log, _ = keep_own_instants(log)
+        log, instants = keep_own_instants(log)
     assert log.time is not None and log.output is not None
     if prior is not None:
         scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
@@ -455,18 +458,26 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     time, measured = log.time - log.time[0], log.output
     output, white = bridge_gaps(measured), white_noise_deviation(measured)
     reference, noisier, rate = log.reference_heading, 0.0, log.reference_rate
-    measured_rows = np.isfinite(measured)
+    measured_rows, at = np.isfinite(measured), time
+    used = rate if reference is None else reference
+    assert used is not None
+    own, values = np.isfinite(used), used
+    if instants is not None and np.isfinite(instants.time[own]).all():
+        at, values = instants.time - log.time[0], instants.values
     if reference is None:
         assert rate is not None
-        filled = interpolate_by_splines(time, rate)
-        measured_rows &= np.isfinite(filled)
-        reference = integrate_with_curvature(time, bridge_gaps(filled))
         if is_slow(rate):  # its integral errs by what happens between its values
-            reference = np.where(np.isfinite(rate), reference, np.nan)
+            reference = np.full(len(time), np.nan)
+            reference[own] = CubicSpline(at[own], values[own]).antiderivative()(at[own])
+            measured_rows &= ~find_lost_reference(np.isfinite(rate))
             treatment = replace(treatment, errs_as_heading=True)
         else:
+            measured_rows &= np.isfinite(rate) | ~find_lost_reference(np.isfinite(rate))
             noisier = rate_noise_share(log)
             white = math.hypot(white, white_noise_deviation(rate))
+            reference = integrate_with_curvature(time, bridge_gaps(rate))
+    else:
+        reference = np.where(own, values, np.nan)
     given = reference if given is None else given
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     walks = [white * math.sqrt(float(np.median(np.diff(time))))]
@@ -478,7 +489,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
             treatment = replace(treatment, errs_as_heading=True)
     else:
         walks = [min(walks[0], _MAX_VEHICLE_WALK)]
-    at, by_code = time, kind == 'encoder' and encoder_step(reference) > 0.0
+    by_code = kind == 'encoder' and at is time and encoder_step(reference) > 0.0
     if by_code:
         # between two samples with different codes the shaft was in the middle of both; a single
         # code gives only a range, and its error at rest or at a reversal is systematic

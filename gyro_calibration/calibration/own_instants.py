@@ -28,13 +28,16 @@ MAX_ROUNDING_STEP = 2e-4
 #: Largest change of the slope on a straight line as a share of the usual slope, and least number
 #: of instants.
 _MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
+#: Difference of times that is rounding, s.
+_EQUAL_TIMES = 1e-9
 
 
 class OwnInstants(NamedTuple):
     """Where a slow reference has its own values."""
 
-    time: Array  # s, shape (k,)
-    values: Array  # rad or rad/s, shape (k,)
+    # s, and rad or rad/s, shape (k,), or (n,) of the samples, nan where none is near
+    time: Array
+    values: Array
     interval: float  # the usual one, s
     is_held: bool  # in between; else on straight lines
 
@@ -120,17 +123,21 @@ def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array
     return time[last] + ahead, values[last] + before * ahead
 
 
-def keep_own_instants(log: Log) -> tuple[Log, float | None]:
+def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     """
-    Return a log whose reference is known at its own instants alone, and their interval, s.
+    Return a log whose reference is known at its own instants alone, and these.
 
     It is nan in between. Where instants lie between samples, the samples next to them get the
-    values of a cubic spline. A rate that is held as a command is not slow. The interval is None
-    where no reference is slow.
+    values of a cubic spline. A rate that is held as a command is not slow.
+
+    Returns
+    -------
+    the log; the instants next to its samples, (n,), and their values, or None if no reference is
+    slow
 
     """
-    interval = None
-    for name in ('reference_heading', 'reference_rate'):
+    kept = None
+    for name in ('reference_rate', 'reference_heading'):
         given, is_heading = getattr(log, name), name == 'reference_heading'
         known = np.flatnonzero(np.isfinite([] if given is None else given))
         if log.time is None or len(known) <= _MIN_INSTANTS:
@@ -147,14 +154,16 @@ def keep_own_instants(log: Log) -> tuple[Log, float | None]:
         inside = stamps[after] - stamps[after - 1] < found.interval
         if found.is_held and is_heading:  # it may be lost where it stands
             inside &= np.diff(found.values, prepend=np.nan) != 0.0
-        at, after = found.time[inside], after[inside]
+        at, values, after = found.time[inside], found.values[inside], after[inside]
         rows = known[after - (at - stamps[after - 1] < stamps[after] - at)]
-        own = np.full(len(log), np.nan)
-        own[rows] = (found.values[inside] if np.isin(at, stamps).all()
-                     else CubicSpline(found.time, found.values)(log.time[rows]))
-        log = replace(log, **{name: own})
-        interval = found.interval
-    return log, interval
+        kept = found._replace(time=np.full(len(log), np.nan), values=np.full(len(log), np.nan))
+        kept.time[rows], kept.values[rows] = at, values
+        own = kept.values.copy()
+        if np.abs(at - log.time[rows]).max(initial=0.0) > _EQUAL_TIMES:
+            own[rows] = CubicSpline(found.time, found.values)(log.time[rows])
+        log = (replace(log, reference_heading=own) if is_heading
+               else replace(log, reference_rate=own))
+    return log, kept
 
 
 def _is_command(log: Log, held: Array) -> bool:

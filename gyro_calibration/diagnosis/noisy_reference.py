@@ -41,6 +41,7 @@ from gyro_calibration.calibration.heading_regression import (
     whiten_regression,
     WhitenedRegression,
 )
+from gyro_calibration.calibration.own_instants import OwnInstants
 from gyro_calibration.diagnosis.candidates import (
     lasting_shapes,
     MAX_STEP_TIME_LACK,
@@ -133,8 +134,14 @@ _MOTION_VARIABLES = frozenset({'rate', 'heading'})
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
-                                false_alarm_rate: float, on_progress: OnProgress) -> Diagnosis:
-    """Diagnose a log with a reference whose errors are larger than those of the gyro."""
+                                false_alarm_rate: float, on_progress: OnProgress,
+                                instants: OwnInstants | None = None) -> Diagnosis:
+    """
+    Diagnose a log with a reference whose errors are larger than those of the gyro.
+
+    The instants are those of a slow reference, by `keep_own_instants`.
+
+    """
     on_progress(None, 'data quality')
     if reference.kind != 'rate_command' and log.reference_heading is not None:
         log = replace(log, reference_rate=None)
@@ -147,7 +154,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     on_progress(None, 'bias and scale factor error')
     if model is not None:
         cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
-    plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior))
+    plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior, instants))
     extended, found = search_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
                                     on_progress)
     on_progress(None, 'cross-validation')

@@ -19,7 +19,7 @@ import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
-from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
@@ -164,7 +164,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     all_gates: list[Gate] = []
     given = logs
     remarks: list[str] = []
-    logs = [_use_own_values(log, remarks) for log in logs]
+    logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
         passed = check_gates(log, model)
         failed = mismatch_finding(passed)
@@ -190,7 +190,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
             'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
     if limiting_logs:
         found = diagnose_by_noisy_reference(logs[0], references[0], model, false_alarm_rate,
-                                            on_progress)
+                                            on_progress, instants[0])
     else:
         try:
             found = _diagnose_by_exact_reference(
@@ -206,15 +206,16 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                    remarks=(*dict.fromkeys(remarks), *found.remarks))
 
 
-def _use_own_values(log: Log, remarks: list[str]) -> Log:
-    """Return a log with what its reference measured alone; add remarks on the rest."""
-    log, interval = keep_own_instants(log)
-    if interval is not None:
-        remarks.append(f'The reference has a value of its own every {1000.0 * interval:.3g} ms, '
-                       'and is held or interpolated in between; its own values alone are used.')
+def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | None]:
+    """Return a log with what its reference measured alone, when; add remarks on the rest."""
+    log, instants = keep_own_instants(log)
+    if instants is not None:
+        remarks.append('The reference has a value of its own every '
+                       f'{1000.0 * instants.interval:.3g} ms, and is held or interpolated in '
+                       'between; its own values alone are used.')
     log, lost = drop_repeated_headings(log)
     remarks += lost
-    return log
+    return log, instants
 
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,

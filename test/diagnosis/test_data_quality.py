@@ -367,8 +367,9 @@ def test_a_calculated_motion_has_no_encoder():
 def test_the_update_interval_of_a_held_reference_is_found(every, generator):
     log = swing(generator)
     held = log.reference_rate[np.arange(6000) // every * every]
-    own, interval = keep_own_instants(replace(log, reference_rate=held))
-    assert interval == (None if every == 1 else pytest.approx(every * INTERVAL, rel=1e-6))
+    own, found = keep_own_instants(replace(log, reference_rate=held))
+    assert (found is None) == (every == 1)
+    assert found is None or found.interval == pytest.approx(every * INTERVAL, rel=1e-6)
     known = np.isfinite(own.reference_rate)
     assert (np.flatnonzero(known) % every == 0).all() and known.mean() > 0.99 / every
     assert own.reference_rate[known] == pytest.approx(log.reference_rate[known], abs=1e-12)

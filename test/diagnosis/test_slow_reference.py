@@ -64,9 +64,10 @@ def test_the_own_instants_of_a_slow_reference_are_found(given, interval):
         assert found.is_held == (given is held)
         assert find_own_instants(TIME, true(TIME)) is None
     log = replace(turning(1)[0], reference_heading=given(true, interval))
-    own, interval_found = keep_own_instants(log)
+    own, instants = keep_own_instants(log)
     known = np.isfinite(own.reference_heading)
-    assert interval_found == found.interval
+    assert instants.interval == found.interval
+    assert (np.isfinite(instants.time) == known).all()
     if given is linear:  # where a held heading stands, it may be lost
         assert known.sum() == pytest.approx(TIME[-1] / interval, rel=0.01)
     # held values were taken since the sample before, those on lines are as exact as the splines
