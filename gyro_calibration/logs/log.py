@@ -55,6 +55,7 @@ from gyro_calibration.logs.columns import (
 )
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -501,17 +502,12 @@ class _AxisRotation:
         if ATTITUDE[0] not in arrays:
             return
         attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
-        length = np.linalg.norm(attitude, axis=1)
-        known = np.abs(length - 1.0) < 0.4  # as in recordings
+        known = np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < 0.4  # as in recordings
         heading = np.full(len(attitude), np.nan)
         if known.any():
-            path = np.concatenate([self._last, attitude[known] / length[known, None]])
-            (w0, v0), (w1, v1) = ((each[:, :1], each[:, 1:]) for each in (path[:-1], path[1:]))
-            cosine = w0 * w1 + np.sum(v0 * v1, axis=1, keepdims=True)
-            vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)
-            sine = np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
-            turned = (2.0 * np.copysign(np.arctan2(sine, np.abs(cosine)), cosine) / sine
-                      * vector)[:, self._axis]
+            path = np.concatenate([self._last, attitude[known]])
+            rotation = Rotation.from_quat(path[:, [1, 2, 3, 0]])
+            turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()[:, self._axis]
             angles = self._angle + np.cumsum(turned)
             heading[known] = angles if len(self._last) else np.concatenate([[0.0], angles])
             self._angle, self._last = float(heading[known][-1]), path[-1:]
