@@ -30,7 +30,7 @@ from typing import Any
 
 from gyro_calibration.allan.deviation import allan_deviation, AllanChart, build_rest_record
 from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
-from gyro_calibration.calibration.encoder import EncoderCalibration
+from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
 from gyro_calibration.calibration.selection import Selection
@@ -44,10 +44,10 @@ from gyro_calibration.cli.compensate import (
     track_log,
 )
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
-from gyro_calibration.cli.fit import calibrate, draw_headings, dwell_lines, heading_lines
+from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
+from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
@@ -307,12 +307,12 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
     _require_choice('method', method, ('dwells', 'likelihood', 'course', 'rate'))
+    for log in logs:
+        refuse_mismatch(log)
     found = calibrate({str(number): log for number, log in enumerate(logs)},
                       [STATIC_EFFECTS[name] for name in effects or ()], method, technology)
-    model = found.calibration.model if isinstance(found, Selection) else found.model
-    if technology:
-        model = replace(model, gyro={'technology': technology})
-    return Fitted(model, found)
+    return Fitted(replace(found.model, gyro={'technology': technology} if technology else {}),
+                  found)
 
 
 @dataclass(frozen=True)

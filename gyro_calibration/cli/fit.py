@@ -18,29 +18,28 @@ example: gyro_calibration fit table.csv --out model.yaml
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    extract_dwells,
-    format_list,
-    join_dwells,
-    NothingSteady,
+from gyro_calibration.calibration.dwells import format_list
+from gyro_calibration.calibration.encoder import (
+    calibrate,
+    EncoderCalibration,
+    HEADING_ALONE,
+    MIN_DWELLS,
 )
-from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
-from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration, fit_effects
+from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
-from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGY_EFFECTS
+from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import display_unit
 from gyro_calibration.files import suggest_nearest
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
     polynomial_to_matrix,
@@ -104,66 +103,21 @@ def run(given: argparse.Namespace) -> Answer:
     effects = given.effects or given.polynomial or ()
     logs = dict(zip(given.log, verb.read_each(given)))
     with show_progress('fit of effects'):
+        for log in logs.values():
+            refuse_mismatch(log)
         found = calibrate(logs, effects, given.method, given.technology)
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
                 'technology': given.technology}
-    model = replace(found.calibration.model if isinstance(found, Selection) else found.model,
-                    gyro={name: value for name, value in identity.items() if value},
+    model = replace(found.model, gyro={name: value for name, value in identity.items() if value},
                     origin=verb.make_origin(given.log))
     if given.surface and not isinstance(found, Selection):
-        raise UsageError(_HEADING_ALONE)
+        raise UsageError(HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
     lines, data = (_answer_dwells(given, model, found) if isinstance(found, Selection)
                    else _answer_heading(given, logs, model, found))
     return Answer(lines, {'out': given.out, **_model_data(model), **data},
                   (given.picture, given.surface, given.out))
-
-
-_HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
-                  'effects, --matrix and --surface use --method dwells')
-
-
-#: Fewer dwells leave nothing over for two values, bias and scale factor error.
-_MIN_DWELLS = 3
-
-
-def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
-              technology: str | None = None) -> Selection | EncoderCalibration:
-    """Calibrate as `api.fit` by named logs: by dwells, or by the heading of a single log."""
-    for log in logs.values():
-        refuse_mismatch(log)
-    others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
-    by_dwells = method == 'dwells' or method is None and (bool(others) or not all(
-        log.time is not None and log.reference_rate is None and log.reference_heading is not None
-        for log in logs.values()))
-    if by_dwells:
-        is_settled = effects or method or len(logs) > 1
-        try:
-            table = join_dwells([
-                _extract_named_dwells(Path(path).name, log) if len(logs) > 1
-                else extract_dwells(log) for path, log in logs.items()])
-            if is_settled or len(table) >= _MIN_DWELLS or any(
-                    log.time is None for log in logs.values()):
-                return (Selection(fit_effects(table, effects), (), ()) if effects
-                        else select_effects(table, technology))
-        except NothingSteady:
-            if is_settled:
-                raise
-    if len(logs) > 1:
-        raise UsageError(f'--method {method or "likelihood"} takes one log; '
-                         'give one log, or use --method dwells')
-    if others:
-        raise UsageError(_HEADING_ALONE)
-    (log,) = logs.values()
-    return calibrate_encoder(log, method, technology=technology or 'mems')
-
-
-def _extract_named_dwells(name: str, log: Log) -> Dwells:
-    try:
-        return extract_dwells(log, name)
-    except DataRefused as error:
-        raise type(error)(f'{name}: {error}') from None
 
 
 def _answer_dwells(given: argparse.Namespace, model: GyroModel,
@@ -195,7 +149,7 @@ def _answer_heading(given: argparse.Namespace, logs: Mapping[str, Log], model: G
         draw_headings(given.picture, found)
     if log.reference_heading is None:
         remarks.insert(
-            0, f'the log has a reference rate, and fewer than {_MIN_DWELLS} stretches of '
+            0, f'the log has a reference rate, and fewer than {MIN_DWELLS} stretches of '
             'constant rate; so the rate is integrated, and headings are compared. For other '
             'effects than bias and scale factor error, hold each rate for some seconds')
     return ([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
