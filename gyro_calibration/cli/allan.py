@@ -32,6 +32,7 @@ from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.diagnosis.words import readable_name
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
@@ -75,10 +76,11 @@ def run(given: argparse.Namespace) -> Answer:
 
 def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[str]:
     """Return the noise figures as lines for people."""
-    lost, floor, (unit, factor) = np.isnan(record.rate).sum(), chart.floor, DISPLAY_UNITS['B']
-    floor_line = (
-        f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} s, '
-        f'95 %: {floor.lower * factor:.4g} to {floor.upper * factor:.4g}.')
+    lost, (unit, factor) = np.isnan(record.rate).sum(), DISPLAY_UNITS['B']
+    time, *sizes = chart.floor.values()
+    deviation, lower, upper = (f'{size * factor:.4g}' for size in sizes)
+    floor_line = (f'Lowest Allan deviation: {deviation} {unit} at {time:.4g} s, '
+                  f'95 %: {lower} to {upper}.')
     if not fit.is_floor_reached:
         floor_line += (' The deviation still falls at the end of the chart; record longer to '
                        'reach its minimum.')
@@ -91,7 +93,7 @@ def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[s
 
 def _figure_line(symbol: str, figure: NoiseFigure) -> str:
     unit, factor = DISPLAY_UNITS[symbol]
-    name = f'{_figure_name(figure).capitalize()} {symbol}'
+    name = f'{readable_name(figure.term.name).capitalize()} {symbol}'
     if not figure.value:
         return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
                 f'({figure.upper:.3g} {figure.term.unit}).')
@@ -103,12 +105,9 @@ def _figure_line(symbol: str, figure: NoiseFigure) -> str:
 def figure_labels(fit: NoiseFit) -> dict[str, str]:
     """Return the labels in a chart of the detected figures, by symbol."""
     return {
-        symbol: f'{_figure_name(figure)} {symbol} = {figure.value * DISPLAY_UNITS[symbol][1]:.3g} '
-        f'{DISPLAY_UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value}
-
-
-def _figure_name(figure: NoiseFigure) -> str:
-    return figure.term.name.replace('_', ' ')
+        symbol: f'{readable_name(figure.term.name)} {symbol} = '
+        f'{figure.value * DISPLAY_UNITS[symbol][1]:.3g} {DISPLAY_UNITS[symbol][0]}'
+        for symbol, figure in fit.figures.items() if figure.value}
 
 
 def _fit_line(fit: NoiseFit) -> str:
@@ -141,7 +140,7 @@ def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
                'differences': chart.difference_count, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval,
             'remarks': list(record.remarks), **figures,
-            'floor': {**vars(chart.floor), 'reached': fit.is_floor_reached},
+            'floor': {**chart.floor, 'reached': fit.is_floor_reached},
             'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
             'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
             else {'standard_deviation': fit.process.standard_deviation,

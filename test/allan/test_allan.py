@@ -187,7 +187,7 @@ def test_a_record_that_is_too_short_for_the_floor_says_so_and_bounds_the_bias_in
     assert (not short.is_floor_reached and not short.figures['B'].value
             and short.figures['B'].upper > 3e-4)
     assert (long.is_floor_reached
-            and long.chart.floor.deviation == pytest.approx(ALLAN_FLOOR_RATIO * 3e-4, rel=0.4))
+            and long.chart.floor['deviation'] == pytest.approx(ALLAN_FLOOR_RATIO * 3e-4, rel=0.4))
 
 
 def stamps(count):
@@ -340,7 +340,7 @@ def test_recordings_of_one_kind_of_gyro_agree(data, number):
     assert not record.remarks and record.interval == pytest.approx(0.01)
     fit = fit_noise(record.rate, record.interval)
     assert fit.figures['N'].value / DEGREE * 60.0 == pytest.approx(2.3, abs=0.1)
-    assert 0.006 < fit.chart.floor.deviation / DEGREE < 0.012
+    assert 0.006 < fit.chart.floor['deviation'] / DEGREE < 0.012
     assert fit.is_floor_reached and not fit.misfit
     assert fit.figures['B'].value / DEGREE == pytest.approx(0.008, rel=0.4)
     assert not any(fit.figures[symbol].value for symbol in 'QR')
