@@ -49,7 +49,7 @@ from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, ma
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.words import terminal_lines
+from gyro_calibration.diagnosis.words import as_sentence, terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
 from gyro_calibration.logs import log as logs
@@ -237,8 +237,7 @@ class Run(_PrintedResult):
     _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
-        text = str(self.model.self_calibration)
-        return f'{text[0].upper()}{text[1:]}.'
+        return as_sentence(str(self.model.self_calibration))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the run and of its heading error before and after."""

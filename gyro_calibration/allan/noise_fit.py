@@ -300,9 +300,9 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
 
 
 def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ranking:
-    since = OctaveVariances(octaves.samples, *(values[start:] for values in (
-        octaves.size, octaves.loss_factor, octaves.variance, octaves.columns)),
-        octaves.forms[start:, start:])
+    since = replace(octaves, forms=octaves.forms[start:, start:], **{
+        name: getattr(octaves, name)[start:]
+        for name in ('size', 'loss_factor', 'variance', 'columns')})
     descriptions = tuple(
         sorted((fit_combination(since, places, misfit) for places in _COMBINATIONS),
                key=CombinationFit.penalized_deviance))

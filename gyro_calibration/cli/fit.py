@@ -37,7 +37,7 @@ from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
-from gyro_calibration.diagnosis.words import display_unit
+from gyro_calibration.diagnosis.words import as_sentence, display_unit
 from gyro_calibration.files import suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -253,11 +253,7 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
                   'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
                   'needs stretches of constant rate in the log.')
         yield wrap_line(f'The error is above 5 deg rms. {remedy}')
-    yield from _remark_lines(remarks)
-
-
-def _remark_lines(remarks: Iterable[str]) -> Iterator[str]:
-    yield from (wrap_line(f'{remark[0].upper()}{remark[1:]}.') for remark in remarks)
+    yield from (wrap_line(as_sentence(remark)) for remark in remarks)
 
 
 def _value_lines(model: GyroModel) -> Iterator[str]:
@@ -288,7 +284,7 @@ def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
         named = format_list([f'{table.location[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
                              for row in outlying])
         yield wrap_line(f'{len(outlying)} outlying, not fitted: {named}.')
-    yield from _remark_lines(table.remarks)
+    yield from (wrap_line(as_sentence(remark)) for remark in table.remarks)
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
@@ -323,9 +319,11 @@ def _choice_lines(selection: Selection) -> Iterator[str]:
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
     for choice in selection.choices:
-        without, with_it = (f'{_format_finite(value / DEGREE, ".4f"):>8s}'
-                            for value in (choice.error_without, choice.error_with))
-        numbers = f'{without} {with_it} {_format_finite(choice.p_value, ".1g"):>7s}'
+        numbers = ' '.join(
+            f'{format(value, digits) if math.isfinite(value) else "-":>{width}s}'
+            for value, digits, width in ((choice.error_without / DEGREE, '.4f', 8),
+                                         (choice.error_with / DEGREE, '.4f', 8),
+                                         (choice.p_value, '.1g', 7)))
         yield wrap_line(f'{choice.effect:26s} {numbers}  '
                         f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
     for pair in selection.confounders:
@@ -335,7 +333,3 @@ def _choice_lines(selection: Selection) -> Iterator[str]:
             yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
                             f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
                             'would distinguish them.')
-
-
-def _format_finite(value: float, format_spec: str) -> str:
-    return format(value, format_spec) if math.isfinite(value) else '-'

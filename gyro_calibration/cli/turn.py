@@ -36,6 +36,7 @@ from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EF
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import sha256_digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
@@ -160,16 +161,16 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
 
 def _lines(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatures: Bins,
            remarks: list[str]) -> Iterator[str]:
-    (rms_before, largest_before), (rms_after, largest_after) = map(
-        _sizes, (errors.static, errors.modelled))
-    yield (f'Error of a turn of 360 deg: largest {_format_error(largest_before)} with the static '
-           f'bias only, {_format_error(largest_after)} with the model, a factor of '
-           f'{_format_ratio(largest_before, largest_after)}; rms {_format_error(rms_before)} and '
-           f'{_format_error(rms_after)}, a factor of {_format_ratio(rms_before, rms_after)}.')
+    rms_phrase, largest_phrase = (
+        (f'{before / DEGREE:.3g} deg ({100.0 * before / math.tau:.2g} %)',
+         f'{after / DEGREE:.3g} deg ({100.0 * after / math.tau:.2g} %)',
+         f'a factor of {f"{before / after:.2g}" if after > 0.0 else "infinity"}')
+        for before, after in zip(_sizes(errors.static), _sizes(errors.modelled)))
+    yield ('Error of a turn of 360 deg: largest {} with the static bias only, {} with the model, '
+           '{}; '.format(*largest_phrase) + 'rms {} and {}, {}.'.format(*rms_phrase))
     yield (f'{len(errors.turns)} turns, {given.slowest:g} deg/s and faster, '
            f'of {len(np.unique(errors.turns.sweep))} sweeps in {given.log}.')
-    for remark in remarks:
-        yield f'{remark[0].upper()}{remark[1:]}.'
+    yield from map(as_sentence, remarks)
     yield from _table('rate [deg/s]', errors, [(low / DEGREE, high / DEGREE, mask)
                                                for low, high, mask in rates])
     yield from _table('temperature [degC]', errors, temperatures)
@@ -177,14 +178,6 @@ def _lines(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatu
 
 def _sizes(errors: Array) -> tuple[float, float]:
     return rms(errors), float(np.abs(errors).max())
-
-
-def _format_error(error: float) -> str:
-    return f'{error / DEGREE:.3g} deg ({100.0 * error / math.tau:.2g} %)'
-
-
-def _format_ratio(before: float, after: float) -> str:
-    return f'{before / after:.2g}' if after > 0.0 else 'infinity'
 
 
 def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:

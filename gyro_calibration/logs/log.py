@@ -27,6 +27,7 @@ import gzip
 import io
 import itertools
 import math
+import os
 from pathlib import Path
 import reprlib
 from typing import Any, NamedTuple
@@ -186,16 +187,12 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                            f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
         table, first_line = _read_header(path, _limit_length(lines), columns, axis)
-        unfolded = 0
+        budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
         while block := _read_block(lines, rows):
-            unfolded += sum(map(len, block))
-            if (compressed and file.seekable()
-                    and unfolded > MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * file.tell()):
-                raise LogError(f'{path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                               'its size, which is the limit; decompress it first if this is '
-                               'intended')
+            if budget:
+                budget.spend(sum(map(len, block)))
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(path, block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
@@ -212,6 +209,21 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
     if count < 2:
         raise LogError(f'{path}: has {count} of the 2 rows of data that are needed at least; '
                        'record more')
+
+
+class ExpansionBudget:
+    """The number of bytes to which the content of a compressed file may expand."""
+
+    def __init__(self, path: str | Path):
+        self._path = path
+        self._remaining = MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * os.stat(path).st_size
+
+    def spend(self, size: int) -> None:
+        """Count bytes, and raise `LogError` beyond the limit."""
+        self._remaining -= size
+        if self._remaining < 0:
+            raise LogError(f'{self._path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
+                           'its size, which is the limit; decompress it first if this is intended')
 
 
 @contextmanager

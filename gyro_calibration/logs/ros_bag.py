@@ -13,7 +13,7 @@ ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and writ
 
 The recording of a killed program lacks its closing part and index, so neither is used: records
 are read from the beginning up to the end, or to the point of truncation. No record may take more
-memory than `MAX_RECORD_BYTES`, and no file may expand to more than `MAX_EXPANSION_RATIO` times its
+memory than `MAX_RECORD_BYTES`, and no file may expand to more than an `ExpansionBudget` of its
 size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
 
@@ -41,16 +41,9 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 import zlib
 
-from gyro_calibration.files import (
-    describe_error,
-    MAX_EXPANSION_RATIO,
-    MIN_EXPANSION_BYTES,
-    open_regular_file,
-    remedy,
-    to_printable,
-)
+from gyro_calibration.files import describe_error, open_regular_file, remedy, to_printable
 from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
-from gyro_calibration.logs.log import excerpt, LogError
+from gyro_calibration.logs.log import excerpt, ExpansionBudget, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
 MAX_RECORD_BYTES = 1 << 28
@@ -177,27 +170,11 @@ def _open_uncompressed(path: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
             source = Path(folder) / path.stem
             with open(source, 'wb') as file:
-                file.writelines(_decompress('zstd', packed, _ExpansionBudget(path)))
+                file.writelines(_decompress('zstd', packed, ExpansionBudget(path)))
             yield source
 
 
-class _ExpansionBudget:
-    """The number of bytes to which the content of a compressed file may expand."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._remaining = MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * path.stat().st_size
-
-    def spend(self, size: int) -> None:
-        """Count bytes, and raise `LogError` beyond the limit."""
-        self._remaining -= size
-        if self._remaining < 0:
-            raise LogError(f'{self._path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                           'its size, which is the limit; record again, or decompress it first if '
-                           'this is intended')
-
-
-def _decompress(compression: str, packed: BinaryIO, budget: _ExpansionBudget) -> Iterator[bytes]:
+def _decompress(compression: str, packed: BinaryIO, budget: ExpansionBudget) -> Iterator[bytes]:
     """Give the data of a compressed stream, up to a truncation or damage."""
     reader: Any
     errors: tuple[type[Exception], ...]
@@ -224,7 +201,7 @@ def _import_library(name: str) -> Any:
                        f'pip install {package}') from None
 
 
-def _decompress_up_to(size: int, compression: str, data: bytes, budget: _ExpansionBudget) -> bytes:
+def _decompress_up_to(size: int, compression: str, data: bytes, budget: ExpansionBudget) -> bytes:
     expanded = bytearray()
     for piece in _decompress(compression, io.BytesIO(data), budget):
         expanded += piece
@@ -233,7 +210,7 @@ def _decompress_up_to(size: int, compression: str, data: bytes, budget: _Expansi
     return bytes(expanded[:size])
 
 
-def _decompress_message(data: bytes, budget: _ExpansionBudget) -> bytes:
+def _decompress_message(data: bytes, budget: ExpansionBudget) -> bytes:
     return (_decompress_up_to(1 << 16, 'zstd', data, budget)
             if data.startswith(_ZSTANDARD_MAGIC) else data)
 
@@ -254,7 +231,7 @@ def _read_mcap(source: Path, path: Path, contents: Contents,
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
             raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
-        reader = _McapReader(contents, _ExpansionBudget(path))
+        reader = _McapReader(contents, ExpansionBudget(path))
         for code, body in _iter_records(file, end, contents):
             if code == _RecordCode.DATA_END:
                 return
@@ -289,7 +266,7 @@ def _iter_records(stream: BinaryIO, end: int, contents: Contents,
 class _McapReader:
     """Reads the records of one file, with its channels and schemas."""
 
-    def __init__(self, contents: Contents, budget: _ExpansionBudget):
+    def __init__(self, contents: Contents, budget: ExpansionBudget):
         self._contents, self._budget = contents, budget
         self._schemas: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[str, str] | None] = {}
@@ -356,7 +333,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     return found
 
 
-def _read_chunk(body: bytes, torn: bool, budget: _ExpansionBudget) -> bytes:
+def _read_chunk(body: bytes, torn: bool, budget: ExpansionBudget) -> bytes:
     """Return the records of a chunk as bytes; of a truncated one those before its end."""
     _, _, size, check = struct.unpack_from('<QQQI', body)
     compression, place = _read_text(body, 28)
@@ -488,7 +465,7 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
     with _open_database(source, path) as (database, tables):
-        channels, budget = _read_topics(database, tables, path, contents), _ExpansionBudget(path)
+        channels, budget = _read_topics(database, tables, path, contents), ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
         with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
