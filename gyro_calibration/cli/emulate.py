@@ -44,7 +44,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_motion_options(parser, default='rest')
     parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=verb.positive_number, metavar='DPS',
+    parser.add_argument('--sensitivity', type=verb.degrees, metavar='DPS',
                         help='deg/s per count of the wire format; default: that of the protocol')
     parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc',
                         help='columns of the protocol csv; default: %(default)s')
@@ -63,7 +63,7 @@ def run(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
     try:
         protocol, settings = find_protocol(given.protocol), Settings(
-            sensitivity=verb.sensitivity(given), columns=tuple(given.columns.split(',')))
+            sensitivity=given.sensitivity, columns=tuple(given.columns.split(',')))
         protocol.check_settings(settings)
     except ValueError as error:
         raise UsageError(str(error)) from None

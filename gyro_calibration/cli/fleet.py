@@ -64,9 +64,8 @@ def add(parser: argparse.ArgumentParser) -> None:
                         'type, drive, date, temperature')
     parser.add_argument('--out', metavar='DIR', required=True, help='folder of the results; logs '
                         'with a result there are not processed again')
-    parser.add_argument(
-        '--pattern', type=_parse_pattern, metavar='TEXT', help='pattern of the file '
-        "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
+    parser.add_argument('--pattern', metavar='TEXT', help='pattern of the file names, without '
+                        "endings, such as 'rc_car_{drive}_unit{unit}'")
     parser.add_argument('--type', metavar='NAME', dest='gyro_type',
                         help='type of the gyro in logs without a type')
     parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
@@ -84,20 +83,14 @@ def add(parser: argparse.ArgumentParser) -> None:
                         'as tcp://host:8786; its workers need the same files')
 
 
-def _parse_pattern(text: str) -> re.Pattern[str]:
-    try:
-        return compile_file_pattern(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def run(given: argparse.Namespace) -> Answer:
+    pattern = compile_file_pattern(given.pattern) if given.pattern else None
     logs = find_logs(given.logs, excluded_folder=given.out)
     folder = os.path.abspath(given.out)
     verb.require_folder(given.out)
     generator = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    records = _process_logs(given, [LogTask(entry, folder, given.technology, given.pattern,
-                                            generator, given.gyro_type or '', given.rate)
+    records = _process_logs(given, [LogTask(entry, folder, given.technology, pattern, generator,
+                                            given.gyro_type or '', given.rate)
                                     for entry in logs])
     used = [each for each in records if each['status'] == DONE]
     if not used:

@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-import csv
 from datetime import datetime, timezone
 import gzip
 import io
@@ -39,7 +38,7 @@ from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.timestamps import read_steady_clock
-from gyro_calibration.files import InputError, to_printable
+from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
@@ -81,7 +80,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                       help='bit/s; default: that of the protocol')
     port.add_argument('--columns', metavar='NAME,...', help='columns of the protocol csv; '
                       f'default: {",".join(Settings().columns)}')
-    port.add_argument('--sensitivity', type=verb.positive_number, metavar='DPS',
+    port.add_argument('--sensitivity', type=verb.degrees, metavar='DPS',
                       help='deg/s per count; default: that of the protocol')
     port.add_argument('--axis', default='z', choices=['x', 'y', 'z'],
                       help='axis of a gyro with three; default: z')
@@ -256,8 +255,7 @@ class CsvRecorder(_Recorder):
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
                                   - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator='\n')
+        text = ''
         if not self._columns:
             # the first value of each column applies from the beginning
             first: dict[str, float] = {}
@@ -267,13 +265,13 @@ class CsvRecorder(_Recorder):
             self._columns, self._start_stamp = list(first), self._rows[0][0]
             seconds, nanoseconds = divmod(self._start_stamp, NSEC_PER_SEC)
             notes = {**self._notes(), 'time_s counts from': f'{seconds}.{nanoseconds:09d} s'}
-            for name, note in notes.items():
-                text.write(f'# {name}: {" ".join(note.split())}\n')
-            writer.writerow(['time_s', *self._columns])
-        for stamp, values in self._rows:
-            writer.writerow([(stamp - self._start_stamp) / NSEC_PER_SEC,
-                             *(values[name] for name in self._columns)])
-        data = text.getvalue().encode()
+            text = ''.join(f'# {name}: {" ".join(note.split())}\n'
+                           for name, note in notes.items())
+            text += format_rows([['time_s', *self._columns]])
+        text += format_rows([(stamp - self._start_stamp) / NSEC_PER_SEC,
+                             *(values[name] for name in self._columns)]
+                            for stamp, values in self._rows)
+        data = text.encode()
         self.append(gzip.compress(data, mtime=0) if self.path.endswith('.gz') else data)
         self._rows.clear()
 
@@ -347,7 +345,7 @@ class _PortSession:
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:
             self._settings = Settings(
-                sensitivity=verb.sensitivity(given), invert=given.invert, axis=given.axis,
+                sensitivity=given.sensitivity, invert=given.invert, axis=given.axis,
                 columns=columns, increments=_INCREMENT_OPTIONS[given.increments],
                 sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-import csv
-import io
 import math
 from typing import Any
 
@@ -37,7 +35,7 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
 from gyro_calibration.diagnosis.words import as_sentence
-from gyro_calibration.files import sha256_digest, write_atomically
+from gyro_calibration.files import format_rows, sha256_digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.ros_bag import list_recording_files
@@ -224,10 +222,8 @@ def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]
 def _write_table(path: str, errors: TurnErrors) -> None:
     turns = errors.turns
     temperature = np.full(len(turns), np.nan) if turns.temperature is None else turns.temperature
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc',
-                     'static_rad_per_turn', 'modelled_rad_per_turn'))
-    writer.writerows(zip(turns.location, *(values.tolist() for values in (
-        turns.sweep, turns.rate, temperature, errors.static, errors.modelled))))
-    write_atomically(path, text.getvalue().encode())
+    write_atomically(path, format_rows([
+        ('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc', 'static_rad_per_turn',
+         'modelled_rad_per_turn'),
+        *zip(turns.location, *(values.tolist() for values in (
+            turns.sweep, turns.rate, temperature, errors.static, errors.modelled)))]).encode())

@@ -243,11 +243,11 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
 
 
 def compile_file_pattern(text: str) -> re.Pattern[str]:
-    """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `ValueError`."""
+    """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `InputError`."""
     parts = re.split(r'\{(\w*)\}', text)
     unknown = [name for name in parts[1::2] if name not in ENTRY_KEYS]
     if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
-        raise ValueError(f'{text}: wanted a file name with {{unit}}, and perhaps '
+        raise InputError(f'{text}: wanted a file name with {{unit}}, and perhaps '
                          f'{", ".join(f"{{{name}}}" for name in ENTRY_KEYS[1:])}, each once')
     return re.compile(''.join(f'(?P<{part}>.+?)' if place % 2 else re.escape(part)
                               for place, part in enumerate(parts)))

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-import csv
 from dataclasses import asdict, dataclass
 from datetime import date
 import io
@@ -44,7 +43,7 @@ from gyro_calibration.diagnosis.words import (
     join_list,
     readable_name,
 )
-from gyro_calibration.files import to_printable
+from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm,
     DRIVES,
@@ -587,23 +586,18 @@ def table_files(types: Sequence[TypeSummary],
         for name, value in (record.get('values', {}) | record.get('slow', {})).items():
             log_rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
     for name, rows in (('logs', log_rows), ('units', list(_unit_rows(types)))):
-        columns = list(dict.fromkeys(key for row in rows for key in row))
+        names = dict.fromkeys(key for row in rows for key in row)
+        columns = {each: [row.get(each) for row in rows] for each in names}
         if not columns:
             continue
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(rows)
-        found[f'{name}.csv'] = text.getvalue().encode()
+        found[f'{name}.csv'] = format_rows([columns, *zip(*columns.values())]).encode()
         try:
             import pyarrow
             from pyarrow import parquet
         except ImportError:
             continue
         stream = io.BytesIO()
-        parquet.write_table(
-            pyarrow.table({column: [row.get(column) for row in rows] for column in columns}),
-            stream)
+        parquet.write_table(pyarrow.table(columns), stream)
         found[f'{name}.parquet'] = stream.getvalue()
     return found
 

@@ -35,6 +35,7 @@ import zlib
 
 from gyro_calibration.files import (
     describe_error,
+    format_rows,
     InputError,
     MAX_EXPANSION_RATIO,
     MAX_MAGNITUDE,
@@ -645,13 +646,10 @@ def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, 
                         for name, texts in log.others.items()}
             columns |= {name: np.asarray(values, dtype=float).tolist()
                         for name, values in more.items()}
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator='\n')
-            if number == 0:
-                text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
-                writer.writerow(columns)
-            writer.writerows(zip(*columns.values()))
-            data.write(text.getvalue().encode('utf-8', 'backslashreplace'))
+            notes = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
+            head = '' if number else notes + format_rows([columns])
+            data.write((head + format_rows(zip(*columns.values()))).encode(
+                'utf-8', 'backslashreplace'))
 
 
 def _normalize_newlines(text: str) -> str:

@@ -21,7 +21,7 @@ and all other corrections.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import os.path
 from pathlib import Path
@@ -29,16 +29,7 @@ from typing import Any
 
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
-from gyro_calibration.logs.log import (
-    Array,
-    BLOCK_ROWS,
-    Log,
-    LogError,
-    Mask,
-    mask_invalid,
-    select_rows,
-    unwrap_heading,
-)
+from gyro_calibration.logs.log import Array, Log, LogError, Mask, mask_invalid, unwrap_heading
 from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
 import numpy as np
 from numpy.typing import NDArray
@@ -185,12 +176,6 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     for note in log.notes:
         on_note(note)
     return replace(log, notes=(*log.notes, *contents.recorder_notes))
-
-
-def split_blocks(log: Log, rows: int = BLOCK_ROWS) -> Iterator[Log]:
-    """Give a log in blocks, as a log file is read."""
-    for begin in range(0, len(log), rows):
-        yield select_rows(log, slice(begin, begin + rows))
 
 
 class _LogBuilder:

@@ -19,7 +19,6 @@ import math
 from gyro_calibration.logs.log import Array, Number
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.special import xlogy
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR_RATIO = math.sqrt(2.0 * math.log(2.0) / math.pi)
@@ -163,8 +162,9 @@ class NoiseTerm:
 ANGLE_RANDOM_WALK = NoiseTerm('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
                               lambda time: -0.5 * np.abs(time))
 # t² ln t / (2 pi), whose second difference has the Allan variance 2 ln 2 / pi
-FLICKER = NoiseTerm('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 2,
-                    lambda time: xlogy(np.square(time), np.abs(time)) / (2.0 * math.pi))
+FLICKER = NoiseTerm(
+    'bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 2, lambda time: (
+        np.square(time) * np.log(np.abs(np.where(time, time, 1.0))) / (2.0 * math.pi)))
 RATE_RANDOM_WALK = NoiseTerm('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
                              lambda time: np.abs(time) ** 3 / 12.0)
 QUANTIZATION = NoiseTerm('quantization', 'Q', 'rad', -1.0, 3.0,
