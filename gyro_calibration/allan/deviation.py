@@ -272,23 +272,15 @@ def allan_deviation(rate: Array, interval: float,
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Averaging
-    times, s, are taken to the nearest whole number of intervals; by default they are ten a decade,
-    up to a third of the record. Raise `DataRefused` for too few samples, or a time that does not
-    fit twice into the record.
+    times, s, from an interval to half the record, are taken to the nearest whole number of
+    intervals; by default they are ten a decade, up to a third of the record. Raise `DataRefused`
+    for too few samples.
 
     """
     _refuse_few(int(np.isfinite(rate).sum()))
     samples = len(rate)
-    if times is None:
-        sizes = averaging_sizes(samples)
-    else:
-        sizes = np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64))
-        if not sizes.size or sizes[0] < 1 or 2 * sizes[-1] > samples:
-            given = (f'{sizes[0] * interval:g} to {sizes[-1] * interval:g} s' if sizes.size
-                     else 'none')
-            raise DataRefused(f'averaging times: {given}; wanted at least one sample, '
-                              f'{interval:g} s, and at most half the record, '
-                              f'{samples // 2 * interval:g} s: choose others, or record longer')
+    sizes = (averaging_sizes(samples) if times is None else
+             np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64)))
     sums, counts = _sum_squared_differences(rate, sizes)
     some = counts > 0
     sizes, counts = sizes[some], counts[some]

@@ -183,11 +183,11 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
         if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
-            raise LogError(f'{path}: is a recording of ROS 1; wanted a log file or a ROS 2 '
-                           'recording: convert it, by pip install rosbags and '
+            raise LogError('is a recording of ROS 1; wanted a log file or a ROS 2 recording: '
+                           'convert it, by pip install rosbags and '
                            f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
-        table, first_line = _read_header(path, _limit_length(lines), columns, axis)
+        table, first_line = _read_header(_limit_length(lines), columns, axis)
         budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
@@ -195,11 +195,11 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if budget:
                 budget.spend(sum(map(len, block)))
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
-                                      or _parse_text_rows(path, block, lines, first_line, table))
+                                      or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
-            last = _refuse_unordered_time(path, places, arrays.get('time'), last)
+            last = _refuse_unordered_time(places, arrays.get('time'), last)
             rotation.replace_attitude(arrays)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
@@ -207,30 +207,32 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                 on_progress(file.tell())
             if count > 1:
                 yield Log(**arrays, notes=table.notes, others=others)
-    if count < 2:
-        raise LogError(f'{path}: has {count} of the 2 rows of data that are needed at least; '
-                       'record more')
+        if count < 2:
+            raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
+                           'more')
 
 
 class ExpansionBudget:
     """The number of bytes to which the content of a compressed file may expand."""
 
     def __init__(self, path: str | Path):
-        self._path = path
         self._remaining = MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * os.stat(path).st_size
 
     def spend(self, size: int) -> None:
         """Count bytes, and raise `LogError` beyond the limit."""
         self._remaining -= size
         if self._remaining < 0:
-            raise LogError(f'{self._path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                           'its size, which is the limit; decompress it first if this is intended')
+            raise LogError(f'decompresses to more than {MAX_EXPANSION_RATIO} times its size, '
+                           'which is the limit; decompress it first if this is intended')
 
 
 @contextmanager
 def _convert_read_errors(path: str | Path) -> Iterator[None]:
+    """Put the name of the file before each error."""
     try:
         yield
+    except InputError as error:
+        raise LogError(f'{path}: {error}') from None
     except UnicodeDecodeError as error:
         code = 'UTF-16' if error.object[:1] in (b'\xff', b'\xfe') else 'WINDOWS-1252'
         raise LogError(
@@ -286,7 +288,7 @@ class _FileHeader(NamedTuple):
     delimiter: str
 
 
-def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
+def _read_header(lines: Iterator[str], columns: Mapping[str, str],
                  axis: str) -> tuple[_FileHeader, int]:
     """Return notes and header, and the number of the next line."""
     notes, line = [], next(lines, '')
@@ -298,17 +300,14 @@ def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, s
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):
         if not header:
-            raise LogError(f'{path}: has no line with the names of columns; record again, or name '
-                           'another file')
+            raise LogError('has no line with the names of columns; record again, or name another '
+                           'file')
         meant = suggest_columns(header) or (
             '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
             'lines above it, or name the columns, as by --columns time=NAME:s,gyro=NAME:deg/s')
-        raise LogError(f'{path}: line {len(notes) + 1} is no header with a known column: '
+        raise LogError(f'line {len(notes) + 1} is no header with a known column: '
                        f'{excerpt(line.strip())}{meant}')
-    try:
-        found = find_columns(header, columns, axis)
-    except InputError as error:
-        raise LogError(f'{path}: {error}') from None
+    found = find_columns(header, columns, axis)
     taken = {column.position for column in found.values()}
     others = {name: index for index, name in enumerate(_make_unique(header))
               if index not in taken and header[index] not in COLUMNS}
@@ -352,15 +351,15 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
     return range(first_line, first_line + len(lines) + 1), arrays, {}
 
 
-def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterator[str],
-                     first_line: int, table: _FileHeader) -> _ParsedRows:
+def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_line: int,
+                     table: _FileHeader) -> _ParsedRows:
     """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
     reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines)),
                         delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
-            raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has '
+            raise LogError(f'line {places[-1]} has {len(row)} values where the header has '
                            f'{len(header)}; correct or remove the line')
         rows.append(row)
         places.append(first_line + reader.line_num)
@@ -370,13 +369,13 @@ def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterat
     if table.delimiter != ',':
         for index, _, _ in table.columns.values():
             texts[index] = tuple(text.replace(',', '.') for text in texts[index])
-    arrays = {quantity: _parse_numbers(path, places, header[index], texts[index], quantity)
+    arrays = {quantity: _parse_numbers(places, header[index], texts[index], quantity)
               * factor + offset for quantity, (index, factor, offset) in table.columns.items()}
     return places, arrays, {name: texts[index] for name, index in table.other_columns.items()}
 
 
-def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
-                   texts: tuple[str, ...], quantity: str) -> Array:
+def _parse_numbers(line_numbers: Sequence[int], column: str, texts: tuple[str, ...],
+                   quantity: str) -> Array:
     if quantity in _NULLABLE_QUANTITIES:
         texts = tuple(text.strip() or 'nan' for text in texts)
     found: list[float] = []
@@ -387,16 +386,16 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
         remedy = ('give seconds, or the sample rate with --rate'
                   if quantity == 'time' else 'leave the cell empty if the value is lost'
                   if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
-        raise LogError(f'{path}: line {line_numbers[row]}, column {column}: '
-                       f'{reprlib.repr(texts[row])} is not a number; {remedy}') from None
+        raise LogError(f'line {line_numbers[row]}, column {column}: {reprlib.repr(texts[row])} '
+                       f'is not a number; {remedy}') from None
     values = np.array(found)
     wrong = mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
         fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
                  if np.isfinite(values[row]) else 'not a finite number')
-        raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
-                       f'is {fault}; remove the row')
+        raise LogError(f'line {line_numbers[row]}, column {column}: {excerpt(texts[row])} is '
+                       f'{fault}; remove the row')
     return values
 
 
@@ -417,22 +416,22 @@ def excerpt(text: str) -> str:
     return to_printable(text[:100])
 
 
-def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: Array | None,
+def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,
                            previous_time: float, place: str = 'line') -> float:
     """Refuse time that does not increase or is too large; return the last time."""
     if time is None or not len(time):
         return previous_time
     if (far := np.abs(time) > MAX_TIME).any():
         row = int(np.argmax(far))
-        raise LogError(f'{path}: {place} {line_numbers[row]}, column time_s: {time[row]:g} s is '
-                       f'beyond the limit of {MAX_TIME:g} s; give its unit, as by --columns '
+        raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is beyond '
+                       f'the limit of {MAX_TIME:g} s; give its unit, as by --columns '
                        'time=time_s:ns')
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{path}: {place} {line_numbers[row]}, column time_s: {time[row]:g} s is '
-                       f'not later than {time[row - 1] if row else previous_time:g} s; sort the '
-                       'rows, or give the sample rate with --rate')
+        raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is not later '
+                       f'than {time[row - 1] if row else previous_time:g} s; sort the rows, or '
+                       'give the sample rate with --rate')
     return float(time[-1])
 
 
@@ -484,8 +483,8 @@ def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> No
             row = int(np.argmax(wrong))
             raise LogError(f'row {row} of {names.get(quantity, quantity)} is {values[row]:g}; '
                            'remove the row')
-    _refuse_unordered_time('the log', range(len(arrays.get('time', ()))), arrays.get('time'),
-                           -math.inf, 'row')
+    _refuse_unordered_time(range(len(arrays.get('time', ()))), arrays.get('time'), -math.inf,
+                           'row')
 
 
 def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:

@@ -146,6 +146,8 @@ def read_messages(path: str | Path, contents: Contents,
             with _open_uncompressed(file) as source:
                 yield from read(source, file, contents, on_place)
             done += file.stat().st_size
+        except LogError as error:
+            raise LogError(f'{file}: {error}') from None
         except OSError as error:
             raise LogError(f'{file}: cannot be read ({describe_error(error)}); '
                            f'{remedy(error, file)}') from error
@@ -230,7 +232,7 @@ def _read_mcap(source: Path, path: Path, contents: Contents,
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
-            raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
+            raise LogError('is not an MCAP file; name a recording, or record again')
         reader = _McapReader(contents, ExpansionBudget(path))
         for code, body in _iter_records(file, end, contents):
             if code == _RecordCode.DATA_END:
@@ -464,8 +466,8 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
-    with _open_database(source, path) as (database, tables):
-        channels, budget = _read_topics(database, tables, path, contents), ExpansionBudget(path)
+    with _open_database(source) as (database, tables):
+        channels, budget = _read_topics(database, tables, contents), ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
         with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
@@ -485,7 +487,7 @@ def _read_database(source: Path, path: Path, contents: Contents,
 
 
 @contextmanager
-def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
+def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """Open a database read-only, and give it with the names of its tables of stored columns."""
     # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
     # count corrected. Computed columns are not read: their cost is not limited by the size of the
@@ -501,12 +503,12 @@ def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connectio
                 continue
             with closing(database):
                 if not {'topics', 'messages'} <= tables:
-                    raise LogError(f'{path}: is a database, but not a ROS 2 recording with tables '
-                                   'of stored columns; name a recording')
+                    raise LogError('is a database, but not a ROS 2 recording with tables of '
+                                   'stored columns; name a recording')
                 yield database, tables
                 return
-    raise LogError(f'{path}: cannot be read as a ROS 2 recording '
-                   f'({_describe_database_error(reason)}); name a recording, or record again')
+    raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '
+                   'name a recording, or record again')
 
 
 def _describe_database_error(error: Exception | None) -> str:
@@ -547,7 +549,7 @@ def _correct_page_count(source: Path, folder: Path) -> Path:
     return copy
 
 
-def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
+def _read_topics(database: sqlite3.Connection, tables: set[str],
                  contents: Contents) -> dict[int, tuple[str, str] | None]:
     try:
         definitions = dict(database.execute(
@@ -558,5 +560,5 @@ def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
                 for number, topic, kind, encoding in database.execute(
                     'SELECT id, name, type, serialization_format FROM topics')}
     except _DATABASE_ERRORS as error:
-        raise LogError(f'{path}: its list of topics cannot be read '
+        raise LogError('its list of topics cannot be read '
                        f'({_describe_database_error(error)}); record again') from error
