@@ -31,8 +31,9 @@ from gyro_calibration.allan.deviation import (
 from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import readable_name
+from gyro_calibration.files import InputError
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
@@ -55,7 +56,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.model and not given.out:
-        raise UsageError('--model was given without --out; give the file to write with --out')
+        raise InputError('--model was given without --out; give the file to write with --out')
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
     try:
         time = verb.require_time(given, log)

@@ -26,7 +26,8 @@ import math
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer
+from gyro_calibration.files import InputError
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX_GAP, Threshold
@@ -64,7 +65,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Totals()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
-        raise UsageError('--rest and --hindsight need no --threshold and a model with an angle '
+        raise InputError('--rest and --hindsight need no --threshold and a model with an angle '
                          'random walk; run allan to add it to the model')
     write_log_blocks(given.out, _compensate_and_count(given, model, found))
     return _answer(given, model, found)

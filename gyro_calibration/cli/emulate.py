@@ -27,10 +27,9 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.simulate import add_motion_options, simulate_log
-from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
-from gyro_calibration.files import to_printable
+from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 
@@ -66,7 +65,7 @@ def run(given: argparse.Namespace) -> None:
             sensitivity=given.sensitivity, columns=tuple(given.columns.split(',')))
         protocol.check_settings(settings)
     except ValueError as error:
-        raise UsageError(str(error)) from None
+        raise InputError(str(error)) from None
     log = verb.read(given) if given.log else simulate_log(given)[0]
     time, output = verb.require_time(given, log), np.asarray(log.output)
     if np.isfinite(output).sum() < 2:

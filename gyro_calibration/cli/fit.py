@@ -35,10 +35,10 @@ from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit
-from gyro_calibration.files import suggest_nearest
+from gyro_calibration.files import InputError, suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
@@ -99,7 +99,7 @@ def _parse_orders(text: str) -> list[Effect]:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.matrix and not given.polynomial:
-        raise UsageError('--matrix needs --polynomial: other effects have no matrix')
+        raise InputError('--matrix needs --polynomial: other effects have no matrix')
     effects = given.effects or given.polynomial or ()
     logs = dict(zip(given.log, verb.read_each(given)))
     with show_progress('fit of effects'):
@@ -111,7 +111,7 @@ def run(given: argparse.Namespace) -> Answer:
     model = replace(found.model, gyro={name: value for name, value in identity.items() if value},
                     origin=verb.make_origin(given.log))
     if given.surface and not isinstance(found, Selection):
-        raise UsageError(HEADING_ALONE)
+        raise InputError(HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
     lines, data = (_answer_dwells(given, model, found) if isinstance(found, Selection)

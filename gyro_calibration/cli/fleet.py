@@ -29,9 +29,9 @@ from typing import Any
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
-from gyro_calibration.files import to_printable, write_atomically
+from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.fleet.logs import (
     compile_file_pattern,
     DONE,
@@ -177,10 +177,10 @@ def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
         with cluster_executors(given.scheduler) as create:
             yield given.workers or 64, create
     except ImportError:
-        raise UsageError('--scheduler needs distributed, which is not installed; install '
+        raise InputError('--scheduler needs distributed, which is not installed; install '
                          'gyro_calibration[fleet] or omit --scheduler') from None
     except (OSError, ValueError) as error:
-        raise UsageError(f'{given.scheduler}: no Dask scheduler answers there '
+        raise InputError(f'{given.scheduler}: no Dask scheduler answers there '
                          f'({type(error).__name__}); give its address, such as '
                          'tcp://host:8786') from None
 

@@ -43,7 +43,7 @@ from gyro_calibration.calibration.self_calibration import (
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import (
@@ -95,13 +95,13 @@ def _parse_turns(text: str) -> int | str:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.turns is not None and given.profile:
-        raise UsageError('--turns and --profile were both given; '
+        raise InputError('--turns and --profile were both given; '
                          'give one of them as the reference')
     if given.turns is not None and given.picture:
-        raise UsageError('--picture draws a run against a motion, which --turns does not have; '
+        raise InputError('--picture draws a run against a motion, which --turns does not have; '
                          'omit one of the two')
     if given.turns is None and given.marking is not None:
-        raise UsageError('--marking needs --turns, whose mark it is the error of; '
+        raise InputError('--marking needs --turns, whose mark it is the error of; '
                          'omit it, or give --turns')
     model = read_model(given.model) if given.model else GyroModel()
     log = verb.read(given)
@@ -117,8 +117,7 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
     except InputError as error:
         if given.profile:
             raise
-        kind = DataRefused if isinstance(error, DataRefused) else UsageError
-        raise kind(f'{given.log}: {error} with --profile') from None
+        raise type(error)(f'{given.log}: {error} with --profile') from None
     _refuse_implausible(given, model, log)
     scale = given.reference_scale_deviation
     usual = default_reference_errors(motion) if given.profile else ReferenceErrors()

@@ -33,9 +33,9 @@ from gyro_calibration.calibration.scatter import cross_validation_parts, find_in
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
-from gyro_calibration.files import format_rows, sha256_digest, write_atomically
+from gyro_calibration.files import format_rows, InputError, sha256_digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.ros_bag import list_recording_files
@@ -66,7 +66,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.model and given.technology:
-        raise UsageError('--technology selects effects, and --model has its own; give one of '
+        raise InputError('--technology selects effects, and --model has its own; give one of '
                          'the two')
     log = verb.read(given)
     found = extract_dwells(log)

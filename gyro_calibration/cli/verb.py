@@ -89,10 +89,6 @@ def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
         yield lambda place: bar.update(place - bar.n)
 
 
-class UsageError(InputError):
-    """Wrong use of the program; the message is one sentence."""
-
-
 @dataclass(frozen=True)
 class Answer:
     """The result of a verb: lines for people, data in SI, and the files that were written."""
@@ -286,7 +282,7 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
 
 def _orient_output(given: argparse.Namespace, log: Log) -> Log:
     if log.output is None:
-        raise UsageError(f'{given.log}: has gyro_counts only; '
+        raise InputError(f'{given.log}: has gyro_counts only; '
                          'give the deg/s per count with --sensitivity')
     return replace(log, output=-log.output) if given.invert else log
 
@@ -294,12 +290,12 @@ def _orient_output(given: argparse.Namespace, log: Log) -> Log:
 def require_folder(path: str) -> None:
     """Refuse a file where a folder of results is wanted."""
     if os.path.exists(path) and not os.path.isdir(path):
-        raise UsageError(f'{path}: is a file, but must be a folder; give another name')
+        raise InputError(f'{path}: is a file, but must be a folder; give another name')
 
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; name its '
+        raise InputError(f'{given.log}: has no time_s, which {given.name} needs; name its '
                          'column, as by --columns time=NAME:s, or give the sample rate in Hz '
                          'with --rate')
     return log.time

@@ -226,20 +226,17 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
             columns):
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
                          f'{", ".join(ENTRY_KEYS)}, each once')
-    lines = _read_text(path).splitlines()
-    rows = csv.reader(lines, delimiter=_find_separator(lines[0]))
-    next(rows)
-    for number, row in enumerate(rows, 2):
+    first, *lines = _read_text(path).splitlines()
+    for number, row in enumerate(csv.reader(lines, delimiter=_find_separator(first)), 2):
         if not any(map(str.strip, row)):
             continue
         if len(row) != len(columns):
             raise InputError(f'{path}, line {number}: holds {len(row)} values, wanted '
                              f'{len(columns)} as in its first line')
-        stated = dict(zip(columns, row))
-        log = stated.pop('log').strip()
-        if not log:
+        stated = dict(zip(columns, map(str.strip, row)))
+        if not stated['log']:
             raise InputError(f'{path}, line {number}: names no log')
-        yield FleetLog(_resolve_log_path(path, log)).fill_missing(stated)
+        yield FleetLog(_resolve_log_path(path, stated['log'])).fill_missing(stated)
 
 
 def compile_file_pattern(text: str) -> re.Pattern[str]:
