@@ -28,15 +28,13 @@ from pathlib import Path
 import reprlib
 from typing import Any
 
-from gyro_calibration.allan.deviation import allan_deviation, AllanChart, build_rest_record
-from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
 from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
 from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
-from gyro_calibration.cli import allan as allan_answer
 from gyro_calibration.cli import plots
+from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures
 from gyro_calibration.cli.compensate import (
     check_finite,
     CompensatedBlock,
@@ -46,6 +44,7 @@ from gyro_calibration.cli.compensate import (
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
+from gyro_calibration.cli.verb import PrintedResult
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
 from gyro_calibration.diagnosis.report import render_report
@@ -73,13 +72,6 @@ __all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_l
 
 #: A motion by its name or file, as (time, rate) in s and rad/s, or as the reference of a log.
 MotionLike = str | Path | tuple[Any, Any] | Log | Motion
-
-
-class _PrintedResult:
-    """A record with a text, that a notebook shows too."""
-
-    def _repr_html_(self) -> str:
-        return f'<pre>{escape(str(self))}</pre>'
 
 
 def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
@@ -152,7 +144,7 @@ def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: flo
 
 
 @dataclass(frozen=True)
-class Headings(_PrintedResult):
+class Headings(PrintedResult):
     """Rates and heading of a log, corrected by a model; nan where the output was not plausible."""
 
     log: Log  # that was corrected
@@ -225,7 +217,7 @@ def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
 
 
 @dataclass(frozen=True)
-class Run(_PrintedResult):
+class Run(PrintedResult):
     """A self-calibration."""
 
     model: GyroModel  # the given model with the new self-calibration
@@ -271,7 +263,7 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
 
 
 @dataclass(frozen=True)
-class Fitted(_PrintedResult):
+class Fitted(PrintedResult):
     """A calibration by a rate table, a turntable or a reference heading."""
 
     model: GyroModel  # with the fitted effects and their covariance
@@ -314,26 +306,6 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
                   found)
 
 
-@dataclass(frozen=True)
-class NoiseFigures(_PrintedResult):
-    """The noise of a gyro at rest: angle random walk, bias instability and so on."""
-
-    chart: AllanChart  # Allan deviations with their bounds
-    fit: NoiseFit  # the noise figures
-    _lines: tuple[str, ...] = field(repr=False)
-
-    def __str__(self) -> str:
-        return '\n'.join(self._lines)
-
-    def put_into(self, model: GyroModel) -> GyroModel:
-        """Return a model with these figures as its noise."""
-        return replace(model, noise=self.fit.noise, noise_bounds=self.fit.noise_bounds)
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Return the Allan chart."""
-        return plots.draw_allan(path, self.chart, self.fit, allan_answer.figure_labels(self.fit))
-
-
 def allan(log: Log) -> NoiseFigures:
     """
     Find the noise figures of a gyro in a log at rest, by its Allan deviation.
@@ -341,14 +313,12 @@ def allan(log: Log) -> NoiseFigures:
     `ValueError` says that the gyro moved, is dead, or has uneven stamps.
 
     """
-    time, output = _require_time(log)
-    even = build_rest_record(time, output, log.moving, log.reference_heading)
-    chart, found = allan_deviation(even.rate, even.interval), fit_noise(even.rate, even.interval)
-    return NoiseFigures(chart, found, tuple(allan_answer.answer_lines(even, chart, found)))
+    _require_time(log)
+    return find_noise_figures(log)
 
 
 @dataclass(frozen=True)
-class Diagnosed(_PrintedResult):
+class Diagnosed(PrintedResult):
     """The error of a simulation against a log, and its causes."""
 
     model: GyroModel  # the extended model; the given one where no extension is offered

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from html import escape
 import importlib.util
 import math
 import os
@@ -87,6 +88,13 @@ def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
     with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
               leave=False, disable=None) as bar:
         yield lambda place: bar.update(place - bar.n)
+
+
+class PrintedResult:
+    """A record with a text, that a notebook shows too."""
+
+    def _repr_html_(self) -> str:
+        return f'<pre>{escape(str(self))}</pre>'
 
 
 @dataclass(frozen=True)

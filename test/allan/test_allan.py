@@ -18,7 +18,7 @@ from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.allan import noise_fit
 from gyro_calibration.allan.deviation import allan_deviation, build_rest_record
 from gyro_calibration.allan.noise_fit import fit_noise
-from gyro_calibration.cli.allan import figure_labels
+from gyro_calibration.cli.allan import find_noise_figures
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.noise import (
@@ -366,8 +366,8 @@ def test_the_verb_says_the_figures_in_units_of_people_and_in_si(log, tmp_path, r
     assert (read_model(tmp_path / 'model.yaml').noise.bias_instability == value
             != pytest.approx(answer['floor']['deviation'] / ALLAN_FLOOR_RATIO, rel=0.05))
     assert f'Bias instability B: {value / DEGREE * 3600.0:.4g} deg/h,' in text
-    labels = figure_labels(fit_noise(read_log(log).output, INTERVAL))
-    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in labels['B']
+    legend = find_noise_figures(read_log(log)).plot().axes[0].get_legend().get_texts()
+    assert any(f'B = {value / DEGREE * 3600.0:.3g} deg/h' in each.get_text() for each in legend)
 
 
 def test_the_verb_puts_the_figures_into_a_model_and_loses_nothing_else(log, tmp_path, run):
