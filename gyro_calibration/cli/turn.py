@@ -118,12 +118,11 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
     if found.temperature is None and model.uses_channel('temperature'):
         remarks.append('the log has no temperature: '
                        'the model was used at its reference temperature')
-    if clipped:
-        remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated '
-                       'temperatures; the correction is extrapolated')
-    if beyond:
-        remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; '
-                       'the correction is extrapolated')
+    for count, where in ((clipped, 'outside the calibrated temperatures'),
+                         (beyond, 'beyond the calibrated rates')):
+        if count:
+            remarks.append(f'{count} of {len(found)} dwells are {where}; the correction is '
+                           'extrapolated')
     rate = result.rate
     if model.needs_history:  # the model depends on the past: the log is compensated row by row
         error = np.asarray(log.output) - compensate_log(model, log)
