@@ -28,10 +28,9 @@ from pathlib import Path
 import reprlib
 from typing import Any
 
-from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
+from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
-from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import plots
 from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures
@@ -42,7 +41,7 @@ from gyro_calibration.cli.compensate import (
     track_log,
 )
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
-from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
+from gyro_calibration.cli.fit import Fitted
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.cli.verb import PrintedResult
 from gyro_calibration.diagnosis.findings import Diagnosis
@@ -260,24 +259,6 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
     calibration = make_self_calibration(run.fit, method, log, run.is_used)
     return Run(with_self_calibration(model, calibration), run.fit.scale_factor_error,
                run.fit.bias, *calibration.standard_deviations, run.fit, run)
-
-
-@dataclass(frozen=True)
-class Fitted(PrintedResult):
-    """A calibration by a rate table, a turntable or a reference heading."""
-
-    model: GyroModel  # with the fitted effects and their covariance
-    #: Effects, dwells and residuals; or the fit of a reference heading.
-    found: Selection | EncoderCalibration = field(repr=False)
-
-    def __str__(self) -> str:
-        return '\n'.join(dwell_lines(self.model, self.found) if isinstance(self.found, Selection)
-                         else heading_lines(self.model, self.found, self.found.remarks))
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Return a figure of the errors before and after the fit."""
-        return (plots.draw_residuals(path, self.found.calibration)
-                if isinstance(self.found, Selection) else draw_headings(path, self.found))
 
 
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,

@@ -533,7 +533,7 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
 
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
-MIN_DWELLS = 3
+_MIN_DWELLS = 3
 HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
                  'effects, --matrix and --surface use --method dwells')
 
@@ -555,7 +555,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         try:
             table = join_dwells([_extract_named_dwells(path, log) if len(logs) > 1
                                  else extract_dwells(log) for path, log in logs.items()])
-            if is_settled or len(table) >= MIN_DWELLS or any(
+            if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
                 return (Selection(fit_effects(table, effects), (), ()) if effects
                         else select_effects(table, technology))
@@ -568,7 +568,11 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     if others:
         raise InputError(HEADING_ALONE)
     (log,) = logs.values()
-    return calibrate_encoder(log, method, technology=technology or 'mems')
+    found = calibrate_encoder(log, method, technology=technology or 'mems')
+    return found if log.reference_heading is not None else replace(found, remarks=(
+        f'the log has a reference rate, and fewer than {_MIN_DWELLS} stretches of constant rate; '
+        'so the rate is integrated, and headings are compared. For other effects than bias and '
+        'scale factor error, hold each rate for some seconds', *found.remarks))
 
 
 def _extract_named_dwells(path: str, log: Log) -> Dwells:

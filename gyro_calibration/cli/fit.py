@@ -18,24 +18,19 @@ example: gyro_calibration fit table.csv --out model.yaml
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.dwells import format_list
-from gyro_calibration.calibration.encoder import (
-    calibrate,
-    EncoderCalibration,
-    HEADING_ALONE,
-    MIN_DWELLS,
-)
+from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration, HEADING_ALONE
 from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
+from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit
 from gyro_calibration.files import InputError, suggest_nearest
@@ -114,8 +109,10 @@ def run(given: argparse.Namespace) -> Answer:
         raise InputError(HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
+    if given.picture:
+        Fitted(model, found).plot(given.picture)
     lines, data = (_answer_dwells(given, model, found) if isinstance(found, Selection)
-                   else _answer_heading(given, logs, model, found))
+                   else _answer_heading(logs, model, found))
     return Answer(lines, {'out': given.out, **_model_data(model), **data},
                   (given.picture, given.surface, given.out))
 
@@ -123,14 +120,12 @@ def run(given: argparse.Namespace) -> Answer:
 def _answer_dwells(given: argparse.Namespace, model: GyroModel,
                    found: Selection) -> tuple[list[str], dict[str, Any]]:
     fit = found.calibration
-    if given.picture:
-        plots.draw_residuals(given.picture, fit)
     if given.surface:
         plots.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range,
                                  fit.used)
     matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
                    if term.effect.name == POLYNOMIAL), None)
-    lines = list(dwell_lines(model, found))
+    lines = list(_dwell_lines(model, found))
     if given.technology and not found.choices:
         lines.append(f'--technology {given.technology} is stored in the model; it had no '
                      'influence, since the effects were given.')
@@ -142,33 +137,43 @@ def _answer_dwells(given: argparse.Namespace, model: GyroModel,
                    'remarks': list(fit.dwells.remarks)}
 
 
-def _answer_heading(given: argparse.Namespace, logs: Mapping[str, Log], model: GyroModel,
+def _answer_heading(logs: Mapping[str, Log], model: GyroModel,
                     found: EncoderCalibration) -> tuple[list[str], dict[str, Any]]:
-    ((path, log),), fit, remarks = logs.items(), found.fit, list(found.remarks)
-    if given.picture:
-        draw_headings(given.picture, found)
-    if log.reference_heading is None:
-        remarks.insert(
-            0, f'the log has a reference rate, and fewer than {MIN_DWELLS} stretches of '
-            'constant rate; so the rate is integrated, and headings are compared. For other '
-            'effects than bias and scale factor error, hold each rate for some seconds')
+    ((path, log),), fit = logs.items(), found.fit
     return ([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
-             *heading_lines(model, found, remarks)],
+             *_heading_lines(model, found)],
             {'method': found.method, 'time_offset_s': fit.time_offset,
              'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
              'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
              **{f'{name}_heading_{when}_rad': getattr(residual, name)
                 for name in ('rms', 'largest') for when, residual in (
                     ('before', found.residual_before), ('after', found.residual_after))},
-             'remarks': remarks})
+             'remarks': list(found.remarks)})
 
 
-def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
-    """Draw the headings of a reference and of the gyro, and return the figure."""
-    name = 'course over ground' if found.method == 'course' else 'reference'
-    motion = found.reference
-    return plots.draw_reference(path, motion.time, motion.heading - motion.heading[0],
-                                found.residual_before.heading, found.residual_after.heading, name)
+@dataclass(frozen=True)
+class Fitted(PrintedResult):
+    """A calibration by a rate table, a turntable or a reference heading."""
+
+    model: GyroModel  # with the fitted effects and their covariance
+    #: Effects, dwells and residuals; or the fit of a reference heading.
+    found: Selection | EncoderCalibration = field(repr=False)
+
+    def __str__(self) -> str:
+        return '\n'.join(_dwell_lines(self.model, self.found)
+                         if isinstance(self.found, Selection)
+                         else _heading_lines(self.model, self.found))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the errors before and after the fit."""
+        found = self.found
+        if isinstance(found, Selection):
+            return plots.draw_residuals(path, found.calibration)
+        motion = found.reference
+        return plots.draw_reference(
+            path, motion.time, motion.heading - motion.heading[0], found.residual_before.heading,
+            found.residual_after.heading,
+            'course over ground' if found.method == 'course' else 'reference')
 
 
 def _model_data(model: GyroModel) -> dict[str, Any]:
@@ -217,7 +222,7 @@ def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
             'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
 
 
-def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
+def _dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
     fit = selection.calibration
     yield from _dwell_count_lines(fit)
@@ -237,8 +242,7 @@ def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     yield from _choice_lines(selection)
 
 
-def heading_lines(model: GyroModel, found: EncoderCalibration,
-                  remarks: Iterable[str]) -> Iterator[str]:
+def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
     """Give the result of a fit to a heading, and the errors before and after."""
     yield from (*_value_lines(model), '')
     if math.isfinite(found.fit.time_offset):
@@ -253,7 +257,7 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
                   'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
                   'needs stretches of constant rate in the log.')
         yield wrap_line(f'The error is above 5 deg rms. {remedy}')
-    yield from (wrap_line(as_sentence(remark)) for remark in remarks)
+    yield from (wrap_line(as_sentence(remark)) for remark in found.remarks)
 
 
 def _value_lines(model: GyroModel) -> Iterator[str]:
