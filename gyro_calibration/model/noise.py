@@ -159,12 +159,16 @@ class NoiseTerm:
         return self.allan_factor * np.asarray(time, dtype=float) ** (2.0 * self.slope)
 
 
+def _flicker_covariance(time: Number) -> Array:
+    """Return t² ln t / (2 pi): the second difference has the Allan variance 2 ln 2 / pi."""
+    size = np.abs(time)
+    return size ** 2 * np.log(np.where(size == 0.0, 1.0, size)) / (2.0 * math.pi)
+
+
 ANGLE_RANDOM_WALK = NoiseTerm('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
                               lambda time: -0.5 * np.abs(time))
-# t² ln t / (2 pi), whose second difference has the Allan variance 2 ln 2 / pi
-FLICKER = NoiseTerm(
-    'bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 2, lambda time: (
-        np.square(time) * np.log(np.abs(np.where(time, time, 1.0))) / (2.0 * math.pi)))
+FLICKER = NoiseTerm('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 2,
+                    _flicker_covariance)
 RATE_RANDOM_WALK = NoiseTerm('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
                              lambda time: np.abs(time) ** 3 / 12.0)
 QUANTIZATION = NoiseTerm('quantization', 'Q', 'rad', -1.0, 3.0,
