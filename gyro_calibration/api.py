@@ -28,15 +28,12 @@ from pathlib import Path
 import reprlib
 from typing import Any
 
-from gyro_calibration.allan.deviation import allan_deviation, AllanChart, build_rest_record
-from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
-from gyro_calibration.calibration.encoder import EncoderCalibration
+from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
-from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
-from gyro_calibration.cli import allan as allan_answer
 from gyro_calibration.cli import plots
+from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures
 from gyro_calibration.cli.compensate import (
     check_finite,
     CompensatedBlock,
@@ -44,12 +41,13 @@ from gyro_calibration.cli.compensate import (
     track_log,
 )
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
-from gyro_calibration.cli.fit import calibrate, draw_headings, dwell_lines, heading_lines
+from gyro_calibration.cli.fit import Fitted
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
+from gyro_calibration.cli.verb import PrintedResult
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
+from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.words import terminal_lines
+from gyro_calibration.diagnosis.words import as_sentence, terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
 from gyro_calibration.logs import log as logs
@@ -73,13 +71,6 @@ __all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_l
 
 #: A motion by its name or file, as (time, rate) in s and rad/s, or as the reference of a log.
 MotionLike = str | Path | tuple[Any, Any] | Log | Motion
-
-
-class _PrintedResult:
-    """A record with a text, that a notebook shows too."""
-
-    def _repr_html_(self) -> str:
-        return f'<pre>{escape(str(self))}</pre>'
 
 
 def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
@@ -152,7 +143,7 @@ def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: flo
 
 
 @dataclass(frozen=True)
-class Headings(_PrintedResult):
+class Headings(PrintedResult):
     """Rates and heading of a log, corrected by a model; nan where the output was not plausible."""
 
     log: Log  # that was corrected
@@ -225,7 +216,7 @@ def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
 
 
 @dataclass(frozen=True)
-class Run(_PrintedResult):
+class Run(PrintedResult):
     """A self-calibration."""
 
     model: GyroModel  # the given model with the new self-calibration
@@ -237,8 +228,7 @@ class Run(_PrintedResult):
     _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
-        text = str(self.model.self_calibration)
-        return f'{text[0].upper()}{text[1:]}.'
+        return as_sentence(str(self.model.self_calibration))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the run and of its heading error before and after."""
@@ -271,24 +261,6 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
                run.fit.bias, *calibration.standard_deviations, run.fit, run)
 
 
-@dataclass(frozen=True)
-class Fitted(_PrintedResult):
-    """A calibration by a rate table, a turntable or a reference heading."""
-
-    model: GyroModel  # with the fitted effects and their covariance
-    #: Effects, dwells and residuals; or the fit of a reference heading.
-    found: Selection | EncoderCalibration = field(repr=False)
-
-    def __str__(self) -> str:
-        return '\n'.join(dwell_lines(self.model, self.found) if isinstance(self.found, Selection)
-                         else heading_lines(self.model, self.found, self.found.remarks))
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Return a figure of the errors before and after the fit."""
-        return (plots.draw_residuals(path, self.found.calibration)
-                if isinstance(self.found, Selection) else draw_headings(path, self.found))
-
-
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,
         method: str | None = None) -> Fitted:
     """
@@ -307,32 +279,12 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
     _require_choice('method', method, ('dwells', 'likelihood', 'course', 'rate'))
+    for log in logs:
+        refuse_mismatch(log)
     found = calibrate({str(number): log for number, log in enumerate(logs)},
                       [STATIC_EFFECTS[name] for name in effects or ()], method, technology)
-    model = found.calibration.model if isinstance(found, Selection) else found.model
-    if technology:
-        model = replace(model, gyro={'technology': technology})
-    return Fitted(model, found)
-
-
-@dataclass(frozen=True)
-class NoiseFigures(_PrintedResult):
-    """The noise of a gyro at rest: angle random walk, bias instability and so on."""
-
-    chart: AllanChart  # Allan deviations with their bounds
-    fit: NoiseFit  # the noise figures
-    _lines: tuple[str, ...] = field(repr=False)
-
-    def __str__(self) -> str:
-        return '\n'.join(self._lines)
-
-    def put_into(self, model: GyroModel) -> GyroModel:
-        """Return a model with these figures as its noise."""
-        return replace(model, noise=self.fit.noise, noise_bounds=self.fit.noise_bounds)
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Return the Allan chart."""
-        return plots.draw_allan(path, self.chart, self.fit, allan_answer.figure_labels(self.fit))
+    return Fitted(replace(found.model, gyro={'technology': technology} if technology else {}),
+                  found)
 
 
 def allan(log: Log) -> NoiseFigures:
@@ -342,14 +294,12 @@ def allan(log: Log) -> NoiseFigures:
     `ValueError` says that the gyro moved, is dead, or has uneven stamps.
 
     """
-    time, output = _require_time(log)
-    even = build_rest_record(time, output, log.moving, log.reference_heading)
-    chart, found = allan_deviation(even.rate, even.interval), fit_noise(even.rate, even.interval)
-    return NoiseFigures(chart, found, tuple(allan_answer.answer_lines(even, chart, found)))
+    _require_time(log)
+    return find_noise_figures(log)
 
 
 @dataclass(frozen=True)
-class Diagnosed(_PrintedResult):
+class Diagnosed(PrintedResult):
     """The error of a simulation against a log, and its causes."""
 
     model: GyroModel  # the extended model; the given one where no extension is offered

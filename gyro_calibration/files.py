@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+import csv
 import difflib
 import errno
 import fcntl
@@ -32,7 +33,7 @@ import re
 import secrets
 import select
 import stat
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 #: Largest magnitude of a value that is accepted. A count of 64 bits is below it, and products of
 #: several such values do not overflow.
@@ -214,6 +215,13 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
                 or Path(error.filename).name.startswith(_temporary_prefix(path))):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def format_rows(rows: Iterable[Iterable[Any]]) -> str:
+    """Return rows of values as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator='\n').writerows(rows)
+    return text.getvalue()
 
 
 def keep_aside(path: Path) -> str:

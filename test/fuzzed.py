@@ -11,7 +11,7 @@
 """
 Targets for fuzzing: each takes any bytes, and raises where a claim about its reader is broken.
 
-The documented errors (LogError, ModelError, MotionError, UsageError, ValueError of a parameter)
+The documented errors (LogError, ModelError, MotionError, InputError, ValueError of a parameter)
 are the right answer to wrong bytes; any other exception is a fault, and so is a message of
 several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
 
@@ -37,7 +37,6 @@ import zlib
 from fake_port import SETTINGS
 from gyro_calibration.cli.main import find_verbs, make_parser
 from gyro_calibration.cli.plan import read_limits, write_motion
-from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.protocols import (
     Protocol,
     PROTOCOLS,
@@ -47,7 +46,7 @@ from gyro_calibration.driver.protocols import (
 )
 from gyro_calibration.driver.protocols.protocol import LineSplitter
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.files import MAX_MAGNITUDE
+from gyro_calibration.files import InputError, MAX_MAGNITUDE
 from gyro_calibration.heading.bias_table import (
     BiasTable,
     read_bias_table,
@@ -383,7 +382,7 @@ def _profile_seeds() -> list[bytes]:
 
 
 def check_limits(data: bytes) -> bool:
-    ability = _read(lambda path: read_limits(str(path)), UsageError, _file(data, '.yaml'))
+    ability = _read(lambda path: read_limits(str(path)), InputError, _file(data, '.yaml'))
     if ability is None:
         return False
     assert all(not math.isnan(value) for value in vars(ability).values())

@@ -189,29 +189,24 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
 # lost samples
 
 def integrate_angle(rate: Array) -> Array:
-    """Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples."""
-    angle = np.empty(len(rate) + 1)
-    angle[0] = 0.0
-    np.cumsum(_fill_gaps(rate), out=angle[1:])
-    return angle
+    """
+    Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
 
+    Gaps get the mean over 5 gap lengths on each side. A line between the samples at both ends
+    would integrate their noise over the whole gap, which passes for a random walk.
 
-def _fill_gaps(rate: Array) -> Array:
-    """Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side."""
-    # A line between the samples at both ends would integrate their noise over the whole gap, which
-    # passes for a random walk.
+    """
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
-    if known.all():
-        return values
-    values[~known] = 0.0
-    begins, ends = np.array([(gap.start, gap.stop) for gap in find_runs(~known)]).T
-    margin = 5 * (ends - begins) + 5
-    low, high = np.maximum(begins - margin, 0), np.minimum(ends + margin, len(rate))
-    sums, counts = (np.concatenate([[0.0], np.cumsum(each)]) for each in (values, known))
-    means = (sums[high] - sums[low]) / np.maximum(counts[high] - counts[low], 1.0)
-    values[~known] = np.repeat(means, ends - begins)
-    return values
+    if not known.all():
+        values[~known] = 0.0
+        begins, ends = np.array([(gap.start, gap.stop) for gap in find_runs(~known)]).T
+        margin = 5 * (ends - begins) + 5
+        low, high = np.maximum(begins - margin, 0), np.minimum(ends + margin, len(rate))
+        sums, counts = (np.concatenate([[0.0], np.cumsum(each)]) for each in (values, known))
+        means = (sums[high] - sums[low]) / np.maximum(counts[high] - counts[low], 1.0)
+        values[~known] = np.repeat(means, ends - begins)
+    return np.concatenate([[0.0], np.cumsum(values)])
 
 
 def _count_lost_before(rate: Array) -> Integers | None:
@@ -239,16 +234,6 @@ _SHORT_MEMORY_INDICES = [
 
 
 @dataclass(frozen=True)
-class Floor:
-    """The point of a chart with the lowest upper bound."""
-
-    time: float  # averaging time, s
-    deviation: float  # Allan deviation, rad/s
-    lower: float  # its 95 % bounds, rad/s
-    upper: float
-
-
-@dataclass(frozen=True)
 class AllanChart:
     """The overlapping Allan deviation, each array of shape (n,)."""
 
@@ -262,12 +247,12 @@ class AllanChart:
     upper: Array
 
     @property
-    def floor(self) -> Floor:
-        """Return the lowest point."""
+    def floor(self) -> dict[str, float]:
+        """Return the point with the lowest upper bound: time, deviation and its bounds."""
         # not the lowest deviation: at the end of the chart single points are low by chance
         lowest = int(np.argmin(self.upper))
-        return Floor(*(float(values[lowest])
-                       for values in (self.time, self.deviation, self.lower, self.upper)))
+        return {name: float(getattr(self, name)[lowest])
+                for name in ('time', 'deviation', 'lower', 'upper')}
 
     @property
     def time(self) -> Array:
@@ -287,23 +272,15 @@ def allan_deviation(rate: Array, interval: float,
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Averaging
-    times, s, are taken to the nearest whole number of intervals; by default they are ten a decade,
-    up to a third of the record. Raise `DataRefused` for too few samples, or a time that does not
-    fit twice into the record.
+    times, s, from an interval to half the record, are taken to the nearest whole number of
+    intervals; by default they are ten a decade, up to a third of the record. Raise `DataRefused`
+    for too few samples.
 
     """
     _refuse_few(int(np.isfinite(rate).sum()))
     samples = len(rate)
-    if times is None:
-        sizes = averaging_sizes(samples)
-    else:
-        sizes = np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64))
-        if not sizes.size or sizes[0] < 1 or 2 * sizes[-1] > samples:
-            given = (f'{sizes[0] * interval:g} to {sizes[-1] * interval:g} s' if sizes.size
-                     else 'none')
-            raise DataRefused(f'averaging times: {given}; wanted at least one sample, '
-                              f'{interval:g} s, and at most half the record, '
-                              f'{samples // 2 * interval:g} s: choose others, or record longer')
+    sizes = (averaging_sizes(samples) if times is None else
+             np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64)))
     sums, counts = _sum_squared_differences(rate, sizes)
     some = counts > 0
     sizes, counts = sizes[some], counts[some]

@@ -86,12 +86,6 @@ class OctaveVariances:
                  * np.outer(scarcity, scarcity)[:, :, None, None])
         return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns, forms)
 
-    def drop_shortest(self, start: int) -> OctaveVariances:
-        """Return the octaves without the shortest averaging times."""
-        return OctaveVariances(self.samples, self.size[start:], self.loss_factor[start:],
-                               self.variance[start:], self.columns[start:],
-                               self.forms[start:, start:])
-
     def process_columns(self, process: GaussMarkov) -> Array:
         """Return the columns with that of a process of 1 rad/s, its times in samples."""
         columns = self.columns.copy()
@@ -259,12 +253,6 @@ class Ranking:
                         else each.penalized_deviance() - best.penalized_deviance())
                    < NORMAL_QUANTILE_975 ** 2 for each in self.process_fits)
 
-    @property
-    def detected_terms(self) -> list[int]:
-        """Return the indices of the detected terms; quantization only from the first octave on."""
-        return [place for place in self.best.active_terms if place != _FILTER_BEND
-                and (place != _Q or self.first_octave == 0)]
-
     @cached_property
     def alternatives(self) -> list[CombinationFit]:
         """Return the combinations of other terms, not more of them, that are nearly as likely."""
@@ -312,7 +300,9 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
 
 
 def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ranking:
-    since = octaves.drop_shortest(start)
+    since = replace(octaves, forms=octaves.forms[start:, start:], **{
+        name: getattr(octaves, name)[start:]
+        for name in ('size', 'loss_factor', 'variance', 'columns')})
     descriptions = tuple(
         sorted((fit_combination(since, places, misfit) for places in _COMBINATIONS),
                key=CombinationFit.penalized_deviance))
@@ -451,7 +441,9 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
     best = ranking.best if process is None or index in (_B, _K) else process
     value, deviation = 0.0, math.nan
     lower, upper = _likelihood_bounds(ranking, best, index)
-    if index in ranking.detected_terms and index in best.active_terms:
+    # quantization is detected from the first octave on only
+    if index in {*ranking.best.active_terms} & {*best.active_terms} and (
+            index != _Q or ranking.first_octave == 0):
         value = math.sqrt(best.squares[index])
         deviation = 0.5 * best.square_deviation(index) / value
         possible = ranking.plausible_fits if best is ranking.best else [best]

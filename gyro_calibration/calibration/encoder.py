@@ -26,14 +26,19 @@ between places of the shaft; that of the bias is its wander between pieces.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from pathlib import Path
 
 from gyro_calibration.calibration.dwells import (
+    Dwells,
+    extract_dwells,
     few_values_remedy,
     format_list,
     interpolate_reference,
+    join_dwells,
+    NothingSteady,
 )
 from gyro_calibration.calibration.heading_regression import (
     COURSE_TREATMENT,
@@ -57,12 +62,14 @@ from gyro_calibration.calibration.noise_grid import (
     TridiagonalMatrix,
 )
 from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROUNDING_STEP
+from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings,
     is_course,
     rate_noise_share,
 )
 from gyro_calibration.calibration.run_faults import refuse_unit_error
+from gyro_calibration.calibration.selection import select_effects, Selection
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION,
     fit_rate,
@@ -70,6 +77,7 @@ from gyro_calibration.calibration.self_calibration import (
     refuse_scale,
     RunLimits,
 )
+from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
     Array,
@@ -87,7 +95,7 @@ from gyro_calibration.logs.quality import (
     refuse_dead,
 )
 from gyro_calibration.logs.stamps import count_lost_samples
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import Motion, motion_from_headings, motion_from_rates
 from gyro_calibration.model.noise import Noise
@@ -523,3 +531,54 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
         yield ('the regression of rates fits no time offset, and noise of the gyro biases its '
                'scale factor error by more than its interval; compare it with the method '
                'likelihood')
+
+
+#: Fewer dwells leave nothing over for two values, bias and scale factor error.
+_MIN_DWELLS = 3
+HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
+                 'effects, --matrix and --surface use --method dwells')
+
+
+def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
+              technology: str | None = None) -> Selection | EncoderCalibration:
+    """
+    Calibrate by the dwells of logs, by their paths, or by the heading of a single log.
+
+    The options are those of `api.fit`. A log in time whose only reference is a heading is
+    calibrated by it, and so is one with a reference rate that is hardly ever steady.
+
+    """
+    others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
+    if method == 'dwells' or method is None and (others or any(
+            log.time is None or log.reference_rate is not None or log.reference_heading is None
+            for log in logs.values())):
+        is_settled = effects or method or len(logs) > 1
+        try:
+            table = join_dwells([_extract_named_dwells(path, log) if len(logs) > 1
+                                 else extract_dwells(log) for path, log in logs.items()])
+            if is_settled or len(table) >= _MIN_DWELLS or any(
+                    log.time is None for log in logs.values()):
+                return (Selection(fit_effects(table, effects), (), ()) if effects
+                        else select_effects(table, technology))
+        except NothingSteady:
+            if is_settled:
+                raise
+    if len(logs) > 1:
+        raise InputError(f'--method {method or "likelihood"} takes one log; '
+                         'give one log, or use --method dwells')
+    if others:
+        raise InputError(HEADING_ALONE)
+    (log,) = logs.values()
+    found = calibrate_encoder(log, method, technology=technology or 'mems')
+    return found if log.reference_heading is not None else replace(found, remarks=(
+        f'the log has a reference rate, and fewer than {_MIN_DWELLS} stretches of constant rate; '
+        'so the rate is integrated, and headings are compared. For other effects than bias and '
+        'scale factor error, hold each rate for some seconds', *found.remarks))
+
+
+def _extract_named_dwells(path: str, log: Log) -> Dwells:
+    name = Path(path).name
+    try:
+        return extract_dwells(log, name)
+    except DataRefused as error:
+        raise type(error)(f'{name}: {error}') from None

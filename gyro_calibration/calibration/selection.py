@@ -104,6 +104,11 @@ class Selection:
     choices: tuple[EffectChoice, ...]
     confounders: tuple[ConfoundedPair, ...]
 
+    @property
+    def model(self) -> GyroModel:
+        """Return the model of the calibration."""
+        return self.calibration.model
+
 
 def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     """

@@ -19,7 +19,8 @@ example: gyro_calibration allan rest.csv --rate 100 --picture allan.png --model 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from gyro_calibration.allan.deviation import (
@@ -31,8 +32,10 @@ from gyro_calibration.allan.deviation import (
 from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
-from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
+from gyro_calibration.diagnosis.words import readable_name
+from gyro_calibration.files import InputError
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
@@ -54,31 +57,59 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.model and not given.out:
-        raise UsageError('--model was given without --out; give the file to write with --out')
+        raise InputError('--model was given without --out; give the file to write with --out')
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
+    verb.require_time(given, log)
     try:
-        time = verb.require_time(given, log)
-        record = build_rest_record(time, np.asarray(log.output), log.moving, log.reference_heading)
         with show_progress('noise figures from the Allan deviation'):
-            chart = allan_deviation(record.rate, record.interval)
-            fit = fit_noise(record.rate, record.interval)
+            found = find_noise_figures(log)
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None
     if given.picture:
-        draw_allan(given.picture, chart, fit, figure_labels(fit))
+        found.plot(given.picture)
     if given.out:
-        write_model(given.out, replace(verb.add_origin(given, model), noise=fit.noise,
-                                       noise_bounds=fit.noise_bounds))
-    return Answer(answer_lines(record, chart, fit), _data(given, record, chart, fit),
+        write_model(given.out, found.put_into(verb.add_origin(given, model)))
+    return Answer([str(found)], _data(given, found.record, found.chart, found.fit),
                   (given.picture, given.out))
 
 
-def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[str]:
-    """Return the noise figures as lines for people."""
-    lost, floor, (unit, factor) = np.isnan(record.rate).sum(), chart.floor, DISPLAY_UNITS['B']
-    floor_line = (
-        f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} s, '
-        f'95 %: {floor.lower * factor:.4g} to {floor.upper * factor:.4g}.')
+@dataclass(frozen=True)
+class NoiseFigures(PrintedResult):
+    """The noise of a gyro at rest: angle random walk, bias instability and so on."""
+
+    record: RestRecord = field(repr=False)
+    chart: AllanChart  # Allan deviations with their bounds
+    fit: NoiseFit  # the noise figures
+
+    def __str__(self) -> str:
+        return '\n'.join(_answer_lines(self.record, self.chart, self.fit))
+
+    def put_into(self, model: GyroModel) -> GyroModel:
+        """Return a model with these figures as its noise."""
+        return replace(model, noise=self.fit.noise, noise_bounds=self.fit.noise_bounds)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return the Allan chart."""
+        return draw_allan(path, self.chart, self.fit, {
+            symbol: f'{readable_name(figure.term.name)} {symbol} = '
+            f'{figure.value * DISPLAY_UNITS[symbol][1]:.3g} {DISPLAY_UNITS[symbol][0]}'
+            for symbol, figure in self.fit.figures.items() if figure.value})
+
+
+def find_noise_figures(log: Log) -> NoiseFigures:
+    """Return the noise figures of a log in time, at rest."""
+    record = build_rest_record(np.asarray(log.time), np.asarray(log.output), log.moving,
+                               log.reference_heading)
+    return NoiseFigures(record, allan_deviation(record.rate, record.interval),
+                        fit_noise(record.rate, record.interval))
+
+
+def _answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[str]:
+    lost, (unit, factor) = np.isnan(record.rate).sum(), DISPLAY_UNITS['B']
+    time, *sizes = chart.floor.values()
+    deviation, lower, upper = (f'{size * factor:.4g}' for size in sizes)
+    floor_line = (f'Lowest Allan deviation: {deviation} {unit} at {time:.4g} s, '
+                  f'95 %: {lower} to {upper}.')
     if not fit.is_floor_reached:
         floor_line += (' The deviation still falls at the end of the chart; record longer to '
                        'reach its minimum.')
@@ -91,24 +122,13 @@ def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[s
 
 def _figure_line(symbol: str, figure: NoiseFigure) -> str:
     unit, factor = DISPLAY_UNITS[symbol]
-    name = f'{_figure_name(figure).capitalize()} {symbol}'
+    name = f'{readable_name(figure.term.name).capitalize()} {symbol}'
     if not figure.value:
         return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
                 f'({figure.upper:.3g} {figure.term.unit}).')
     return (f'{name}: {figure.value * factor:.4g} {unit}, '
             f'95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
             f'({figure.value:.4g} {figure.term.unit}, {figure.lower:.4g} to {figure.upper:.4g}).')
-
-
-def figure_labels(fit: NoiseFit) -> dict[str, str]:
-    """Return the labels in a chart of the detected figures, by symbol."""
-    return {
-        symbol: f'{_figure_name(figure)} {symbol} = {figure.value * DISPLAY_UNITS[symbol][1]:.3g} '
-        f'{DISPLAY_UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value}
-
-
-def _figure_name(figure: NoiseFigure) -> str:
-    return figure.term.name.replace('_', ' ')
 
 
 def _fit_line(fit: NoiseFit) -> str:
@@ -141,7 +161,7 @@ def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
                'differences': chart.difference_count, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval,
             'remarks': list(record.remarks), **figures,
-            'floor': {**vars(chart.floor), 'reached': fit.is_floor_reached},
+            'floor': {**chart.floor, 'reached': fit.is_floor_reached},
             'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
             'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
             else {'standard_deviation': fit.process.standard_deviation,

@@ -26,7 +26,8 @@ import math
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer
+from gyro_calibration.files import InputError
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX_GAP, Threshold
@@ -64,22 +65,19 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Totals()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
-        raise UsageError('--rest and --hindsight need no --threshold and a model with an angle '
+        raise InputError('--rest and --hindsight need no --threshold and a model with an angle '
                          'random walk; run allan to add it to the model')
     write_log_blocks(given.out, _compensate_and_count(given, model, found))
     return _answer(given, model, found)
 
 
-#: Other inputs of effects: quantity of a log -> channel, and the sentence where the log lacks it.
+#: Other inputs of effects: quantity of a log -> the sentence where the log lacks it.
 _MISSING_INPUTS = {
-    'temperature': ('temperature', 'The log has no temperature: '
-                    'the model was used at its reference temperature.'),
-    'specific_force': ('specific_force',
-                       'The log has no specific force: 0 m/s² was assumed.'),
-    'supply': ('supply', 'The log has no supply voltage: its effect was left out.'),
-    'reference_heading': ('heading', 'The log has no reference heading: '
-                          'the compensated heading was used, from 0 on.'),
-}
+    'temperature': 'The log has no temperature: the model was used at its reference temperature.',
+    'specific_force': 'The log has no specific force: 0 m/s² was assumed.',
+    'supply': 'The log has no supply voltage: its effect was left out.',
+    'reference_heading': 'The log has no reference heading: '
+    'the compensated heading was used, from 0 on.'}
 
 
 _INTERVAL_REMEDY = 'check the unit of time_s, or give the sample rate with --rate'
@@ -90,8 +88,7 @@ class _Totals:
     """Counts over the blocks so far; heading and deviation of the last sample, rad."""
 
     counts: Counter[str] = field(default_factory=Counter)
-    longest_gap: float = 0.0
-    usual_interval: float = 0.0
+    intervals: Intervals = field(default_factory=Intervals)
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
@@ -100,9 +97,7 @@ class _Totals:
 
     def add(self, piece: CompensatedBlock) -> None:
         log, columns = piece.log, piece.columns
-        self.longest_gap = piece.intervals.longest_gap
-        self.usual_interval = piece.intervals.usual_interval
-        self.counts['lost_samples'] = piece.intervals.lost_samples
+        self.intervals = piece.intervals
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
         self.counts.update(
             rows=len(log), rows_without_output=without,
@@ -263,7 +258,9 @@ def _make_estimator(model: GyroModel, log: Log,
 
 
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:
-    data: dict[str, Any] = {'out': given.out, **found.counts, 'longest_gap_s': found.longest_gap,
+    data: dict[str, Any] = {'out': given.out, **found.counts,
+                            'lost_samples': found.intervals.lost_samples,
+                            'longest_gap_s': found.intervals.longest_gap,
                             'temperature_known': 'temperature' not in found.unknown}
     lines = [f'{data["rows"]} rows compensated by {given.model}, written to {given.out}.']
     if found.heading is not None:
@@ -281,13 +278,13 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answ
         lines.append('Both headings start at 0 at the first row with a reference. This error '
                      'includes its mean and a delay of the reference; the heading errors that fit '
                      'prints exclude both.')
-    lines += [words for quantity, (channel, words) in _MISSING_INPUTS.items()
-              if quantity in found.unknown and model.uses_channel(channel)]
+    lines += [words for quantity, words in _MISSING_INPUTS.items() if quantity in found.unknown
+              and model.uses_channel(quantity.removeprefix('reference_'))]
     lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
               if term.effect.not_compensated]
-    if MAX_GAP < found.usual_interval < math.inf:
-        lines.append(f'The samples are {found.usual_interval:g} s apart, and the heading is that '
-                     f'of a rate which is constant meanwhile; {_INTERVAL_REMEDY}.')
+    if MAX_GAP < (interval := found.intervals.usual_interval) < math.inf:
+        lines.append(f'The samples are {interval:g} s apart, and the heading is that of a rate '
+                     f'which is constant meanwhile; {_INTERVAL_REMEDY}.')
     for name, words in (
             ('rows_without_output',
              'rows have no output of the gyro; the heading is integrated across them.'),

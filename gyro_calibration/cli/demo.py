@@ -21,7 +21,8 @@ import argparse
 from pathlib import Path
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer
+from gyro_calibration.files import InputError
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +36,7 @@ def run(given: argparse.Namespace) -> Answer:
     try:
         from gyro_calibration.cli.demo_run import run_demo
     except ImportError as error:
-        raise UsageError(f'the demo needs ROS 2 and matplotlib ({error}); source ROS 2, or '
+        raise InputError(f'the demo needs ROS 2 and matplotlib ({error}); source ROS 2, or '
                          'install gyro_calibration[ros,plot]') from None
     verb.require_folder(given.out)
     return run_demo(Path(given.out), given.seed)

@@ -24,7 +24,7 @@ import json
 from pathlib import Path
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.extended_model import merge_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis, OnProgress
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
@@ -32,7 +32,7 @@ from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import is_model_extended, terminal_lines
-from gyro_calibration.files import write_atomically
+from gyro_calibration.files import InputError, write_atomically
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import format_model, read_model
@@ -73,7 +73,7 @@ def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind:
     """Diagnose logs in time, or a rate table; a model that is not extended is unchanged."""
     table = any(log.time is None for log in logs)
     if table and len(logs) > 1:
-        raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
+        raise InputError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
                          'alone, or give the sample rate in Hz with --rate')
     found = (diagnose_table(logs[0], None if model is None else merge_self_calibration(model),
                             on_progress=on_progress)

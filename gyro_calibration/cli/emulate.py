@@ -27,10 +27,9 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.simulate import add_motion_options, simulate_log
-from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
-from gyro_calibration.files import to_printable
+from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 
@@ -44,7 +43,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_motion_options(parser, default='rest')
     parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=verb.positive_number, metavar='DPS',
+    parser.add_argument('--sensitivity', type=verb.degrees, metavar='DPS',
                         help='deg/s per count of the wire format; default: that of the protocol')
     parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc',
                         help='columns of the protocol csv; default: %(default)s')
@@ -63,10 +62,10 @@ def run(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
     try:
         protocol, settings = find_protocol(given.protocol), Settings(
-            sensitivity=verb.sensitivity(given), columns=tuple(given.columns.split(',')))
+            sensitivity=given.sensitivity, columns=tuple(given.columns.split(',')))
         protocol.check_settings(settings)
     except ValueError as error:
-        raise UsageError(str(error)) from None
+        raise InputError(str(error)) from None
     log = verb.read(given) if given.log else simulate_log(given)[0]
     time, output = verb.require_time(given, log), np.asarray(log.output)
     if np.isfinite(output).sum() < 2:

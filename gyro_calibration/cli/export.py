@@ -21,8 +21,8 @@ import argparse
 from dataclasses import asdict
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.files import write_atomically
+from gyro_calibration.cli.verb import Answer
+from gyro_calibration.files import InputError, write_atomically
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.simulator_export import export_model, simulator_parameters, SIMULATORS
 
@@ -44,7 +44,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     model = read_model(given.model)
     if given.span * given.sample_rate < 2.0:
-        raise UsageError(f'--span {given.span:g} is shorter than two samples; give at least '
+        raise InputError(f'--span {given.span:g} is shorter than two samples; give at least '
                          f'{2.0 / given.sample_rate:g} s')
     temperature = model.reference_temperature if given.temperature is None else given.temperature
     noise_figures, error = simulator_parameters(model, given.sample_rate, temperature, given.span)

@@ -18,29 +18,23 @@ example: gyro_calibration fit table.csv --out model.yaml
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    extract_dwells,
-    format_list,
-    join_dwells,
-    NothingSteady,
-)
-from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
-from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration, fit_effects
+from gyro_calibration.calibration.dwells import format_list
+from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration, HEADING_ALONE
+from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
-from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGY_EFFECTS
+from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
-from gyro_calibration.diagnosis.words import display_unit
-from gyro_calibration.files import suggest_nearest
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
+from gyro_calibration.diagnosis.words import as_sentence, display_unit
+from gyro_calibration.files import InputError, suggest_nearest
+from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
     polynomial_to_matrix,
@@ -100,83 +94,38 @@ def _parse_orders(text: str) -> list[Effect]:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.matrix and not given.polynomial:
-        raise UsageError('--matrix needs --polynomial: other effects have no matrix')
+        raise InputError('--matrix needs --polynomial: other effects have no matrix')
     effects = given.effects or given.polynomial or ()
     logs = dict(zip(given.log, verb.read_each(given)))
     with show_progress('fit of effects'):
+        for log in logs.values():
+            refuse_mismatch(log)
         found = calibrate(logs, effects, given.method, given.technology)
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
                 'technology': given.technology}
-    model = replace(found.calibration.model if isinstance(found, Selection) else found.model,
-                    gyro={name: value for name, value in identity.items() if value},
+    model = replace(found.model, gyro={name: value for name, value in identity.items() if value},
                     origin=verb.make_origin(given.log))
     if given.surface and not isinstance(found, Selection):
-        raise UsageError(_HEADING_ALONE)
+        raise InputError(HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
+    if given.picture:
+        Fitted(model, found).plot(given.picture)
     lines, data = (_answer_dwells(given, model, found) if isinstance(found, Selection)
-                   else _answer_heading(given, logs, model, found))
+                   else _answer_heading(logs, model, found))
     return Answer(lines, {'out': given.out, **_model_data(model), **data},
                   (given.picture, given.surface, given.out))
-
-
-_HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
-                  'effects, --matrix and --surface use --method dwells')
-
-
-#: Fewer dwells leave nothing over for two values, bias and scale factor error.
-_MIN_DWELLS = 3
-
-
-def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
-              technology: str | None = None) -> Selection | EncoderCalibration:
-    """Calibrate as `api.fit` by named logs: by dwells, or by the heading of a single log."""
-    for log in logs.values():
-        refuse_mismatch(log)
-    others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
-    by_dwells = method == 'dwells' or method is None and (bool(others) or not all(
-        log.time is not None and log.reference_rate is None and log.reference_heading is not None
-        for log in logs.values()))
-    if by_dwells:
-        is_settled = effects or method or len(logs) > 1
-        try:
-            table = join_dwells([
-                _extract_named_dwells(Path(path).name, log) if len(logs) > 1
-                else extract_dwells(log) for path, log in logs.items()])
-            if is_settled or len(table) >= _MIN_DWELLS or any(
-                    log.time is None for log in logs.values()):
-                return (Selection(fit_effects(table, effects), (), ()) if effects
-                        else select_effects(table, technology))
-        except NothingSteady:
-            if is_settled:
-                raise
-    if len(logs) > 1:
-        raise UsageError(f'--method {method or "likelihood"} takes one log; '
-                         'give one log, or use --method dwells')
-    if others:
-        raise UsageError(_HEADING_ALONE)
-    (log,) = logs.values()
-    return calibrate_encoder(log, method, technology=technology or 'mems')
-
-
-def _extract_named_dwells(name: str, log: Log) -> Dwells:
-    try:
-        return extract_dwells(log, name)
-    except DataRefused as error:
-        raise type(error)(f'{name}: {error}') from None
 
 
 def _answer_dwells(given: argparse.Namespace, model: GyroModel,
                    found: Selection) -> tuple[list[str], dict[str, Any]]:
     fit = found.calibration
-    if given.picture:
-        plots.draw_residuals(given.picture, fit)
     if given.surface:
         plots.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range,
                                  fit.used)
     matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
                    if term.effect.name == POLYNOMIAL), None)
-    lines = list(dwell_lines(model, found))
+    lines = list(_dwell_lines(model, found))
     if given.technology and not found.choices:
         lines.append(f'--technology {given.technology} is stored in the model; it had no '
                      'influence, since the effects were given.')
@@ -188,33 +137,43 @@ def _answer_dwells(given: argparse.Namespace, model: GyroModel,
                    'remarks': list(fit.dwells.remarks)}
 
 
-def _answer_heading(given: argparse.Namespace, logs: Mapping[str, Log], model: GyroModel,
+def _answer_heading(logs: Mapping[str, Log], model: GyroModel,
                     found: EncoderCalibration) -> tuple[list[str], dict[str, Any]]:
-    ((path, log),), fit, remarks = logs.items(), found.fit, list(found.remarks)
-    if given.picture:
-        draw_headings(given.picture, found)
-    if log.reference_heading is None:
-        remarks.insert(
-            0, f'the log has a reference rate, and fewer than {_MIN_DWELLS} stretches of '
-            'constant rate; so the rate is integrated, and headings are compared. For other '
-            'effects than bias and scale factor error, hold each rate for some seconds')
+    ((path, log),), fit = logs.items(), found.fit
     return ([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
-             *heading_lines(model, found, remarks)],
+             *_heading_lines(model, found)],
             {'method': found.method, 'time_offset_s': fit.time_offset,
              'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
              'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
              **{f'{name}_heading_{when}_rad': getattr(residual, name)
                 for name in ('rms', 'largest') for when, residual in (
                     ('before', found.residual_before), ('after', found.residual_after))},
-             'remarks': remarks})
+             'remarks': list(found.remarks)})
 
 
-def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
-    """Draw the headings of a reference and of the gyro, and return the figure."""
-    name = 'course over ground' if found.method == 'course' else 'reference'
-    motion = found.reference
-    return plots.draw_reference(path, motion.time, motion.heading - motion.heading[0],
-                                found.residual_before.heading, found.residual_after.heading, name)
+@dataclass(frozen=True)
+class Fitted(PrintedResult):
+    """A calibration by a rate table, a turntable or a reference heading."""
+
+    model: GyroModel  # with the fitted effects and their covariance
+    #: Effects, dwells and residuals; or the fit of a reference heading.
+    found: Selection | EncoderCalibration = field(repr=False)
+
+    def __str__(self) -> str:
+        return '\n'.join(_dwell_lines(self.model, self.found)
+                         if isinstance(self.found, Selection)
+                         else _heading_lines(self.model, self.found))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the errors before and after the fit."""
+        found = self.found
+        if isinstance(found, Selection):
+            return plots.draw_residuals(path, found.calibration)
+        motion = found.reference
+        return plots.draw_reference(
+            path, motion.time, motion.heading - motion.heading[0], found.residual_before.heading,
+            found.residual_after.heading,
+            'course over ground' if found.method == 'course' else 'reference')
 
 
 def _model_data(model: GyroModel) -> dict[str, Any]:
@@ -263,7 +222,7 @@ def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
             'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
 
 
-def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
+def _dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
     fit = selection.calibration
     yield from _dwell_count_lines(fit)
@@ -283,8 +242,7 @@ def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     yield from _choice_lines(selection)
 
 
-def heading_lines(model: GyroModel, found: EncoderCalibration,
-                  remarks: Iterable[str]) -> Iterator[str]:
+def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
     """Give the result of a fit to a heading, and the errors before and after."""
     yield from (*_value_lines(model), '')
     if math.isfinite(found.fit.time_offset):
@@ -299,11 +257,7 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
                   'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
                   'needs stretches of constant rate in the log.')
         yield wrap_line(f'The error is above 5 deg rms. {remedy}')
-    yield from _remark_lines(remarks)
-
-
-def _remark_lines(remarks: Iterable[str]) -> Iterator[str]:
-    yield from (wrap_line(f'{remark[0].upper()}{remark[1:]}.') for remark in remarks)
+    yield from (wrap_line(as_sentence(remark)) for remark in found.remarks)
 
 
 def _value_lines(model: GyroModel) -> Iterator[str]:
@@ -334,7 +288,7 @@ def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
         named = format_list([f'{table.location[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
                              for row in outlying])
         yield wrap_line(f'{len(outlying)} outlying, not fitted: {named}.')
-    yield from _remark_lines(table.remarks)
+    yield from (wrap_line(as_sentence(remark)) for remark in table.remarks)
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
@@ -369,9 +323,11 @@ def _choice_lines(selection: Selection) -> Iterator[str]:
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
     for choice in selection.choices:
-        without, with_it = (f'{_format_finite(value / DEGREE, ".4f"):>8s}'
-                            for value in (choice.error_without, choice.error_with))
-        numbers = f'{without} {with_it} {_format_finite(choice.p_value, ".1g"):>7s}'
+        numbers = ' '.join(
+            f'{format(value, digits) if math.isfinite(value) else "-":>{width}s}'
+            for value, digits, width in ((choice.error_without / DEGREE, '.4f', 8),
+                                         (choice.error_with / DEGREE, '.4f', 8),
+                                         (choice.p_value, '.1g', 7)))
         yield wrap_line(f'{choice.effect:26s} {numbers}  '
                         f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
     for pair in selection.confounders:
@@ -381,7 +337,3 @@ def _choice_lines(selection: Selection) -> Iterator[str]:
             yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
                             f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
                             'would distinguish them.')
-
-
-def _format_finite(value: float, format_spec: str) -> str:
-    return format(value, format_spec) if math.isfinite(value) else '-'

@@ -29,9 +29,9 @@ from typing import Any
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
-from gyro_calibration.files import to_printable, write_atomically
+from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.fleet.logs import (
     compile_file_pattern,
     DONE,
@@ -64,9 +64,8 @@ def add(parser: argparse.ArgumentParser) -> None:
                         'type, drive, date, temperature')
     parser.add_argument('--out', metavar='DIR', required=True, help='folder of the results; logs '
                         'with a result there are not processed again')
-    parser.add_argument(
-        '--pattern', type=_parse_pattern, metavar='TEXT', help='pattern of the file '
-        "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
+    parser.add_argument('--pattern', metavar='TEXT', help='pattern of the file names, without '
+                        "endings, such as 'rc_car_{drive}_unit{unit}'")
     parser.add_argument('--type', metavar='NAME', dest='gyro_type',
                         help='type of the gyro in logs without a type')
     parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
@@ -84,20 +83,14 @@ def add(parser: argparse.ArgumentParser) -> None:
                         'as tcp://host:8786; its workers need the same files')
 
 
-def _parse_pattern(text: str) -> re.Pattern[str]:
-    try:
-        return compile_file_pattern(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def run(given: argparse.Namespace) -> Answer:
+    pattern = compile_file_pattern(given.pattern) if given.pattern else None
     logs = find_logs(given.logs, excluded_folder=given.out)
     folder = os.path.abspath(given.out)
     verb.require_folder(given.out)
     generator = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    records = _process_logs(given, [LogTask(entry, folder, given.technology, given.pattern,
-                                            generator, given.gyro_type or '', given.rate)
+    records = _process_logs(given, [LogTask(entry, folder, given.technology, pattern, generator,
+                                            given.gyro_type or '', given.rate)
                                     for entry in logs])
     used = [each for each in records if each['status'] == DONE]
     if not used:
@@ -184,10 +177,10 @@ def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
         with cluster_executors(given.scheduler) as create:
             yield given.workers or 64, create
     except ImportError:
-        raise UsageError('--scheduler needs distributed, which is not installed; install '
+        raise InputError('--scheduler needs distributed, which is not installed; install '
                          'gyro_calibration[fleet] or omit --scheduler') from None
     except (OSError, ValueError) as error:
-        raise UsageError(f'{given.scheduler}: no Dask scheduler answers there '
+        raise InputError(f'{given.scheduler}: no Dask scheduler answers there '
                          f'({type(error).__name__}); give its address, such as '
                          'tcp://host:8786') from None
 

@@ -31,7 +31,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
 from gyro_calibration import __version__
-from gyro_calibration.cli.verb import print_message, UsageError
+from gyro_calibration.cli.verb import print_message
 from gyro_calibration.diagnosis.causes import add_causes
 from gyro_calibration.files import (
     describe_error,
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, value in vars(given).items():
             # for example from a shell variable that is not set
             if value == '' or isinstance(value, list) and '' in value:
-                raise UsageError(f'{name.replace("_", "-")} is empty; give a value or omit it')
+                raise InputError(f'{name.replace("_", "-")} is empty; give a value or omit it')
         for path in given.catalogue:
             _load_effects(path)
         answer = given.run(given)
@@ -82,14 +82,14 @@ def _load_effects(path: str) -> None:
     # Only the command line names such a file; models and logs cannot.
     spec = spec_from_file_location('effects_of_the_user', path)
     if spec is None or spec.loader is None or not Path(path).is_file():
-        raise UsageError(f'{path} is not a Python file; wanted one, .py, with a list EFFECTS')
+        raise InputError(f'{path} is not a Python file; wanted one, .py, with a list EFFECTS')
     module = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
         add_effects(module.EFFECTS)
         add_causes(module.EFFECTS)
     except Exception as error:
-        raise UsageError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
+        raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
                          f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'
                          'Effect') from None
 

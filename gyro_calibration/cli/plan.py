@@ -33,8 +33,8 @@ from gyro_calibration.calibration.motion_design import (
 from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_motion
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
-from gyro_calibration.files import describe_error, write_atomically
+from gyro_calibration.cli.verb import Answer, show_progress
+from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_by_name, NAMED_MOTIONS
@@ -82,12 +82,12 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.seconds > MAX_DURATION:
-        raise UsageError(f'--seconds {given.seconds:g} is above {MAX_DURATION:g}; '
+        raise InputError(f'--seconds {given.seconds:g} is above {MAX_DURATION:g}; '
                          'plan a shorter motion and repeat it')
     robot = read_limits(given.limits)
     noise = read_model(given.model).noise if given.model else XV3500.noise
     if not noise.angle_random_walk:
-        raise UsageError(f'{given.model}: has no angle_random_walk; '
+        raise InputError(f'{given.model}: has no angle_random_walk; '
                          'run allan on a log at rest, with --model and --out')
     drive = motion_by_name(given.motion)
     given.drive = given.drive or drive.duration
@@ -115,24 +115,24 @@ def run(given: argparse.Namespace) -> Answer:
 
 
 def read_limits(path: str) -> RobotLimits:
-    """Read the limits of a robot; a `UsageError` names what is missing, unknown or wrong."""
+    """Read the limits of a robot; a `InputError` names what is missing, unknown or wrong."""
     try:
         content = read_settings(path)
     except (OSError, ValueError) as error:
-        raise UsageError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
+        raise InputError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
                          'start with a copy of config/limits.yaml') from error
     try:
         given = validate('the file', content, dict.fromkeys(LIMIT_FIELDS, _check_limit))
     except InvalidValue as error:
-        raise UsageError(f'{path}: {error}; config/limits.yaml is an example') from None
+        raise InputError(f'{path}: {error}; config/limits.yaml is an example') from None
     missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
                if name not in given]
     if missing:
-        raise UsageError(f'{path}: {missing[0]} is missing; add the limit of the robot')
+        raise InputError(f'{path}: {missing[0]} is missing; add the limit of the robot')
     robot = RobotLimits(**{LIMIT_FIELDS[name][0]: value * LIMIT_FIELDS[name][1]
                            for name, value in given.items()})
     if robot.slowest > robot.rate:
-        raise UsageError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
+        raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
                          'them')
     return robot
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-import csv
 from datetime import datetime, timezone
 import gzip
 import io
@@ -33,13 +32,13 @@ from typing import Any
 
 from gyro_calibration import __version__
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.timestamps import read_steady_clock
-from gyro_calibration.files import InputError, to_printable
+from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
@@ -81,7 +80,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                       help='bit/s; default: that of the protocol')
     port.add_argument('--columns', metavar='NAME,...', help='columns of the protocol csv; '
                       f'default: {",".join(Settings().columns)}')
-    port.add_argument('--sensitivity', type=verb.positive_number, metavar='DPS',
+    port.add_argument('--sensitivity', type=verb.degrees, metavar='DPS',
                       help='deg/s per count; default: that of the protocol')
     port.add_argument('--axis', default='z', choices=['x', 'y', 'z'],
                       help='axis of a gyro with three; default: z')
@@ -95,10 +94,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Answer:
     if not given.out.endswith(_FILE_SUFFIXES):
-        raise UsageError(f'{given.out} is no recording file; give a name that ends in '
+        raise InputError(f'{given.out} is no recording file; give a name that ends in '
                          f'{", ".join(_FILE_SUFFIXES[:-1])} or {_FILE_SUFFIXES[-1]}')
     if os.path.exists(given.out):
-        raise UsageError(_EXISTS.format(given.out))
+        raise InputError(_EXISTS.format(given.out))
     with _stop_event(given.seconds) as stop:
         return _record((_PortSession if given.port else _TopicSession)(given, stop), given.out)
 
@@ -142,7 +141,7 @@ class _Recorder:
         try:
             self._file = io.FileIO(path, 'xb')
         except FileExistsError:
-            raise UsageError(_EXISTS.format(path)) from None
+            raise InputError(_EXISTS.format(path)) from None
 
     def append(self, piece: bytes) -> None:
         """Write a piece; on an error truncate the file to the pieces before, raise `DiskFull`."""
@@ -256,8 +255,7 @@ class CsvRecorder(_Recorder):
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
                                   - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator='\n')
+        text = ''
         if not self._columns:
             # the first value of each column applies from the beginning
             first: dict[str, float] = {}
@@ -267,13 +265,13 @@ class CsvRecorder(_Recorder):
             self._columns, self._start_stamp = list(first), self._rows[0][0]
             seconds, nanoseconds = divmod(self._start_stamp, NSEC_PER_SEC)
             notes = {**self._notes(), 'time_s counts from': f'{seconds}.{nanoseconds:09d} s'}
-            for name, note in notes.items():
-                text.write(f'# {name}: {" ".join(note.split())}\n')
-            writer.writerow(['time_s', *self._columns])
-        for stamp, values in self._rows:
-            writer.writerow([(stamp - self._start_stamp) / NSEC_PER_SEC,
-                             *(values[name] for name in self._columns)])
-        data = text.getvalue().encode()
+            text = ''.join(f'# {name}: {" ".join(note.split())}\n'
+                           for name, note in notes.items())
+            text += format_rows([['time_s', *self._columns]])
+        text += format_rows([(stamp - self._start_stamp) / NSEC_PER_SEC,
+                             *(values[name] for name in self._columns)]
+                            for stamp, values in self._rows)
+        data = text.encode()
         self.append(gzip.compress(data, mtime=0) if self.path.endswith('.gz') else data)
         self._rows.clear()
 
@@ -339,21 +337,21 @@ class _PortSession:
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         if given.topic or given.temperature_topic or given.reference_topic or given.all:
-            raise UsageError('--port and topics were both given; record one of them, '
+            raise InputError('--port and topics were both given; record one of them, '
                              'or the topics of a driver on that port')
         if not 0 <= given.baud <= MAX_BAUD:
-            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}; '
+            raise InputError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}; '
                              'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:
             self._settings = Settings(
-                sensitivity=verb.sensitivity(given), invert=given.invert, axis=given.axis,
+                sensitivity=given.sensitivity, invert=given.invert, axis=given.axis,
                 columns=columns, increments=_INCREMENT_OPTIONS[given.increments],
                 sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
                                           self._settings, on_change=self._report_state)
         except ValueError as error:
-            raise UsageError(str(error)) from None
+            raise InputError(str(error)) from None
         self._given, self._stop, self._last_message = given, stop, ''
         kind = McapRecorder if given.out.endswith('.mcap') else CsvRecorder
         self.recorder = kind(given.out, self._file_notes)
@@ -428,16 +426,16 @@ class _TopicSession:
         port_options = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
                         given.sample_rate)
         if any(port_options) or given.increments != 'default':
-            raise UsageError('options of a port were given without --port; '
+            raise InputError('options of a port were given without --port; '
                              'give --port or omit them')
         self._is_mcap = given.out.endswith('.mcap')
         if not self._is_mcap and (given.all or len(given.reference_topic) > 1):
-            raise UsageError(f'{given.out}: a log has one gyro and one reference; '
+            raise InputError(f'{given.out}: a log has one gyro and one reference; '
                              'record several topics into .mcap')
         try:
             from gyro_calibration.ros.recorder_node import take_messages
         except ImportError as error:
-            raise UsageError(f'topics need ROS 2, which is not available ({error}); '
+            raise InputError(f'topics need ROS 2, which is not available ({error}); '
                              'source it, or record from --port') from None
         self._take_messages = take_messages
         names = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
@@ -445,7 +443,7 @@ class _TopicSession:
                  **dict(zip(('reference',), given.reference_topic))}
         self._roles = {'/' + topic.lstrip('/'): role for role, topic in names.items()}
         if len(self._roles) < len(names):
-            raise UsageError(f'one topic was named twice, of {", ".join(names.values())}; '
+            raise InputError(f'one topic was named twice, of {", ".join(names.values())}; '
                              f'name one each for {", ".join(names)}')
         self._topics = [*self._roles, *given.reference_topic[1:]]
         self._messages, self._samples, self._is_waiting = 0, 0, True

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
 from pathlib import Path
+import re
 from typing import Any
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
@@ -42,7 +43,8 @@ from gyro_calibration.calibration.self_calibration import (
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress
+from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import (
     compensate_log,
@@ -85,27 +87,21 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _parse_turns(text: str) -> int | str:
-    if text == _NEAREST:
-        return text
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if not value:
+    if text != _NEAREST and not re.fullmatch('[+-]?0*[1-9][0-9]*', text):
         raise argparse.ArgumentTypeError(f'{text} is no number of turns; give an integer other '
                                          f'than 0, or {_NEAREST}')
-    return value
+    return text if text == _NEAREST else int(text)
 
 
 def run(given: argparse.Namespace) -> Answer:
     if given.turns is not None and given.profile:
-        raise UsageError('--turns and --profile were both given; '
+        raise InputError('--turns and --profile were both given; '
                          'give one of them as the reference')
     if given.turns is not None and given.picture:
-        raise UsageError('--picture draws a run against a motion, which --turns does not have; '
+        raise InputError('--picture draws a run against a motion, which --turns does not have; '
                          'omit one of the two')
     if given.turns is None and given.marking is not None:
-        raise UsageError('--marking needs --turns, whose mark it is the error of; '
+        raise InputError('--marking needs --turns, whose mark it is the error of; '
                          'omit it, or give --turns')
     model = read_model(given.model) if given.model else GyroModel()
     log = verb.read(given)
@@ -121,8 +117,7 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
     except InputError as error:
         if given.profile:
             raise
-        kind = DataRefused if isinstance(error, DataRefused) else UsageError
-        raise kind(f'{given.log}: {error} with --profile') from None
+        raise type(error)(f'{given.log}: {error} with --profile') from None
     _refuse_implausible(given, model, log)
     scale = given.reference_scale_deviation
     usual = default_reference_errors(motion) if given.profile else ReferenceErrors()
@@ -137,7 +132,7 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
     technology = model.gyro.get('technology', 'mems')
     if remark := describe_implausible_scale(
             run.fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
-        lines.append(f'{remark[0].upper()}{remark[1:]}.')
+        lines.append(as_sentence(remark))
     return _store_and_answer(given, model, log, run.fit, run.is_used, given.method,
                              _fit_data(run.fit, run.rest_check), lines)
 
@@ -215,7 +210,7 @@ def _store_and_answer(given: argparse.Namespace, model: GyroModel, log: Log, fit
         np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible_rows(model, log)))
     remarks = [f'{implausible_count} rows have an implausible rate or temperature and are not '
                'used.'] if implausible_count else []
-    first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {is_used.sum()} samples.'
+    first = as_sentence(f'{calibration}, from {is_used.sum()} samples')
     return Answer([first, *lines, *remarks],
                   {**calibration.to_dict(), 'samples': int(is_used.sum()),
                    'refused_samples': implausible_count, **data, 'out': given.out},
@@ -231,15 +226,13 @@ def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,
 
 
 def _fit_data(fit: ScaleBiasFit, check: RestCheck | None) -> dict[str, Any]:
-    goodness = fit.goodness
     return {'time_offset_s': fit.time_offset,
             'time_offset_standard_deviation_s': fit.time_offset_deviation,
             'start_heading_rad': fit.start_heading,
             'start_heading_standard_deviation_rad': fit.start_heading_deviation,
-            'chi_square': goodness.chi_square if goodness else math.nan,
-            'degrees_of_freedom': goodness.dof if goodness else math.nan,
-            'probability': goodness.probability if goodness else math.nan,
-            'noise_ratio': goodness.noise_ratio if goodness else math.nan,
+            **{key: getattr(fit.goodness, name, math.nan) for key, name in (
+                ('chi_square', 'chi_square'), ('degrees_of_freedom', 'dof'),
+                ('probability', 'probability'), ('noise_ratio', 'noise_ratio'))},
             'rest_rate_rad_s': check.rate if check else math.nan,
             'rest_limit_rad_s': check.limit if check else math.nan}
 

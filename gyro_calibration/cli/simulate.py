@@ -23,7 +23,8 @@ import secrets
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer
+from gyro_calibration.files import InputError
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import motion_by_name, NAMED_MOTIONS, simulate
@@ -64,10 +65,10 @@ def simulate_log(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
     motion = motion_by_name(given.motion)
     if motion.duration * given.sample_rate > MAX_SAMPLES:
-        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
+        raise InputError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
                          f'{MAX_SAMPLES:g} samples; give a lower rate or a shorter motion')
     if round(motion.duration * given.sample_rate) < 1:
-        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has fewer than '
+        raise InputError(f'{given.motion} at --sample-rate {given.sample_rate:g} has fewer than '
                          'two samples; give a higher rate or a longer motion')
     return simulate(read_model(given.model), motion, given.sample_rate,
                     np.random.default_rng(seed), given.temperature), seed

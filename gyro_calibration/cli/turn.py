@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-import csv
-import io
 import math
 from typing import Any
 
@@ -35,8 +33,9 @@ from gyro_calibration.calibration.scatter import cross_validation_parts, find_in
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
-from gyro_calibration.cli.verb import Answer, show_progress, UsageError
-from gyro_calibration.files import sha256_digest, write_atomically
+from gyro_calibration.cli.verb import Answer, show_progress
+from gyro_calibration.diagnosis.words import as_sentence
+from gyro_calibration.files import format_rows, InputError, sha256_digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.ros_bag import list_recording_files
@@ -67,7 +66,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> Answer:
     if given.model and given.technology:
-        raise UsageError('--technology selects effects, and --model has its own; give one of '
+        raise InputError('--technology selects effects, and --model has its own; give one of '
                          'the two')
     log = verb.read(given)
     found = extract_dwells(log)
@@ -119,12 +118,11 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
     if found.temperature is None and model.uses_channel('temperature'):
         remarks.append('the log has no temperature: '
                        'the model was used at its reference temperature')
-    if clipped:
-        remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated '
-                       'temperatures; the correction is extrapolated')
-    if beyond:
-        remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; '
-                       'the correction is extrapolated')
+    for count, where in ((clipped, 'outside the calibrated temperatures'),
+                         (beyond, 'beyond the calibrated rates')):
+        if count:
+            remarks.append(f'{count} of {len(found)} dwells are {where}; the correction is '
+                           'extrapolated')
     rate = result.rate
     if model.needs_history:  # the model depends on the past: the log is compensated row by row
         error = np.asarray(log.output) - compensate_log(model, log)
@@ -160,16 +158,16 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
 
 def _lines(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatures: Bins,
            remarks: list[str]) -> Iterator[str]:
-    (rms_before, largest_before), (rms_after, largest_after) = map(
-        _sizes, (errors.static, errors.modelled))
-    yield (f'Error of a turn of 360 deg: largest {_format_error(largest_before)} with the static '
-           f'bias only, {_format_error(largest_after)} with the model, a factor of '
-           f'{_format_ratio(largest_before, largest_after)}; rms {_format_error(rms_before)} and '
-           f'{_format_error(rms_after)}, a factor of {_format_ratio(rms_before, rms_after)}.')
+    rms_phrase, largest_phrase = (
+        (f'{before / DEGREE:.3g} deg ({100.0 * before / math.tau:.2g} %)',
+         f'{after / DEGREE:.3g} deg ({100.0 * after / math.tau:.2g} %)',
+         f'a factor of {f"{before / after:.2g}" if after > 0.0 else "infinity"}')
+        for before, after in zip(_sizes(errors.static), _sizes(errors.modelled)))
+    yield ('Error of a turn of 360 deg: largest {} with the static bias only, {} with the model, '
+           '{}; '.format(*largest_phrase) + 'rms {} and {}, {}.'.format(*rms_phrase))
     yield (f'{len(errors.turns)} turns, {given.slowest:g} deg/s and faster, '
            f'of {len(np.unique(errors.turns.sweep))} sweeps in {given.log}.')
-    for remark in remarks:
-        yield f'{remark[0].upper()}{remark[1:]}.'
+    yield from map(as_sentence, remarks)
     yield from _table('rate [deg/s]', errors, [(low / DEGREE, high / DEGREE, mask)
                                                for low, high, mask in rates])
     yield from _table('temperature [degC]', errors, temperatures)
@@ -177,14 +175,6 @@ def _lines(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatu
 
 def _sizes(errors: Array) -> tuple[float, float]:
     return rms(errors), float(np.abs(errors).max())
-
-
-def _format_error(error: float) -> str:
-    return f'{error / DEGREE:.3g} deg ({100.0 * error / math.tau:.2g} %)'
-
-
-def _format_ratio(before: float, after: float) -> str:
-    return f'{before / after:.2g}' if after > 0.0 else 'infinity'
 
 
 def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
@@ -231,10 +221,8 @@ def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]
 def _write_table(path: str, errors: TurnErrors) -> None:
     turns = errors.turns
     temperature = np.full(len(turns), np.nan) if turns.temperature is None else turns.temperature
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc',
-                     'static_rad_per_turn', 'modelled_rad_per_turn'))
-    writer.writerows(zip(turns.location, *(values.tolist() for values in (
-        turns.sweep, turns.rate, temperature, errors.static, errors.modelled))))
-    write_atomically(path, text.getvalue().encode())
+    write_atomically(path, format_rows([
+        ('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc', 'static_rad_per_turn',
+         'modelled_rad_per_turn'),
+        *zip(turns.location, *(values.tolist() for values in (
+            turns.sweep, turns.rate, temperature, errors.static, errors.modelled)))]).encode())

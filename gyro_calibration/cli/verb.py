@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from html import escape
 import importlib.util
 import math
 import os
@@ -31,6 +32,7 @@ from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_
 from gyro_calibration.logs.columns import AXES, suggest_attitude
 from gyro_calibration.logs.log import (
     Array,
+    BLOCK_ROWS,
     DataRefused,
     DEGREE,
     Log,
@@ -39,7 +41,7 @@ from gyro_calibration.logs.log import (
     select_rows,
     unwrap_heading,
 )
-from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
+from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -88,8 +90,11 @@ def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
         yield lambda place: bar.update(place - bar.n)
 
 
-class UsageError(InputError):
-    """Wrong use of the program; the message is one sentence."""
+class PrintedResult:
+    """A record with a text, that a notebook shows too."""
+
+    def _repr_html_(self) -> str:
+        return f'<pre>{escape(str(self))}</pre>'
 
 
 @dataclass(frozen=True)
@@ -123,7 +128,7 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
                         'ROS 2 recording: folder, .mcap or .db3', **options)
     parser.add_argument('--rate', type=positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=positive_number, metavar='DPS',
+    parser.add_argument('--sensitivity', type=degrees, metavar='DPS',
                         help='deg/s per count, for logs with gyro_counts only')
     parser.add_argument('--invert', action='store_true',
                         help='the gyro reports clockwise turns as positive')
@@ -168,34 +173,30 @@ def parse_columns(text: str) -> dict[str, str]:
     return {name.strip(): column.strip() for name, column in pairs}
 
 
-def positive_number(text: str) -> float:
-    return _bounded(float(text), 1.0 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+def _number(kind: type[Any], low: float, high: float = math.inf,
+            unit: str = '') -> Callable[[str], Any]:
+    """Return a parser of numbers of a kind within bounds."""
+    def parse(text: str) -> Any:
+        value = kind(text)
+        if not low <= value <= high:
+            wanted = (f'from {low:g} to {high:g}' if high < MAX_MAGNITUDE
+                      else 'above 0' if 0.0 < low < 1.0 else f'of {low:g} or more')
+            raise argparse.ArgumentTypeError(f'{value:g}{unit} is out of range; give a number '
+                                             f'{wanted}{unit}')
+        return value
+    return parse
 
 
-def non_negative_number(text: str) -> float:
-    return _bounded(float(text), 0.0, MAX_MAGNITUDE)
+positive_number = _number(float, 1.0 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+non_negative_number = _number(float, 0.0, MAX_MAGNITUDE)
+degrees_celsius = _number(float, -273.15, 1e4, ' degC')
+positive_integer = _number(int, 1)
+non_negative_integer = _number(int, 0)  # as seeds of numpy
 
 
-def degrees_celsius(text: str) -> float:
-    return _bounded(float(text), -273.15, 1e4, ' degC')
-
-
-def positive_integer(text: str) -> int:
-    return int(_bounded(int(text), 1))
-
-
-def non_negative_integer(text: str) -> int:
-    """Return a seed, as a numpy Generator takes it."""
-    return int(_bounded(int(text), 0))
-
-
-def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -> float:
-    if not low <= value <= high:
-        wanted = (f'from {low:g} to {high:g}' if high < MAX_MAGNITUDE
-                  else 'above 0' if 0.0 < low < 1.0 else f'of {low:g} or more')
-        raise argparse.ArgumentTypeError(f'{value:g}{unit} is out of range; give a number '
-                                         f'{wanted}{unit}')
-    return value
+def degrees(text: str) -> float:
+    """Return a positive number of deg in rad."""
+    return float(positive_number(text)) * DEGREE
 
 
 def _picture_file(text: str) -> str:
@@ -216,7 +217,7 @@ def read(given: argparse.Namespace) -> Log:
                             given.axis)
             log = read_recording(given.log, topics, given.rate, on_progress, print_message)
         else:
-            log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
+            log = read_log(given.log, given.sensitivity, given.rate, given.names, given.axis,
                            on_progress)
     log = _orient_output(given, log)
     if given.unwrap and log.reference_heading is not None:
@@ -276,23 +277,20 @@ def add_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     """Read the log of a verb block by block, with a progress bar."""
     if is_recording(given.log) or given.unwrap:
-        yield from split_blocks(read(given))
+        log = read(given)
+        yield from (select_rows(log, slice(begin, begin + BLOCK_ROWS))
+                    for begin in range(0, len(log), BLOCK_ROWS))
         return
     with _show_bytes_read(given.log) as on_progress:
-        blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
+        blocks = read_log_blocks(given.log, given.sensitivity, given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _cut_to_range(given, blocks):
             yield _orient_output(given, log)
 
 
-def sensitivity(given: argparse.Namespace) -> float | None:
-    """Return --sensitivity, rad/s per count."""
-    return None if given.sensitivity is None else given.sensitivity * DEGREE
-
-
 def _orient_output(given: argparse.Namespace, log: Log) -> Log:
     if log.output is None:
-        raise UsageError(f'{given.log}: has gyro_counts only; '
+        raise InputError(f'{given.log}: has gyro_counts only; '
                          'give the deg/s per count with --sensitivity')
     return replace(log, output=-log.output) if given.invert else log
 
@@ -300,12 +298,12 @@ def _orient_output(given: argparse.Namespace, log: Log) -> Log:
 def require_folder(path: str) -> None:
     """Refuse a file where a folder of results is wanted."""
     if os.path.exists(path) and not os.path.isdir(path):
-        raise UsageError(f'{path}: is a file, but must be a folder; give another name')
+        raise InputError(f'{path}: is a file, but must be a folder; give another name')
 
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; name its '
+        raise InputError(f'{given.log}: has no time_s, which {given.name} needs; name its '
                          'column, as by --columns time=NAME:s, or give the sample rate in Hz '
                          'with --rate')
     return log.time

@@ -21,7 +21,7 @@ repeats over many logs, wander does not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import asdict, dataclass, replace
@@ -38,14 +38,13 @@ import re
 from typing import Any
 
 from gyro_calibration import __version__
-from gyro_calibration.calibration.dwells import extract_dwells
-from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns,
     fit_noise_grid,
     heading_noise,
 )
-from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.gates import (
     is_at_rest,
@@ -227,28 +226,25 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
             columns):
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
                          f'{", ".join(ENTRY_KEYS)}, each once')
-    lines = _read_text(path).splitlines()
-    rows = csv.reader(lines, delimiter=_find_separator(lines[0]))
-    next(rows)
-    for number, row in enumerate(rows, 2):
+    first, *lines = _read_text(path).splitlines()
+    for number, row in enumerate(csv.reader(lines, delimiter=_find_separator(first)), 2):
         if not any(map(str.strip, row)):
             continue
         if len(row) != len(columns):
             raise InputError(f'{path}, line {number}: holds {len(row)} values, wanted '
                              f'{len(columns)} as in its first line')
-        stated = dict(zip(columns, row))
-        log = stated.pop('log').strip()
-        if not log:
+        stated = dict(zip(columns, map(str.strip, row)))
+        if not stated['log']:
             raise InputError(f'{path}, line {number}: names no log')
-        yield FleetLog(_resolve_log_path(path, log)).fill_missing(stated)
+        yield FleetLog(_resolve_log_path(path, stated['log'])).fill_missing(stated)
 
 
 def compile_file_pattern(text: str) -> re.Pattern[str]:
-    """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `ValueError`."""
+    """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `InputError`."""
     parts = re.split(r'\{(\w*)\}', text)
     unknown = [name for name in parts[1::2] if name not in ENTRY_KEYS]
     if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
-        raise ValueError(f'{text}: wanted a file name with {{unit}}, and perhaps '
+        raise InputError(f'{text}: wanted a file name with {{unit}}, and perhaps '
                          f'{", ".join(f"{{{name}}}" for name in ENTRY_KEYS[1:])}, each once')
     return re.compile(''.join(f'(?P<{part}>.+?)' if place % 2 else re.escape(part)
                               for place, part in enumerate(parts)))
@@ -309,42 +305,39 @@ DONE, NO_EVIDENCE = 'done', 'no evidence'
 SCHEMA = 'gyro_calibration/fleet_log/2'
 
 
-class _SpanFit:
-    """Increments of the heading over spans of a log; `edges` of the spans are in s."""
+def _fit_spans(log: Log, time_offset: float, heading: tuple[Array, Array] | None) -> tuple[
+        Array, Callable[..., tuple[float, float]]]:
+    """Return edges of spans of a log, s, and a fit of its headings over them; none at rest."""
+    output = np.asarray(log.output)
+    known = np.isfinite(output)
+    time = np.asarray(log.time)[known] - time_offset
+    # 60 spans of at least 2 s
+    edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
+    turns: list[Array] = []
+    rate = np.zeros(len(edges))
+    if heading is not None:
+        place = np.searchsorted(heading[0], edges).clip(0, len(heading[0]) - 1)
+        edges = heading[0][np.unique(place)]
+        true = np.interp(edges, *heading)
+        turns = [np.diff(true)]
+        rate = np.gradient(true, edges) if len(true) > 1 else 0.0 * true
+    increments = np.diff(np.interp(edges, time, integrate(time, output[known])))
+    noise = heading_noise(edges, rate)[:None if turns else 1]
 
-    def __init__(self, log: Log, time_offset: float, heading: tuple[Array, Array] | None):
-        """Take time and heading, s and rad, of a reference; None at rest."""
-        assert log.time is not None and log.output is not None
-        known = np.isfinite(log.output)
-        time = log.time[known] - time_offset
-        # 60 spans of at least 2 s
-        self.edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
-        self._turns: list[Array] = []
-        rate = np.zeros(len(self.edges))
-        if heading is not None:
-            place = np.searchsorted(heading[0], self.edges).clip(0, len(heading[0]) - 1)
-            self.edges = heading[0][np.unique(place)]
-            true = np.interp(self.edges, *heading)
-            self._turns = [np.diff(true)]
-            rate = np.gradient(true, self.edges) if len(true) > 1 else 0.0 * true
-        self._increments = np.diff(
-            np.interp(self.edges, time, integrate(time, log.output[known])))
-        noise = heading_noise(self.edges, rate)
-        self._noise = noise if self._turns else noise[:1]
-
-    def fit(self, *column: Array) -> tuple[float, float]:
+    def fit(*column: Array) -> tuple[float, float]:
         """Fit scale factor error, bias and a column; return the last value and its deviation."""
         found = fit_noise_grid(
-            self._increments, np.column_stack([*self._turns, np.diff(self.edges), *column]),
-            self._noise, *bias_wander_columns(self.edges),
-            noisy_column=0 if self._turns else None, wandering_value=len(self._turns))
+            increments, np.column_stack([*turns, np.diff(edges), *column]), noise,
+            *bias_wander_columns(edges), noisy_column=0 if turns else None,
+            wandering_value=len(turns))
         return float(found.values[-1]), float(found.deviations[-1])
+
+    return edges, fit
 
 
 def _duration(log: Log) -> float:
     """Return the time from the first to the last output, s; 0 with less than 100 of them."""
-    assert log.time is not None and log.output is not None
-    time = log.time[np.isfinite(log.output)]
+    time = np.asarray(log.time)[np.isfinite(np.asarray(log.output))]
     return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
 
 
@@ -359,26 +352,21 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, 
         heading = log.time, integrate(log.time, bridge_gaps(log.reference_rate))
     if _duration(log) < _MIN_LOG_DURATION:
         return {}
-    spans, found = _SpanFit(log, time_offset, heading), {}
-    if len(spans.edges) < 10:
+    edges, fit = _fit_spans(log, time_offset, heading)
+    if len(edges) < 10:
         return {}
-    for name, unit, angle in _slow_effects(log, spans.edges):
-        value, deviation = spans.fit(np.diff(angle))
-        if math.isfinite(deviation) and deviation > 0.0:
-            found[name] = _value_record(value, deviation, unit)
-    return found
-
-
-def _slow_effects(log: Log, time: Array) -> Iterator[tuple[str, str, Array]]:
-    """Give name, unit and integral over time of each effect, to some constant."""
-    assert log.time is not None
-    elapsed = time - log.time[0]
-    yield 'rate_ramp', 'rad/s²', 0.5 * (elapsed - 0.5 * elapsed[-1]) ** 2
+    # name, unit and integral over time, to some constant
+    elapsed = edges - log.time[0]
+    effects = [('rate_ramp', 'rad/s²', 0.5 * (elapsed - 0.5 * elapsed[-1]) ** 2)]
     for constant in (60.0, 300.0):  # s; the same for all logs, as they are pooled
-        yield f'warm_up_{constant:.0f}s', 'rad/s', -constant * np.exp(-elapsed / constant)
+        effects.append((f'warm_up_{constant:.0f}s', 'rad/s',
+                        -constant * np.exp(-elapsed / constant)))
     if log.temperature is not None and np.ptp(log.temperature) > 0.0:  # False with nan
         angle = integrate(log.time, log.temperature - log.temperature.mean())
-        yield 'bias_temperature', 'rad/s/K', np.interp(time, log.time, angle)
+        effects.append(('bias_temperature', 'rad/s/K', np.interp(edges, log.time, angle)))
+    fits = {name: _value_record(*fit(np.diff(angle)), unit) for name, unit, angle in effects}
+    return {name: each for name, each in fits.items()
+            if math.isfinite(each['deviation']) and each['deviation'] > 0.0}
 
 
 @dataclass(frozen=True)
@@ -424,7 +412,10 @@ def process_log(task: LogTask) -> dict[str, Any]:
         identity = [SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log,
                     content, state]  # all that the record depends on
         key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
-        found = _load_record(task.record_path, key)
+        found = None
+        with suppress(OSError, ValueError, KeyError, TypeError):  # none, or of another version
+            kept = json.loads(task.record_path.read_bytes())
+            found = kept if kept['key'] == key else None
         if found is None:
             found = {'schema': SCHEMA, 'key': key, 'sha256': content,
                      **_calibrate_and_diagnose(task)}
@@ -453,14 +444,6 @@ def _format_reason(error: Exception, path: str) -> str:
     if isinstance(error, InputError):
         return str(error).removeprefix(f'{to_printable(path)}: ')
     return describe_error(error)
-
-
-def _load_record(path: Path, key: str) -> dict[str, Any] | None:
-    try:
-        kept = json.loads(path.read_bytes())
-        return kept if kept['key'] == key else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
@@ -499,32 +482,32 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
     """
     Return the method of calibration of a log, its model, and the time offset of its reference.
 
-    A log in time with a reference heading is calibrated by `calibrate_encoder`, which finds the
-    offset and its standard deviation, s; a log at rest gives the bias only, and any other one is
-    calibrated by dwells. Raise `DataRefused` with the reason and the remedy.
+    The offset, s, comes with its standard deviation. A log at rest gives the bias only, and any
+    other one is calibrated by `calibrate`. Raise `DataRefused` with the reason and the remedy.
 
     """
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
     refuse_mismatch(log)
-    if log.time is not None and log.reference_rate is None and log.reference_heading is not None:
-        found = calibrate_encoder(log, technology=technology)
-        offset = found.fit.time_offset, found.fit.time_offset_deviation
-        return found.method, found.model, None if math.isnan(offset[0]) else offset
-    refuse_unusable(log)
-    if log.time is not None and is_at_rest(log):
-        if _duration(log) < _MIN_LOG_DURATION:
-            raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for longer')
-        bias, deviation = _SpanFit(log, 0.0, None).fit()
-        walk = (white_noise_deviation(log.output, order=1)
-                * math.sqrt(float(np.median(np.diff(log.time)))))
-        return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
-                                 noise=Noise(angle_random_walk=walk)), None
-    table_quality = None if log.time is not None else inspect_record(log)
-    if table_quality is not None and is_implausible_factor(table_quality.unit_factor):
-        raise DataRefused(f'{table_quality.findings[0].evidence}: correct the unit or the sign of '
-                          'the column of the gyro')
-    return 'dwells', select_effects(extract_dwells(log), technology).calibration.model, None
+    if log.time is None or log.reference_rate is not None or log.reference_heading is None:
+        refuse_unusable(log)
+        if log.time is not None and is_at_rest(log):
+            if _duration(log) < _MIN_LOG_DURATION:
+                raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for '
+                                  'longer')
+            bias, deviation = _fit_spans(log, 0.0, None)[1]()
+            walk = (white_noise_deviation(log.output, order=1)
+                    * math.sqrt(float(np.median(np.diff(log.time)))))
+            return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
+                                     noise=Noise(angle_random_walk=walk)), None
+    if log.time is None and is_implausible_factor((found := inspect_record(log)).unit_factor):
+        raise DataRefused(f'{found.findings[0].evidence}: correct the unit or the sign of the '
+                          'column of the gyro')
+    fitted = calibrate({'': log}, technology=technology)
+    if isinstance(fitted, Selection):
+        return 'dwells', fitted.model, None
+    offset = fitted.fit.time_offset, fitted.fit.time_offset_deviation
+    return fitted.method, fitted.model, None if math.isnan(offset[0]) else offset
 
 
 def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:

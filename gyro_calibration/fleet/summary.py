@@ -17,8 +17,8 @@ They are sentences, data, models, one page that needs nothing else, and tables i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-import csv
 from dataclasses import asdict, dataclass
 from datetime import date
 import io
@@ -43,7 +43,7 @@ from gyro_calibration.diagnosis.words import (
     join_list,
     readable_name,
 )
-from gyro_calibration.files import to_printable
+from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm,
     DRIVES,
@@ -104,12 +104,10 @@ class ValueSummary:
 
     def format_component(self, name: str) -> str:
         """Return a standard deviation with its interval, or its bound where it may be zero."""
-        if name not in self.components:
+        if (component := self.components.get(name)) is None:
             return 'not shown'
-        component = self.components[name]
-        if component.low <= 0.0:
-            return f'less than {format_amount(component.high, self.unit, self.name)}'
-        return self.format_interval(component)
+        return (self.format_interval(component) if component.low > 0.0
+                else f'less than {format_amount(component.high, self.unit, self.name)}')
 
 
 @dataclass(frozen=True)
@@ -196,8 +194,8 @@ def _summarize_value(name: str, slow: bool, records: Sequence[Record],
 
 
 def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
-    return {name: Interval(*map(float, parts)) for name, *parts in zip(
-        names, found.value, found.low, found.high, found.deviation)}
+    return {name: Interval(*map(float, parts))
+            for name, *parts in zip(names, *vars(found).values())}
 
 
 def _covariates(records: Sequence[Record], unit: IntegerArray) -> dict[str, Array]:
@@ -487,17 +485,14 @@ def _variance_table(summary: TypeSummary) -> Markup:
     drifts = any(each.slopes for each in summary.values.values())
     heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
              *(['drift'] if drifts else [])]
-    rows = []
-    for each in summary.values.values():
-        drift = '; '.join(each.format_interval(slope, per[name])
-                          for name, slope in each.slopes.items())
-        rows.append([
-            _cell(readable_name(each.name)), _interval_cell(each, each.mean),
-            _interval_cell(each, each.new_unit),
-            *(_cell(each.format_component(name), each.components[name].value
-                    if name in each.components else -1.0) for name in COMPONENT_LABELS),
-            *([_cell(drift)] if drifts else [])])
-    return _table(heads, rows)
+    return _table(heads, [
+        [_cell(readable_name(each.name)), _interval_cell(each, each.mean),
+         _interval_cell(each, each.new_unit),
+         *(_cell(each.format_component(name), each.components[name].value
+                 if name in each.components else -1.0) for name in COMPONENT_LABELS),
+         *([_cell('; '.join(each.format_interval(slope, per[name])
+                            for name, slope in each.slopes.items()))] if drifts else [])]
+        for each in summary.values.values()])
 
 
 def _unit_table(summary: TypeSummary, values: Sequence[ValueSummary]) -> Markup:
@@ -505,14 +500,12 @@ def _unit_table(summary: TypeSummary, values: Sequence[ValueSummary]) -> Markup:
                              for alarm in each.outlying_units},
               'changed': {alarm.name for each in summary.values.values()
                           for alarm in each.changes}}
-    heads = ['unit', 'logs', *(readable_name(each.name) for each in values), 'remark']
-    rows = []
-    for name in summary.units:
-        logs = sum(each['unit'] == name for each in summary.records)
-        rows.append([_cell(name), _cell(str(logs), logs),
-                     *(_interval_cell(each, each.units.get(name)) for each in values),
-                     _cell(', '.join(text for text, names in alarms.items() if name in names))])
-    return _table(heads, rows)
+    logs = Counter(each['unit'] for each in summary.records)
+    return _table(['unit', 'logs', *(readable_name(each.name) for each in values), 'remark'], [
+        [_cell(name), _cell(str(logs[name]), logs[name]),
+         *(_interval_cell(each, each.units.get(name)) for each in values),
+         _cell(', '.join(text for text, names in alarms.items() if name in names))]
+        for name in summary.units])
 
 
 def _log_section(records: Sequence[Mapping[str, Any]]) -> Markup:
@@ -586,36 +579,27 @@ def _dates_chart(summary: TypeSummary, value: ValueSummary, key: str) -> Chart:
 def table_files(types: Sequence[TypeSummary],
                 records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """Return the content of files by name: values of logs, and of units, one row each, in SI."""
-    # They are CSV, and Parquet where pyarrow is installed.
-    found = {}
-    for name, rows in (('logs', list(map(_log_row, records))), ('units', list(_unit_rows(types)))):
-        columns = list(dict.fromkeys(key for row in rows for key in row))
+    # CSV, and Parquet where pyarrow is installed
+    found, log_rows = {}, []
+    for record in records:
+        log_rows.append({key: record.get(key) for key in _COLUMNS})
+        for name, value in (record.get('values', {}) | record.get('slow', {})).items():
+            log_rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
+    for name, rows in (('logs', log_rows), ('units', list(_unit_rows(types)))):
+        names = dict.fromkeys(key for row in rows for key in row)
+        columns = {each: [row.get(each) for row in rows] for each in names}
         if not columns:
             continue
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(rows)
-        found[f'{name}.csv'] = text.getvalue().encode()
+        found[f'{name}.csv'] = format_rows([columns, *zip(*columns.values())]).encode()
         try:
             import pyarrow
             from pyarrow import parquet
         except ImportError:
             continue
         stream = io.BytesIO()
-        parquet.write_table(
-            pyarrow.table({column: [row.get(column) for row in rows] for column in columns}),
-            stream)
+        parquet.write_table(pyarrow.table(columns), stream)
         found[f'{name}.parquet'] = stream.getvalue()
     return found
-
-
-def _log_row(record: Mapping[str, Any]) -> dict[str, Any]:
-    row = {key: record.get(key) for key in _COLUMNS}
-    for kind in ('values', 'slow'):
-        for name, value in record.get(kind, {}).items():
-            row[name], row[f'{name}_deviation'] = value['value'], value['deviation']
-    return row
 
 
 def _unit_rows(types: Sequence[TypeSummary]) -> Iterator[dict[str, Any]]:

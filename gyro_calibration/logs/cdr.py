@@ -100,17 +100,13 @@ geometry_msgs/TwistWithCovariance twist""",
 }
 
 
-def _append_nested_definitions(text: str) -> str:
-    for name, part in reversed(_NESTED_DEFINITIONS.items()):
-        if f'{name} ' in text:
-            text += f'{DEFINITION_SEPARATOR}\nMSG: {name}\n{part}\n'
-    return text
-
-
 #: Message type -> definition as ROS 2 writes it, for recordings without definitions and recorders.
-DEFINITIONS: Mapping[str, str] = {
-    kind: _append_nested_definitions(f'std_msgs/Header header\n{fields}\n')
-    for kind, fields in _MESSAGE_FIELDS.items()}
+DEFINITIONS: dict[str, str] = {}
+for _kind, _fields in _MESSAGE_FIELDS.items():
+    DEFINITIONS[_kind] = f'std_msgs/Header header\n{_fields}\n'
+    for _name, _part in reversed(_NESTED_DEFINITIONS.items()):
+        if f'{_name} ' in DEFINITIONS[_kind]:
+            DEFINITIONS[_kind] += f'{DEFINITION_SEPARATOR}\nMSG: {_name}\n{_part}\n'
 
 
 class MessageError(ValueError):

@@ -27,6 +27,7 @@ import gzip
 import io
 import itertools
 import math
+import os
 from pathlib import Path
 import reprlib
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ import zlib
 
 from gyro_calibration.files import (
     describe_error,
+    format_rows,
     InputError,
     MAX_EXPANSION_RATIO,
     MAX_MAGNITUDE,
@@ -55,6 +57,7 @@ from gyro_calibration.logs.columns import (
 )
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -180,27 +183,23 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
         if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
-            raise LogError(f'{path}: is a recording of ROS 1; wanted a log file or a ROS 2 '
-                           'recording: convert it, by pip install rosbags and '
+            raise LogError('is a recording of ROS 1; wanted a log file or a ROS 2 recording: '
+                           'convert it, by pip install rosbags and '
                            f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
-        table, first_line = _read_header(path, _limit_length(lines), columns, axis)
-        unfolded = 0
+        table, first_line = _read_header(_limit_length(lines), columns, axis)
+        budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
         while block := _read_block(lines, rows):
-            unfolded += sum(map(len, block))
-            if (compressed and file.seekable()
-                    and unfolded > MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * file.tell()):
-                raise LogError(f'{path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                               'its size, which is the limit; decompress it first if this is '
-                               'intended')
+            if budget:
+                budget.spend(sum(map(len, block)))
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
-                                      or _parse_text_rows(path, block, lines, first_line, table))
+                                      or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
-            last = _refuse_unordered_time(path, places, arrays.get('time'), last)
+            last = _refuse_unordered_time(places, arrays.get('time'), last)
             rotation.replace_attitude(arrays)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
@@ -208,15 +207,32 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                 on_progress(file.tell())
             if count > 1:
                 yield Log(**arrays, notes=table.notes, others=others)
-    if count < 2:
-        raise LogError(f'{path}: has {count} of the 2 rows of data that are needed at least; '
-                       'record more')
+        if count < 2:
+            raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
+                           'more')
+
+
+class ExpansionBudget:
+    """The number of bytes to which the content of a compressed file may expand."""
+
+    def __init__(self, path: str | Path):
+        self._remaining = MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * os.stat(path).st_size
+
+    def spend(self, size: int) -> None:
+        """Count bytes, and raise `LogError` beyond the limit."""
+        self._remaining -= size
+        if self._remaining < 0:
+            raise LogError(f'decompresses to more than {MAX_EXPANSION_RATIO} times its size, '
+                           'which is the limit; decompress it first if this is intended')
 
 
 @contextmanager
 def _convert_read_errors(path: str | Path) -> Iterator[None]:
+    """Put the name of the file before each error."""
     try:
         yield
+    except InputError as error:
+        raise LogError(f'{path}: {error}') from None
     except UnicodeDecodeError as error:
         code = 'UTF-16' if error.object[:1] in (b'\xff', b'\xfe') else 'WINDOWS-1252'
         raise LogError(
@@ -272,7 +288,7 @@ class _FileHeader(NamedTuple):
     delimiter: str
 
 
-def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
+def _read_header(lines: Iterator[str], columns: Mapping[str, str],
                  axis: str) -> tuple[_FileHeader, int]:
     """Return notes and header, and the number of the next line."""
     notes, line = [], next(lines, '')
@@ -284,17 +300,14 @@ def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, s
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):
         if not header:
-            raise LogError(f'{path}: has no line with the names of columns; record again, or name '
-                           'another file')
+            raise LogError('has no line with the names of columns; record again, or name another '
+                           'file')
         meant = suggest_columns(header) or (
             '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
             'lines above it, or name the columns, as by --columns time=NAME:s,gyro=NAME:deg/s')
-        raise LogError(f'{path}: line {len(notes) + 1} is no header with a known column: '
+        raise LogError(f'line {len(notes) + 1} is no header with a known column: '
                        f'{excerpt(line.strip())}{meant}')
-    try:
-        found = find_columns(header, columns, axis)
-    except InputError as error:
-        raise LogError(f'{path}: {error}') from None
+    found = find_columns(header, columns, axis)
     taken = {column.position for column in found.values()}
     others = {name: index for index, name in enumerate(_make_unique(header))
               if index not in taken and header[index] not in COLUMNS}
@@ -338,15 +351,15 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
     return range(first_line, first_line + len(lines) + 1), arrays, {}
 
 
-def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterator[str],
-                     first_line: int, table: _FileHeader) -> _ParsedRows:
+def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_line: int,
+                     table: _FileHeader) -> _ParsedRows:
     """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
     reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines)),
                         delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
-            raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has '
+            raise LogError(f'line {places[-1]} has {len(row)} values where the header has '
                            f'{len(header)}; correct or remove the line')
         rows.append(row)
         places.append(first_line + reader.line_num)
@@ -356,13 +369,13 @@ def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterat
     if table.delimiter != ',':
         for index, _, _ in table.columns.values():
             texts[index] = tuple(text.replace(',', '.') for text in texts[index])
-    arrays = {quantity: _parse_numbers(path, places, header[index], texts[index], quantity)
+    arrays = {quantity: _parse_numbers(places, header[index], texts[index], quantity)
               * factor + offset for quantity, (index, factor, offset) in table.columns.items()}
     return places, arrays, {name: texts[index] for name, index in table.other_columns.items()}
 
 
-def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
-                   texts: tuple[str, ...], quantity: str) -> Array:
+def _parse_numbers(line_numbers: Sequence[int], column: str, texts: tuple[str, ...],
+                   quantity: str) -> Array:
     if quantity in _NULLABLE_QUANTITIES:
         texts = tuple(text.strip() or 'nan' for text in texts)
     found: list[float] = []
@@ -373,16 +386,16 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
         remedy = ('give seconds, or the sample rate with --rate'
                   if quantity == 'time' else 'leave the cell empty if the value is lost'
                   if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
-        raise LogError(f'{path}: line {line_numbers[row]}, column {column}: '
-                       f'{reprlib.repr(texts[row])} is not a number; {remedy}') from None
+        raise LogError(f'line {line_numbers[row]}, column {column}: {reprlib.repr(texts[row])} '
+                       f'is not a number; {remedy}') from None
     values = np.array(found)
     wrong = mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
         fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
                  if np.isfinite(values[row]) else 'not a finite number')
-        raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
-                       f'is {fault}; remove the row')
+        raise LogError(f'line {line_numbers[row]}, column {column}: {excerpt(texts[row])} is '
+                       f'{fault}; remove the row')
     return values
 
 
@@ -403,22 +416,22 @@ def excerpt(text: str) -> str:
     return to_printable(text[:100])
 
 
-def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: Array | None,
+def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,
                            previous_time: float, place: str = 'line') -> float:
     """Refuse time that does not increase or is too large; return the last time."""
     if time is None or not len(time):
         return previous_time
     if (far := np.abs(time) > MAX_TIME).any():
         row = int(np.argmax(far))
-        raise LogError(f'{path}: {place} {line_numbers[row]}, column time_s: {time[row]:g} s is '
-                       f'beyond the limit of {MAX_TIME:g} s; give its unit, as by --columns '
+        raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is beyond '
+                       f'the limit of {MAX_TIME:g} s; give its unit, as by --columns '
                        'time=time_s:ns')
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{path}: {place} {line_numbers[row]}, column time_s: {time[row]:g} s is '
-                       f'not later than {time[row - 1] if row else previous_time:g} s; sort the '
-                       'rows, or give the sample rate with --rate')
+        raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is not later '
+                       f'than {time[row - 1] if row else previous_time:g} s; sort the rows, or '
+                       'give the sample rate with --rate')
     return float(time[-1])
 
 
@@ -470,8 +483,8 @@ def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> No
             row = int(np.argmax(wrong))
             raise LogError(f'row {row} of {names.get(quantity, quantity)} is {values[row]:g}; '
                            'remove the row')
-    _refuse_unordered_time('the log', range(len(arrays.get('time', ()))), arrays.get('time'),
-                           -math.inf, 'row')
+    _refuse_unordered_time(range(len(arrays.get('time', ()))), arrays.get('time'), -math.inf,
+                           'row')
 
 
 def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
@@ -501,17 +514,12 @@ class _AxisRotation:
         if ATTITUDE[0] not in arrays:
             return
         attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
-        length = np.linalg.norm(attitude, axis=1)
-        known = np.abs(length - 1.0) < 0.4  # as in recordings
+        known = np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < 0.4  # as in recordings
         heading = np.full(len(attitude), np.nan)
         if known.any():
-            path = np.concatenate([self._last, attitude[known] / length[known, None]])
-            (w0, v0), (w1, v1) = ((each[:, :1], each[:, 1:]) for each in (path[:-1], path[1:]))
-            cosine = w0 * w1 + np.sum(v0 * v1, axis=1, keepdims=True)
-            vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)
-            sine = np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
-            turned = (2.0 * np.copysign(np.arctan2(sine, np.abs(cosine)), cosine) / sine
-                      * vector)[:, self._axis]
+            path = np.concatenate([self._last, attitude[known]])
+            rotation = Rotation.from_quat(path[:, [1, 2, 3, 0]])
+            turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()[:, self._axis]
             angles = self._angle + np.cumsum(turned)
             heading[known] = angles if len(self._last) else np.concatenate([[0.0], angles])
             self._angle, self._last = float(heading[known][-1]), path[-1:]
@@ -637,13 +645,10 @@ def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, 
                         for name, texts in log.others.items()}
             columns |= {name: np.asarray(values, dtype=float).tolist()
                         for name, values in more.items()}
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator='\n')
-            if number == 0:
-                text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
-                writer.writerow(columns)
-            writer.writerows(zip(*columns.values()))
-            data.write(text.getvalue().encode('utf-8', 'backslashreplace'))
+            notes = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
+            head = '' if number else notes + format_rows([columns])
+            data.write((head + format_rows(zip(*columns.values()))).encode(
+                'utf-8', 'backslashreplace'))
 
 
 def _normalize_newlines(text: str) -> str:

@@ -21,7 +21,7 @@ and all other corrections.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import os.path
 from pathlib import Path
@@ -29,16 +29,7 @@ from typing import Any
 
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
-from gyro_calibration.logs.log import (
-    Array,
-    BLOCK_ROWS,
-    Log,
-    LogError,
-    Mask,
-    mask_invalid,
-    select_rows,
-    unwrap_heading,
-)
+from gyro_calibration.logs.log import Array, Log, LogError, Mask, mask_invalid, unwrap_heading
 from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
 import numpy as np
 from numpy.typing import NDArray
@@ -181,33 +172,30 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
             series[message.topic] = _TopicBuffer(
                 message.topic, message.kind, contents.definitions[message.kind], axis)
         series[message.topic].add(message)
-    log = _LogBuilder(path, topics, contents, series).build(rate)
+    try:
+        log = _LogBuilder(Path(path).name, topics, contents, series).build(rate)
+    except LogError as error:
+        raise LogError(f'{path}: {error}') from None
     for note in log.notes:
         on_note(note)
     return replace(log, notes=(*log.notes, *contents.recorder_notes))
 
 
-def split_blocks(log: Log, rows: int = BLOCK_ROWS) -> Iterator[Log]:
-    """Give a log in blocks, as a log file is read."""
-    for begin in range(0, len(log), rows):
-        yield select_rows(log, slice(begin, begin + rows))
-
-
 class _LogBuilder:
     """Makes a log of the messages of a recording, with notes on selections and corrections."""
 
-    def __init__(self, path: str | Path, topics: Topics, contents: Contents,
+    def __init__(self, name: str, topics: Topics, contents: Contents,
                  series: dict[str, _TopicBuffer]):
-        self._path, self._topics, self._contents, self._series = path, topics, contents, series
-        self._notes = [f'ROS 2 recording {Path(path).name}']
+        self._topics, self._contents, self._series = topics, contents, series
+        self._notes = [f'ROS 2 recording {name}']
 
     def build(self, rate: float | None) -> Log:
         wanted = self._topics.gyro
         gyro = self._topic_series(
             self._find_topic(wanted, 'gyro') if wanted else self._find_only_imu())
         if not gyro.is_reported('rate'):
-            raise LogError(f'{self._path}: {gyro.topic} declares that it reports no angular '
-                           'velocity; name another by --topic')
+            raise LogError(f'{gyro.topic} declares that it reports no angular velocity; name '
+                           'another by --topic')
         reference, temperature = self._find_reference(), self._find_temperature(gyro.topic)
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
@@ -230,11 +218,8 @@ class _LogBuilder:
         if reference is not None:
             arrays |= self._interpolate_reference(reference.with_times(use_stamps), gyro, time,
                                                   output)
-        try:
-            return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
-                       notes=(*self._notes, *self._contents.notes))
-        except LogError as error:
-            raise LogError(f'{self._path}: {error}') from None
+        return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
+                   notes=(*self._notes, *self._contents.notes))
 
     def _find_only_imu(self) -> str:
         found = [topic for topic in self._topics_of_type({cdr.IMU})
@@ -242,16 +227,14 @@ class _LogBuilder:
         if len(found) == 1:
             return found[0]
         if found:
-            raise LogError(f'{self._path}: several gyros, {_join_names(found)}; '
-                           'select one with --topic')
+            raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
         others = self._topics_of_type({
             kind for kind, definition in self._contents.definitions.items()
             if kind not in REFERENCE_TYPES and 'rate' in cdr.parse_layout(definition).quantities})
         remedy = (f'select {_join_names(others, "or")} with --topic' if others
                   else 'record the topic of the gyro')
-        raise LogError(f'{self._path}: no message of {cdr.IMU} in it{reasons}'
-                       f'{self._list_topics()}; {remedy}')
+        raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; {remedy}')
 
     def _find_reference(self) -> _TopicSeries | None:
         if self._topics.reference is not None:
@@ -277,20 +260,19 @@ class _LogBuilder:
         topic = next((topic for topic in self._contents.topics if _is_same_topic(topic, wanted)),
                      None)
         if topic is None:
-            raise LogError(f'{self._path}: no topic {wanted}{self._list_topics()}; '
-                           f'name one of them by {_ROLES[role][0]}')
+            raise LogError(f'no topic {wanted}{self._list_topics()}; name one of them by '
+                           f'{_ROLES[role][0]}')
         kind = self._contents.topics[topic]
         if kind in self._contents.undefined:
-            raise LogError(f'{self._path}: {topic} is {kind}, of which the recording has no '
-                           'definition; convert it by ros2 bag convert of ROS 2 Iron or later, '
-                           f'where the package {kind.partition("/")[0]} is sourced')
+            raise LogError(f'{topic} is {kind}, of which the recording has no definition; convert '
+                           'it by ros2 bag convert of ROS 2 Iron or later, where the package '
+                           f'{kind.partition("/")[0]} is sourced')
         definition = self._contents.definitions.get(kind)
         found = cdr.parse_layout(definition).quantities if definition else {}
-        if (not _ROLES[role][2] & set(found)
-                and (wrong := topic_type_fault(role, topic, kind))):
-            raise LogError(f'{self._path}: {wrong}')
+        if not _ROLES[role][2] & set(found) and (wrong := topic_type_fault(role, topic, kind)):
+            raise LogError(wrong)
         if topic not in self._series or not len(self._series[topic]):
-            raise LogError(f'{self._path}: {topic} has no message that can be read; record again')
+            raise LogError(f'{topic} has no message that can be read; record again')
         return topic
 
     def _topics_of_type(self, kinds: set[str]) -> list[str]:
@@ -307,10 +289,9 @@ class _LogBuilder:
             self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
                                'were left out')
         if len(series.frames) > 1:
-            raise LogError(f'{self._path}: messages of the frames '
-                           f'{_join_names(sorted(series.frames))} are on {topic}, as of several '
-                           'sensors: record each on a topic of its own, or split the recording '
-                           'where the frame changes')
+            raise LogError(f'messages of the frames {_join_names(sorted(series.frames))} are on '
+                           f'{topic}, as of several sensors: record each on a topic of its own, '
+                           'or split the recording where the frame changes')
         return series.sort_by_arrival()
 
     def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:
@@ -322,7 +303,7 @@ class _LogBuilder:
         elif back.any():
             if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
                 place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
-                raise LogError(f'{self._path}: the stamps of {gyro.topic} step back by '
+                raise LogError(f'the stamps of {gyro.topic} step back by '
                                f'{_format_seconds(back[place])} s at sample {place + 1}, as after '
                                'setting a clock; split the recording there, or give the sample '
                                'rate with --rate')
@@ -332,8 +313,8 @@ class _LogBuilder:
         if rate is None:
             gyro = self._drop_duplicates(gyro)
         if len(gyro) < 2:
-            raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; '
-                           'a log has at least two: record more')
+            raise LogError(f'{gyro.topic} has {len(gyro)} samples with a time; a log has at '
+                           'least two: record more')
         return gyro
 
     def _drop_duplicates(self, gyro: _TopicSeries) -> _TopicSeries:
@@ -343,9 +324,9 @@ class _LogBuilder:
         differs = np.diff(gyro.values('rate'), prepend=np.nan) != 0.0
         other = int(np.count_nonzero(doubled & differs))
         if other > 1 + 0.01 * len(gyro):
-            raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
-                           'the stamp of another sample, so their times are unknown; '
-                           'give the sample rate with --rate')
+            raise LogError(f'{other} of {len(gyro)} samples of {gyro.topic} have the stamp of '
+                           'another sample, so their times are unknown; give the sample rate '
+                           'with --rate')
         self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
                            'were left out')
         return gyro.select(~doubled)
@@ -383,8 +364,8 @@ class _LogBuilder:
                                output: Array) -> dict[str, Any]:
         """Return heading and rate of a reference at the samples of the gyro; nan where lost."""
         if series.topic == gyro.topic:
-            raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; '
-                           'name another by --reference-topic')
+            raise LogError(f'{gyro.topic} cannot be its own reference; name another by '
+                           '--reference-topic')
         series = series.with_unique_stamps()
         at, wrapped = (series.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _wrapped_headings(series)
         rate = series.values('rate') if series.is_reported('rate') else None
@@ -405,8 +386,8 @@ class _LogBuilder:
             for name, values in (('reference_heading', heading), ('reference_rate', rate))
             if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
-            raise LogError(f'{self._path}: {series.topic} has no heading and no rate at the times '
-                           'of the gyro; name another reference, or check that both clocks agree')
+            raise LogError(f'{series.topic} has no heading and no rate at the times of the gyro; '
+                           'name another reference, or check that both clocks agree')
         lost = np.isnan(next(iter(found.values()))).mean()
         self._notes.append(f'reference: {series.topic} ({series.kind}), {len(at)} values, '
                            f'lost for {100 * lost:.1f} % of the samples')

@@ -13,7 +13,7 @@ ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and writ
 
 The recording of a killed program lacks its closing part and index, so neither is used: records
 are read from the beginning up to the end, or to the point of truncation. No record may take more
-memory than `MAX_RECORD_BYTES`, and no file may expand to more than `MAX_EXPANSION_RATIO` times its
+memory than `MAX_RECORD_BYTES`, and no file may expand to more than an `ExpansionBudget` of its
 size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
 
@@ -41,16 +41,9 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 import zlib
 
-from gyro_calibration.files import (
-    describe_error,
-    MAX_EXPANSION_RATIO,
-    MIN_EXPANSION_BYTES,
-    open_regular_file,
-    remedy,
-    to_printable,
-)
+from gyro_calibration.files import describe_error, open_regular_file, remedy, to_printable
 from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
-from gyro_calibration.logs.log import excerpt, LogError
+from gyro_calibration.logs.log import excerpt, ExpansionBudget, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
 MAX_RECORD_BYTES = 1 << 28
@@ -153,6 +146,8 @@ def read_messages(path: str | Path, contents: Contents,
             with _open_uncompressed(file) as source:
                 yield from read(source, file, contents, on_place)
             done += file.stat().st_size
+        except LogError as error:
+            raise LogError(f'{file}: {error}') from None
         except OSError as error:
             raise LogError(f'{file}: cannot be read ({describe_error(error)}); '
                            f'{remedy(error, file)}') from error
@@ -177,27 +172,11 @@ def _open_uncompressed(path: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
             source = Path(folder) / path.stem
             with open(source, 'wb') as file:
-                file.writelines(_decompress('zstd', packed, _ExpansionBudget(path)))
+                file.writelines(_decompress('zstd', packed, ExpansionBudget(path)))
             yield source
 
 
-class _ExpansionBudget:
-    """The number of bytes to which the content of a compressed file may expand."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._remaining = MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * path.stat().st_size
-
-    def spend(self, size: int) -> None:
-        """Count bytes, and raise `LogError` beyond the limit."""
-        self._remaining -= size
-        if self._remaining < 0:
-            raise LogError(f'{self._path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                           'its size, which is the limit; record again, or decompress it first if '
-                           'this is intended')
-
-
-def _decompress(compression: str, packed: BinaryIO, budget: _ExpansionBudget) -> Iterator[bytes]:
+def _decompress(compression: str, packed: BinaryIO, budget: ExpansionBudget) -> Iterator[bytes]:
     """Give the data of a compressed stream, up to a truncation or damage."""
     reader: Any
     errors: tuple[type[Exception], ...]
@@ -224,7 +203,7 @@ def _import_library(name: str) -> Any:
                        f'pip install {package}') from None
 
 
-def _decompress_up_to(size: int, compression: str, data: bytes, budget: _ExpansionBudget) -> bytes:
+def _decompress_up_to(size: int, compression: str, data: bytes, budget: ExpansionBudget) -> bytes:
     expanded = bytearray()
     for piece in _decompress(compression, io.BytesIO(data), budget):
         expanded += piece
@@ -233,7 +212,7 @@ def _decompress_up_to(size: int, compression: str, data: bytes, budget: _Expansi
     return bytes(expanded[:size])
 
 
-def _decompress_message(data: bytes, budget: _ExpansionBudget) -> bytes:
+def _decompress_message(data: bytes, budget: ExpansionBudget) -> bytes:
     return (_decompress_up_to(1 << 16, 'zstd', data, budget)
             if data.startswith(_ZSTANDARD_MAGIC) else data)
 
@@ -253,8 +232,8 @@ def _read_mcap(source: Path, path: Path, contents: Contents,
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
-            raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
-        reader = _McapReader(contents, _ExpansionBudget(path))
+            raise LogError('is not an MCAP file; name a recording, or record again')
+        reader = _McapReader(contents, ExpansionBudget(path))
         for code, body in _iter_records(file, end, contents):
             if code == _RecordCode.DATA_END:
                 return
@@ -289,7 +268,7 @@ def _iter_records(stream: BinaryIO, end: int, contents: Contents,
 class _McapReader:
     """Reads the records of one file, with its channels and schemas."""
 
-    def __init__(self, contents: Contents, budget: _ExpansionBudget):
+    def __init__(self, contents: Contents, budget: ExpansionBudget):
         self._contents, self._budget = contents, budget
         self._schemas: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[str, str] | None] = {}
@@ -356,7 +335,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     return found
 
 
-def _read_chunk(body: bytes, torn: bool, budget: _ExpansionBudget) -> bytes:
+def _read_chunk(body: bytes, torn: bool, budget: ExpansionBudget) -> bytes:
     """Return the records of a chunk as bytes; of a truncated one those before its end."""
     _, _, size, check = struct.unpack_from('<QQQI', body)
     compression, place = _read_text(body, 28)
@@ -487,8 +466,8 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
-    with _open_database(source, path) as (database, tables):
-        channels, budget = _read_topics(database, tables, path, contents), _ExpansionBudget(path)
+    with _open_database(source) as (database, tables):
+        channels, budget = _read_topics(database, tables, contents), ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
         with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
@@ -508,7 +487,7 @@ def _read_database(source: Path, path: Path, contents: Contents,
 
 
 @contextmanager
-def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
+def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """Open a database read-only, and give it with the names of its tables of stored columns."""
     # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
     # count corrected. Computed columns are not read: their cost is not limited by the size of the
@@ -524,12 +503,12 @@ def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connectio
                 continue
             with closing(database):
                 if not {'topics', 'messages'} <= tables:
-                    raise LogError(f'{path}: is a database, but not a ROS 2 recording with tables '
-                                   'of stored columns; name a recording')
+                    raise LogError('is a database, but not a ROS 2 recording with tables of '
+                                   'stored columns; name a recording')
                 yield database, tables
                 return
-    raise LogError(f'{path}: cannot be read as a ROS 2 recording '
-                   f'({_describe_database_error(reason)}); name a recording, or record again')
+    raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '
+                   'name a recording, or record again')
 
 
 def _describe_database_error(error: Exception | None) -> str:
@@ -570,7 +549,7 @@ def _correct_page_count(source: Path, folder: Path) -> Path:
     return copy
 
 
-def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
+def _read_topics(database: sqlite3.Connection, tables: set[str],
                  contents: Contents) -> dict[int, tuple[str, str] | None]:
     try:
         definitions = dict(database.execute(
@@ -581,5 +560,5 @@ def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
                 for number, topic, kind, encoding in database.execute(
                     'SELECT id, name, type, serialization_format FROM topics')}
     except _DATABASE_ERRORS as error:
-        raise LogError(f'{path}: its list of topics cannot be read '
+        raise LogError('its list of topics cannot be read '
                        f'({_describe_database_error(error)}); record again') from error

@@ -110,8 +110,12 @@ class _Block:
         fast, slow = (self.lag_difference('temperature', lag)
                       for lag in (0.5 * filter_time, filter_time))
         rate, key = (fast - slow) / (0.5 * filter_time), ('heating', filter_time, threshold)
-        branch = _hold_last_sign(
-            np.sign(rate) * (abs(rate) > threshold), self._lag_states.get(key, 0.0))
+        sign, previous = np.sign(rate) * (abs(rate) > threshold), self._lag_states.get(key, 0.0)
+        if isinstance(sign, np.ndarray):
+            last = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), -1))
+            branch: Number = np.where(last < 0, previous, sign[last])
+        else:
+            branch = float(sign) or previous
         self._end_states[key] = _edge_value(branch, -1)
         return branch
 
@@ -148,10 +152,3 @@ def _edge_value(signal: Number, index: int) -> float:
 def _differences(signal: Number, previous: float) -> Number:
     return (np.diff(signal, prepend=previous) if isinstance(signal, np.ndarray) else signal
             - previous)
-
-
-def _hold_last_sign(sign: Number, previous: float) -> Number:
-    if not isinstance(sign, np.ndarray):
-        return float(sign) or previous
-    last = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), -1))
-    return np.where(last < 0, previous, sign[last])

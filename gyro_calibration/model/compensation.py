@@ -148,7 +148,12 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
             rows = [0.0 if term.effect.not_compensated else row / steepness
                     for term in model.terms for row in term.sensitivity(channels)]
         if model.active_tolerances:
-            faster, warmer = model.range_excess(output, temperature)
+            # out of the calibrated ranges, which include the temperature of the self-calibration
+            known = [] if calibration is None or calibration.temperature is None else [
+                calibration.temperature]
+            ends = (*model.valid_temperatures, *known)
+            faster = output - clip(output, *model.rate_range)
+            warmer = temperature - clip(temperature, min(ends), max(ends))
             sizes = {'bias': 1.0, 'scale_factor_error': modelled, 'bias_per_kelvin': warmer,
                      'scale_factor_error_per_kelvin': warmer * modelled, 'per_rate': faster}
             rows += [sizes[name] / steepness for name in model.active_tolerances]

@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 from gyro_calibration.logs.log import Array, DEGREE, Number
-from gyro_calibration.model.channels import ChannelHistory, clip
+from gyro_calibration.model.channels import ChannelHistory
 from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -60,16 +60,15 @@ class Term:
 
     def sensitivity(self, channels: Channels) -> list[Number]:
         """Return the derivative of the error by each fitted value."""
-        columns, shapes = self.columns(channels), len(self.effect.nonlinear_parameters)
-        return [self._derivative(place, channels) if place < shapes else columns[place - shapes]
-                for place in self.fitted_indices]
-
-    def _derivative(self, index: int, channels: Channels) -> Number:
-        step = 1e-5 * abs(self.values[index]) or 1e-9
-        below, above = (replace(self, values=(*self.values[:index], self.values[index] + change,
-                                              *self.values[index + 1:]))
-                        for change in (-step, step))
-        return (above.error(channels) - below.error(channels)) / (2.0 * step)
+        shapes = len(self.effect.nonlinear_parameters)
+        rows = [*[0.0] * shapes, *self.columns(channels)]
+        for place in (each for each in self.fitted_indices if each < shapes):
+            step = 1e-5 * abs(self.values[place]) or 1e-9
+            below, above = (self.effect.error_function(
+                (*self.values[:place], self.values[place] + change, *self.values[place + 1:]))(
+                    channels) for change in (-step, step))
+            rows[place] = (above - below) / (2.0 * step)
+        return [rows[place] for place in self.fitted_indices]
 
 
 @dataclass(frozen=True)
@@ -236,15 +235,6 @@ class GyroModel:
         return np.array([getattr(self.tolerance, name) or math.inf
                          for name in ('scale_factor_error', 'bias')])
 
-    def range_excess(self, output: Number, temperature: Number) -> tuple[Number, Number]:
-        """Return how far outputs and temperatures are out of the calibrated ranges, rad/s, K."""
-        # the range of temperatures includes that of the self-calibration
-        low, high = self.valid_temperatures
-        known = self.self_calibration.temperature if self.self_calibration else None
-        if known is not None:
-            low, high = min(low, known), max(high, known)
-        return output - clip(output, *self.rate_range), temperature - clip(temperature, low, high)
-
     @cached_property
     def rate_domain(self) -> tuple[float, float]:
         """Return the rates between which the response is inverted, rad/s."""
@@ -344,23 +334,17 @@ class GyroModel:
                 time = term.effect.correct_stamps(time, *term.values)
         return time
 
-    @cached_property
-    def _split_by_output(self) -> _TermSplit:
-        return _split_terms(self.terms, 'output')
+    # terms that do not depend on the unknown, which need no iteration, and terms that do
 
     @cached_property
-    def _split_by_rate(self) -> _TermSplit:
-        return _split_terms([term for term in self.terms if not term.effect.not_compensated],
-                            'rate')
+    def _split_by_output(self) -> list[list[Term]]:
+        return [[term for term in self.terms if ('output' in term.effect.inputs) == depends]
+                for depends in (False, True)]
 
-
-#: Terms that do not depend on the unknown, which need no iteration, and terms that do.
-_TermSplit = tuple[list[Term], list[Term]]
-
-
-def _split_terms(terms: Sequence[Term], channel: str) -> _TermSplit:
-    independent = [term for term in terms if channel not in term.effect.inputs]
-    return independent, [term for term in terms if channel in term.effect.inputs]
+    @cached_property
+    def _split_by_rate(self) -> list[list[Term]]:
+        return [[term for term in self.terms if not term.effect.not_compensated
+                 and ('rate' in term.effect.inputs) == depends] for depends in (False, True)]
 
 
 def _sum_errors(terms: Sequence[Term], channels: Channels) -> Number:

@@ -26,7 +26,7 @@ from xml.sax.saxutils import escape
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.noise import GaussMarkov, Noise
+from gyro_calibration.model.noise import GaussMarkov, Noise, NOISE_TERMS
 import numpy as np
 from scipy.optimize import minimize
 
@@ -154,8 +154,6 @@ _FORMATTERS: dict[str, Callable[[SimulatorParameters], tuple[str, set[str]]]] = 
     'sdf': _format_sdf, 'isaac': _format_isaac, 'mujoco': _format_mujoco}
 #: Names of the simulators.
 SIMULATORS = tuple(_FORMATTERS)
-_NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
-                'rate_random_walk': 'rad/s/√s'}
 
 
 def export_model(parameters: SimulatorParameters, model: GyroModel,
@@ -175,8 +173,8 @@ def export_model(parameters: SimulatorParameters, model: GyroModel,
         found['scale_factor_error'] = f'{run.scale_factor_error:.6g} by the self-calibration'
     if parameters.bias:
         found['bias'] = f'{parameters.bias:.6g} rad/s at rest'
-    found |= {name: f'{getattr(noise, name):.6g} {unit}'
-              for name, unit in _NOISE_UNITS.items() if getattr(noise, name)}
+    found |= {part.name: f'{value:.6g} {part.unit}' for part in NOISE_TERMS
+              if (value := getattr(noise, part.name, 0.0))}
     left_out = [f'{name}: {value}' for name, value in found.items() if name not in names]
     if simulator == 'mujoco' and parameters.white_noise:
         left_out.append('angle_random_walk: stored as noise; MuJoCo 3.1.4 and later add none')

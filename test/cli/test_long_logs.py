@@ -76,12 +76,13 @@ def test_the_memory_does_not_grow_with_the_log(model, tmp_path):
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Let logs be read in blocks of 300 rows."""
+    monkeypatch.setattr('gyro_calibration.cli.verb.BLOCK_ROWS', 300)
     monkeypatch.setattr('gyro_calibration.cli.verb.read_log_blocks',
                         lambda *given, **more: read_log_blocks(*given, rows=300, **more))
 
 
 WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--invert'],
-         'at a rate': ['--rate', '100']}
+         'at a rate': ['--rate', '100'], 'unwrapped': ['--unwrap']}
 
 
 @pytest.mark.parametrize('words', WORDS.values(), ids=WORDS)

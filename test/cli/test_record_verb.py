@@ -26,10 +26,10 @@ import time
 from gyro_calibration.cli import main as command_line
 from gyro_calibration.cli import record as record_verb
 from gyro_calibration.cli.record import CsvRecorder, McapRecorder
-from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
+from gyro_calibration.files import InputError
 from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
@@ -219,7 +219,7 @@ def test_rosbags_and_mcap_read_what_is_recorded(tmp_path):
 
 def test_a_file_that_is_there_is_never_written_to(tmp_path):
     (tmp_path / 'a.mcap').write_text('precious')
-    with pytest.raises(UsageError, match='exists already'):
+    with pytest.raises(InputError, match='exists already'):
         recorders(tmp_path)
     assert (tmp_path / 'a.mcap').read_text() == 'precious'
 

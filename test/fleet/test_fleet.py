@@ -28,6 +28,7 @@ from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.logs import (
+    calibrate_log,
     compile_file_pattern,
     describe_log,
     find_logs,
@@ -254,6 +255,13 @@ def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch):
     (tmp_path / 'a.csv').touch()
     assert run(tmp_path, '--out', tmp_path / 'out') == 1
     assert 'interrupted after 0 of 1 logs; run the same command' in capsys.readouterr().err
+
+
+def test_a_reference_rate_that_is_never_steady_is_integrated_as_by_fit():
+    log = drive(0.01, 0)
+    method, model, _ = calibrate_log(replace(
+        log, reference_heading=None, reference_rate=np.gradient(log.reference_heading, log.time)))
+    assert method == 'likelihood' and model.terms[0].values[0] == pytest.approx(0.01, abs=1e-3)
 
 
 def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):

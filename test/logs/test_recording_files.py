@@ -27,7 +27,7 @@ from gyro_calibration.logs.cdr import (
     TEMPERATURE,
 )
 from gyro_calibration.logs.log import LogError, read_log, select_rows, write_log
-from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
+from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording
 import numpy as np
 import pytest
@@ -538,14 +538,6 @@ def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path,
 
 
 # Verbs
-
-
-def test_blocks_of_a_recording_are_the_whole(make, tmp_path, turning):
-    time, rate, _ = turning
-    log = read_recording(write(tmp_path / 'bag', {'imu': gyro(make, time, rate)}))
-    blocks = list(split_blocks(log, 300))
-    assert [len(block) for block in blocks] == [300] * 6 + [200]
-    np.testing.assert_array_equal(np.concatenate([block.output for block in blocks]), log.output)
 
 
 def numbers_of(answer):
