@@ -245,6 +245,13 @@ class HeadingTracker:
         self._state = self._state.with_heading(heading, variance)
         self._begin_anew()
 
+    def add_unknown_turn(self, deviation: float, angle: float = 0.0) -> None:
+        """Add a turn that was not measured, rad, with its standard deviation."""
+        self._advance_to_last_sample()
+        self._suspected_turn = None
+        self._add_unobserved_turn(deviation ** 2 + self._erroneous_turn ** 2, angle=angle)
+        self._begin_anew()
+
     @property
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
@@ -780,10 +787,11 @@ class HeadingTracker:
         return (f'no samples for {interval:.3f} s' if interval > 0.0
                 else f'the stamp jumps back by {-interval:.3f} s')
 
-    def _add_unobserved_turn(self, variance: float, duration: float = 0.0) -> None:
-        """Add a turn that was not measured in a time, s, after the last sample."""
+    def _add_unobserved_turn(self, variance: float, duration: float = 0.0,
+                             angle: float = 0.0) -> None:
+        """Add a turn, rad, that was not measured in a time, s, after the last sample."""
         self._erroneous_turn = 0.0
-        self._propagate_state(replace(self._zero_integral, duration=duration,
+        self._propagate_state(replace(self._zero_integral, duration=duration, angle=angle,
                                       lost_variance=variance, is_unobserved=True),
                               self._last_time)
         self._adopt_state()

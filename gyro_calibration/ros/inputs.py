@@ -178,6 +178,8 @@ COASTING_DURATION = 0.5
 STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s.
 MIN_TURN_RATE = 0.05
+#: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
+MAX_ANGULAR_ACCELERATION = 3.2
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
 
