@@ -26,7 +26,7 @@ import math
 
 from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.integration import Intervals, RECENT_DURATION
-from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
@@ -79,7 +79,8 @@ class RepeatedOutputDetector:
     def __init__(self, noise: Noise):
         """Start without samples; `noise` is that of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
-        self._value, self._since, self._count, self._had_sudden_stop = math.nan, 0.0, 0, False
+        self._value, self._since, self._count = math.nan, 0.0, 0
+        self._last_step = self._acceleration = 0.0  # to this value, rad/s, and rad/s² less noise
         self._reports_zero, self._holds = False, Intervals()
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # Smallest and largest value since a time, s, and the number of samples after the first.
@@ -94,10 +95,12 @@ class RepeatedOutputDetector:
         toggles, self.unseen_turn = self._toggles(time, output, has_noise_at_rest), 0.0
         if output != self._value:
             changed_after = abs(time - self._since)
-            if self._holds.add(changed_after) and (self._value or has_noise_at_rest
-                                                   or self._had_sudden_stop):
-                self.unseen_turn = self._find_unseen_turn(step)
-            self._had_sudden_stop = step > MIN_TURN_RATE + _MAX_DECELERATION * changed_after
+            if self._holds.add(changed_after) and (
+                    self._value or has_noise_at_rest
+                    or self._acceleration > MAX_ANGULAR_ACCELERATION):
+                self.unseen_turn = self._find_unseen_turn(math.hypot(step, self._last_step))
+            self._last_step = step
+            self._acceleration = (step - MIN_TURN_RATE) / max(changed_after, MIN_SAMPLE_INTERVAL)
             self._value, self._since, self._until, self._count = output, time, time, 0
             self._changes += 1
             return toggles
@@ -109,17 +112,18 @@ class RepeatedOutputDetector:
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
+        is_sudden = self._acceleration > _MAX_DECELERATION
         self._reports_zero = self._reports_zero or output == 0.0 and not (
-            has_noise_at_rest or self._had_sudden_stop)
+            has_noise_at_rest or is_sudden)
         # the step of the output is known after 100 changes
-        if (output == 0.0 and self._reports_zero and not self._had_sudden_stop
+        if (output == 0.0 and self._reports_zero and not is_sudden
                 or self._changes <= 100 or not sample):
             return False
         return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
                 or self._excludes_chance(self._step, self._count, sample))
 
     def _find_unseen_turn(self, step: float) -> float:
-        """Return the possible turn, rad, while the value was held before a step, rad/s."""
+        """Return the possible turn, rad, while the value was held between steps, rad/s."""
         usual = self._holds.usual_interval
         sample = self._noise.angle_random_walk / math.sqrt(usual)
         repeats = (self._until - self._since) / usual
