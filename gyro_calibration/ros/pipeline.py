@@ -208,8 +208,9 @@ class Pipeline:
     # Time
 
     def _new_stamp_delay(self) -> StampDelay:
-        """Return a comparison of stamps and clock, whose tolerance a deviation of 9 % exceeds."""
-        return StampDelay(self._clock, _INTERLEAVING_WINDOW, window=30.0)
+        """Return a comparison of stamps and clock, whose tolerance a deviation of 6 % exceeds."""
+        # a busy computer delays all samples by a second for a short time
+        return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
 
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
