@@ -219,7 +219,8 @@ class RestScatter:
 
     def probabilities(self, likelihood: Array) -> Array:
         """Return the probability of each scatter, shape (k,)."""
-        chances = self.counts * np.exp(likelihood - likelihood.max())
+        possible = np.where(self.counts > 0.0, likelihood, -math.inf)
+        chances = self.counts * np.exp(possible - possible.max())
         return np.asarray(chances / chances.sum())
 
     def mean_and_median(self, likelihood: Array) -> tuple[float, float]:

@@ -139,7 +139,10 @@ class HeadingTracker:
         self.steps, self._keeps_steps = list[TrackStep](), keeps_steps
         # numbers of steps before another calibration was used, and the states before it
         self.recalibrations = list[tuple[int, HeadingState]]()
-        self._interval, self._last_time, self.intervals = math.inf, 0.0, Intervals()
+        self._interval, self.intervals = math.inf, Intervals()
+        self._last_time = 0.0
+        # Begin of the motion since the last rest, and last time when the wheels did not stand, s.
+        self._motion_start_time = self._wheel_motion_time = 0.0
         self._last_sample: tuple[float, float, float, Array] | None = None
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
         # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump, and turn
@@ -242,6 +245,13 @@ class HeadingTracker:
         self._state = self._state.with_heading(heading, variance)
         self._begin_anew()
 
+    def add_unknown_turn(self, deviation: float, angle: float = 0.0) -> None:
+        """Add a turn that was not measured, rad, with its standard deviation."""
+        self._advance_to_last_sample()
+        self._suspected_turn = None
+        self._add_unobserved_turn(deviation ** 2 + self._erroneous_turn ** 2, angle=angle)
+        self._begin_anew()
+
     @property
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
@@ -308,7 +318,8 @@ class HeadingTracker:
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
             self._remember([time], [rate])
-            self._last_time, self.rate = time, rate - self._rate_error(sensitivity)
+            self._last_time = self._motion_start_time = self._wheel_motion_time = time
+            self.rate = rate - self._rate_error(sensitivity)
             return ''
         interval = time - last[0]
         if interval < 0.0 or interval > self._settings.maximum_gap:
@@ -542,6 +553,8 @@ class HeadingTracker:
     def _decide_rest(self, quiet: bool | None, wheels: bool | None) -> None:
         """Decide on rest or motion at the end of a block."""
         part = self._close_block()
+        if wheels is not False:
+            self._wheel_motion_time = self._last_time
         if self.is_resting:
             self._rest_blocks.append(part)
             self._wheels_stand = wheels is False
@@ -561,8 +574,13 @@ class HeadingTracker:
         if beyond >= _STEP_DURATION - TIME_TOLERANCE:
             self._advance_state(self._held_integral)
         if quiet and self._is_mean_at_rest(wheels):
-            self._advance_state(self._held_rest_integral())
-            self._enter_rest()
+            held = self._held_rest_integral()
+            change = self._unexpected_bias_change(self._with_still_sensitivity(held))
+            self._advance_state(held)
+            # it may have come at any time since the last rest
+            self._state = self._state.with_added_variance(
+                HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
+            self._enter_rest(change)
             self._rest_blocks.extend([*self._recent_blocks][1:])
 
     def _close_block(self) -> RateIntegral:
@@ -601,6 +619,14 @@ class HeadingTracker:
                 and not self._accept_slow_turn_as_bias()):
             self._enter_motion(self._quiet_duration)
         return stands
+
+    def _unexpected_bias_change(self, turn: RateIntegral) -> float:
+        """Return the change of the bias by a rest that only the wheels explain, rad/s, or 0."""
+        if (self._last_time - self._wheel_motion_time < _WHEEL_DELAY
+                or abs(self._normalized_innovation(self._state, turn))
+                < self._sigmas[WINDOW_DURATION]):
+            return 0.0
+        return (turn.angle - self._state.expected_rest_angle(turn)[0]) / turn.duration
 
     def _accept_slow_turn_as_bias(self) -> bool:
         """Attribute a slow, constant turn to a change of the bias at rest; tell whether so."""
@@ -647,9 +673,7 @@ class HeadingTracker:
                 if wheels is False:
                     if lag < _WHEEL_DELAY:
                         continue
-                    self._state = self._state.with_added_variance(
-                        WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
-                    self._enter_rest()
+                    self._enter_rest((turn.angle - expected) / turn.duration)
                 else:
                     self._revert_to_motion(lag)
                 return
@@ -662,8 +686,9 @@ class HeadingTracker:
 
     # From rest to motion and back
 
-    def _enter_rest(self) -> None:
-        """Begin a rest with the state as it is."""
+    def _enter_rest(self, bias_change: float = 0.0) -> None:
+        """Begin a rest with the state as it is, or with an unexpected change of bias, rad/s."""
+        self._state = self._state.with_added_variance(WALK_INDEX, bias_change ** 2)
         self.is_resting, self._rest_integral = True, self._zero_integral
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
@@ -676,6 +701,8 @@ class HeadingTracker:
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
+        if self.is_resting and len(self._snapshots) > 1:
+            self._motion_start_time = self._last_time - self._open_integral.duration
         self.is_resting, self._quiet_duration = False, quiet_duration
         self._recent_blocks, self._held_integral = deque[RateIntegral](), self._zero_integral
 
@@ -760,10 +787,11 @@ class HeadingTracker:
         return (f'no samples for {interval:.3f} s' if interval > 0.0
                 else f'the stamp jumps back by {-interval:.3f} s')
 
-    def _add_unobserved_turn(self, variance: float, duration: float = 0.0) -> None:
-        """Add a turn that was not measured in a time, s, after the last sample."""
+    def _add_unobserved_turn(self, variance: float, duration: float = 0.0,
+                             angle: float = 0.0) -> None:
+        """Add a turn, rad, that was not measured in a time, s, after the last sample."""
         self._erroneous_turn = 0.0
-        self._propagate_state(replace(self._zero_integral, duration=duration,
+        self._propagate_state(replace(self._zero_integral, duration=duration, angle=angle,
                                       lost_variance=variance, is_unobserved=True),
                               self._last_time)
         self._adopt_state()

@@ -158,7 +158,7 @@ class Drive:
         self._start_time = self._last_poll = clock.steady()
         self._has_receiver = self._had_callers = self._lost_callers = False
         self._next_command_time = -math.inf
-        self._stamp_delay = StampDelay(clock, DRIVE_SAMPLE_TIMEOUT, window=2.0)
+        self._stamp_delay = StampDelay(clock, 2.0, (0.5, DRIVE_SAMPLE_TIMEOUT))
         self.command_lateness = self.sample_lateness = 0.0  # largest ones, s
 
     def add_sample(self, time: float) -> None:

@@ -20,15 +20,17 @@ alarms.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 import math
 
 from gyro_calibration.files import MAX_MAGNITUDE
-from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.heading.integration import Intervals, RECENT_DURATION
+from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.inputs import MIN_TURN_RATE
+from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_TURN_RATE
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
@@ -37,6 +39,10 @@ _MAX_NOISE_RATIO = 1.25  # largest accepted one to the noise of the model; figur
 #: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
+_MAX_DECELERATION = 20.0  # rad/s²; of a robot
+#: Height of a spike, in medians of the steps before it, that no vibration has: 5 of 1.2 million
+#: samples of cars and turntables are higher.
+_MIN_SPIKE_RATIO = 10.0
 #: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
 #: path may vibrate for some time.
 _DECIDING_STRETCHES = 3
@@ -65,13 +71,18 @@ class RepeatedOutputDetector:
     stretch at rest had the noise of the model before the first such zero. Two neighbouring codes,
     as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above.
 
+    A value that was held for less time, but longer than usual and not by chance, leaves a possible
+    error of the integrated rate, `unseen_turn`, rad, with the sample that ends it.
+
     """
 
     def __init__(self, noise: Noise):
         """Start without samples; `noise` is that of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
-        self._value, self._since, self._count, self._had_sudden_stop = math.nan, 0.0, 0, False
-        self._reports_zero = False
+        self._value, self._since, self._count = math.nan, 0.0, 0
+        self._last_step = self._acceleration = 0.0  # to this value, rad/s, and rad/s² less noise
+        self._reports_zero, self._holds = False, Intervals()
+        self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # Smallest and largest value since a time, s, and the number of samples after the first.
         self._band = math.nan, math.nan, 0.0, 0
 
@@ -81,13 +92,19 @@ class RepeatedOutputDetector:
         step = abs(output - self._value)
         if step:
             self._step = min(step, self._step)
-        toggles = self._toggles(time, output, has_noise_at_rest)
+        toggles, self.unseen_turn = self._toggles(time, output, has_noise_at_rest), 0.0
         if output != self._value:
-            self._had_sudden_stop = step > MIN_TURN_RATE + 20.0 * abs(time - self._since)
-            self._value, self._since, self._count = output, time, 0
+            changed_after = abs(time - self._since)
+            if self._holds.add(changed_after) and (
+                    self._value or has_noise_at_rest
+                    or self._acceleration > MAX_ANGULAR_ACCELERATION):
+                self.unseen_turn = self._find_unseen_turn(math.hypot(step, self._last_step))
+            self._last_step = step
+            self._acceleration = (step - MIN_TURN_RATE) / max(changed_after, MIN_SAMPLE_INTERVAL)
+            self._value, self._since, self._until, self._count = output, time, time, 0
             self._changes += 1
             return toggles
-        self._count += 1
+        self._count, self._until = self._count + 1, time
         lasts = time - self._since
         if toggles or self._count < 20 or lasts < 0.25:
             return toggles
@@ -95,14 +112,29 @@ class RepeatedOutputDetector:
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
+        is_sudden = self._acceleration > _MAX_DECELERATION
         self._reports_zero = self._reports_zero or output == 0.0 and not (
-            has_noise_at_rest or self._had_sudden_stop)
+            has_noise_at_rest or is_sudden)
         # the step of the output is known after 100 changes
-        if (output == 0.0 and self._reports_zero and not self._had_sudden_stop
+        if (output == 0.0 and self._reports_zero and not is_sudden
                 or self._changes <= 100 or not sample):
             return False
         return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
                 or self._excludes_chance(self._step, self._count, sample))
+
+    def _find_unseen_turn(self, step: float) -> float:
+        """Return the possible turn, rad, while the value was held between steps, rad/s."""
+        usual = self._holds.usual_interval
+        sample = self._noise.angle_random_walk / math.sqrt(usual)
+        repeats = (self._until - self._since) / usual
+        # a chance of e^-20 is once in 50 days at 100 Hz
+        if (self._changes <= 100 or not sample
+                or not self._excludes_chance(self._step, repeats, sample, 20.0)):
+            return 0.0
+        held = self._until - self._since + usual
+        # the mean square of a rate that goes on linearly, or changes at once, and a turn meanwhile
+        return math.hypot(step * held / math.sqrt(3.0),
+                          0.25 * MAX_ANGULAR_ACCELERATION * held ** 2)
 
     def _toggles(self, time: float, output: float, has_noise_at_rest: bool) -> bool:
         """Tell whether the output has two neighbouring codes for longer than noise allows."""
@@ -117,16 +149,41 @@ class RepeatedOutputDetector:
                 and self._changes > 100 and sample > 0.0
                 and self._excludes_chance(2.0 * self._step, count, sample))
 
-    def _excludes_chance(self, width: float, count: int, sample: float) -> bool:
+    def _excludes_chance(self, width: float, count: float, sample: float,
+                         level: float = 100.0) -> bool:
         """
         Tell whether a live gyro cannot have `count` samples within a width, rad/s.
 
         The noise of a sample, rad/s, may be lower than that of the model. The probability must be
-        below e^-100, since it is e^-25 for a gyro that sends each sample four times.
+        below e^-level: e^-100, since it is e^-25 for a gyro that sends each sample four times.
 
         """
         stays = math.erf(_MAX_NOISE_REDUCTION * width / (2.0 * math.sqrt(2.0) * sample))
-        return -count * math.log(max(stays, 1e-9)) > 100.0
+        return -count * math.log(max(stays, 1e-9)) > level
+
+
+class SpikeDetector:
+    """Detector of single samples that deviate from both neighbours as no rate of a robot does."""
+
+    def __init__(self) -> None:
+        """Start without samples."""
+        self._last = math.nan, math.nan
+        self._step = 0.0  # to the last sample, rad/s
+        self._steps = deque[tuple[float, float]]()  # stamps, s, and sizes, rad/s
+
+    def add(self, time: float, output: float) -> float:
+        """Add a sample, s and rad/s; return the turn by the one before if it is a spike, rad."""
+        (then, before), self._last = self._last, (time, output)
+        last, self._step = self._step, output - before
+        interval = abs(time - then)
+        while self._steps and not 0.0 <= time - self._steps[0][0] <= RECENT_DURATION:
+            self._steps.popleft()
+        height = min(abs(last), abs(self._step)) if last * self._step < 0.0 else 0.0
+        is_spike = height > _MAX_DECELERATION * interval and height > (
+            _MAX_DECELERATION * interval
+            + _MIN_SPIKE_RATIO * float(np.median([size for _, size in self._steps])))
+        self._steps.append((time, abs(self._step)))
+        return math.copysign(height * interval, last) if is_spike else 0.0
 
 
 class HealthMonitor:

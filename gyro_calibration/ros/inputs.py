@@ -109,13 +109,19 @@ def node_time(clock: Clock) -> float:
 class StampDelay:
     """Delay of stamps behind the clock of a node, and a test whether both advance equally."""
 
-    def __init__(self, clock: Clock, tolerance: float, window: float):
-        """Start without samples; tolerance of their delay and window of the test, both in s."""
-        self._clock, self._tolerance, self._window = clock, tolerance, window
-        self.min_delay = math.nan  # of recent samples, s
+    def __init__(self, clock: Clock, window: float, *tolerances: tuple[float, float]):
+        """
+        Start without samples.
+
+        The test compares with the delays of a window, s. A tolerance is a duration, s, the
+        shortest one first, in which some samples are not late, and a change of their delay, s.
+
+        """
+        self._clock, self._window, self._tolerances = clock, window, tolerances
         # Time of arrival and delay, s, of samples with less delay than any after them.
         self._min_delays = deque[tuple[float, float]]()
-        self._previous: tuple[float, float] | None = None
+        # Times, s, and the least delays at these times for each tolerance, s.
+        self._earlier = deque[tuple[float, list[float]]]()
 
     def add(self, time: float) -> float:
         """Add the stamp of a sample, s; return its delay beyond the least one, s."""
@@ -123,27 +129,40 @@ class StampDelay:
         while self._min_delays and self._min_delays[-1][1] >= now - time:
             self._min_delays.pop()
         self._min_delays.append((now, now - time))
-        # few samples are delayed for longer than this window, s, and a gyro clock that is 3 % off
-        # drifts by 15 ms in it
-        while now - self._min_delays[0][0] > 0.5:
+        while now - self._min_delays[0][0] > self._tolerances[-1][0]:
             self._min_delays.popleft()
-        self.min_delay = self._min_delays[0][1]
         return now - time - self.min_delay
+
+    @property
+    def min_delay(self) -> float:
+        """Return the least delay in the shortest duration, s."""
+        return self._least_delay(self._tolerances[0][0])
+
+    def _least_delay(self, duration: float) -> float:
+        """Return the least delay in a duration before the last sample, s."""
+        return next((delay for then, delay in self._min_delays
+                     if self._min_delays[-1][0] - then <= duration), math.nan)
 
     def find_fault(self) -> str:
         """Return a sentence if stamps and clock advance differently; else ''."""
         now = node_time(self._clock)
-        then, before = self._previous or (now, self.min_delay)
-        elapsed, grown = now - then, self.min_delay - before
         # In a fast simulation the same delay is more simulated time.
-        limit = self._tolerance * (1.0 if self._clock.simulated() is None else 4.0)
-        # the clocks of gyros are up to 3 % off
-        if abs(grown) > limit + 0.05 * abs(elapsed):
-            return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
-                    f'imu/data_raw advanced by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
-                    'the load, or check that clock and use_sim_time')
-        if self._min_delays and (self._previous is None or elapsed > self._window):
-            self._previous = now, self.min_delay
+        factor = 1.0 if self._clock.simulated() is None else 4.0
+        while self._earlier and not 0.0 <= now - self._earlier[0][0] <= self._window:
+            self._earlier.popleft()
+        least = [self._least_delay(duration) for duration, _ in self._tolerances]
+        for then, before in self._earlier:
+            elapsed = now - then
+            for late, early, (_, tolerance) in zip(least, before, self._tolerances, strict=True):
+                # the clocks of gyros are up to 3 % off
+                if abs(late - early) > factor * tolerance + 0.05 * elapsed:
+                    return ('this computer was busy, or the clock of the driver is wrong: the '
+                            'stamps on imu/data_raw advanced by '
+                            f'{elapsed - late + early:.2f} s in {elapsed:.2f} s; reduce the load, '
+                            'or check that clock and use_sim_time')
+        if self._min_delays and not (
+                self._earlier and now - self._earlier[-1][0] < self._tolerances[-1][0]):
+            self._earlier.append((now, least))
         return ''
 
 
@@ -178,6 +197,8 @@ COASTING_DURATION = 0.5
 STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s.
 MIN_TURN_RATE = 0.05
+#: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
+MAX_ANGULAR_ACCELERATION = 3.2
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
 

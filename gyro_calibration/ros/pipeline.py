@@ -52,10 +52,15 @@ from gyro_calibration.ros.calibration_session import (
     REST,
     ROS_TIME_PAUSED,
 )
-from gyro_calibration.ros.health_monitor import HealthMonitor, RepeatedOutputDetector
+from gyro_calibration.ros.health_monitor import (
+    HealthMonitor,
+    RepeatedOutputDetector,
+    SpikeDetector,
+)
 from gyro_calibration.ros.inputs import (
     Clock,
     COMMAND,
+    MAX_ANGULAR_ACCELERATION,
     MAX_VELOCITY_AGE,
     ODOMETRY,
     Parameter,
@@ -111,7 +116,6 @@ PARAMETERS = (
 _MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits for seconds
 _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
-_MAX_ANGULAR_ACCELERATION = 3.2  # rad/s²; between two samples: the default of Nav2's controllers
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
 #: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill.
 _MAX_HEADING_CHANGE_AT_REST = 1.0 * DEGREE
@@ -192,6 +196,7 @@ class Pipeline:
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
         self.repeat_fault, self._repeat_detector = '', RepeatedOutputDetector(noise)
+        self._spike_detector, self._outlier_count = SpikeDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
         self._stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
@@ -203,8 +208,9 @@ class Pipeline:
     # Time
 
     def _new_stamp_delay(self) -> StampDelay:
-        """Return a comparison of stamps and clock, whose tolerance a deviation of 9 % exceeds."""
-        return StampDelay(self._clock, _INTERLEAVING_WINDOW, window=30.0)
+        """Return a comparison of stamps and clock, whose tolerance a deviation of 6 % exceeds."""
+        # a busy computer delays all samples by a second for a short time
+        return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
 
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
@@ -261,7 +267,7 @@ class Pipeline:
         elif abs(math.remainder(heading - self._heading_at_rest,
                                 math.tau)) > _MAX_HEADING_CHANGE_AT_REST:
             self._contradiction_time, self._heading_at_rest = now, heading
-            self._add_unknown_turn(_MAX_HEADING_CHANGE_AT_REST)
+            self.estimator.tracker.add_unknown_turn(_MAX_HEADING_CHANGE_AT_REST)
         elif math.isnan(self._heading_at_rest):
             self._heading_at_rest = heading
         # A late message is not used, and a contradictory one does not show standstill.
@@ -339,7 +345,7 @@ class Pipeline:
         if self._frozen_stamp is not None:
             (first, fastest), self._frozen_stamp = self._frozen_stamp, None
             if now - first > DRIVE_SAMPLE_TIMEOUT:  # add the possible turn meanwhile
-                self._add_unknown_turn(min(fastest * (now - first), math.tau))
+                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                  'came; turns in this time are not in the heading')
         interval = time - self._last_time
@@ -415,10 +421,10 @@ class Pipeline:
             self._recent_rates.clear()
             self.session.interrupt(restarted)
         elif unseen and moving is not False and tracker.intervals.lost_samples > lost:
-            turned = 0.25 * _MAX_ANGULAR_ACCELERATION * interval ** 2
+            turned = 0.25 * MAX_ANGULAR_ACCELERATION * interval ** 2
             if silence < 0.5 * interval:  # the stamps may have jumped without a loss
                 turned += abs(estimator.rate) * interval
-            self._add_unknown_turn(turned)
+            self.estimator.tracker.add_unknown_turn(turned)
         return True
 
     def _corrected_sample(self, stamp: int, time: float) -> CorrectedSample | None:
@@ -441,21 +447,24 @@ class Pipeline:
             self._recent_rates.popleft()
         return found
 
-    def _add_unknown_turn(self, angle: float) -> None:
-        """Add a turn that was not measured, rad, to the variance of the heading."""
-        tracker = self.estimator.tracker
-        self.estimator.set_heading(tracker.heading, tracker.variance + angle ** 2)
-
     def _check_repeats(self, time: float, output: float, now: float) -> None:
-        """Detect a repeated value, and add an unknown turn to the heading."""
-        if not self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
-                                         self.monitor.has_noise_at_rest):
+        """Detect repeated values and spikes, and add an unknown turn to the heading."""
+        outliers, self._outlier_count = self._outlier_count, self.estimator.tracker.outlier_count
+        spike = self._spike_detector.add(time, output)
+        is_repeated = self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
+                                                self.monitor.has_noise_at_rest)
+        if not is_repeated:
+            if self._outlier_count > outliers:  # the tracker has not used the sample
+                spike = 0.0
+            unseen = math.hypot(self._repeat_detector.unseen_turn, spike)
+            if unseen and not self.repeat_fault:
+                self.estimator.tracker.add_unknown_turn(unseen, -spike)
             self.repeat_fault = ''
         elif not self.repeat_fault:
             self.repeat_fault = (f'the gyro repeats the rate {output:g} rad/s: it is dead or '
                                  'saturated, or its driver has stopped')
             self.journal.event = self.repeat_fault
-            self._add_unknown_turn(math.tau)
+            self.estimator.tracker.add_unknown_turn(math.tau)
             if self.session.is_driving:
                 self.session.end(self.repeat_fault)
 
@@ -548,7 +557,7 @@ class Pipeline:
         self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
         if self.clock_fault or self.frame_fault or self.turn_fault:
-            self._add_unknown_turn(math.tau)
+            self.estimator.tracker.add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):
             self.journal.event = event

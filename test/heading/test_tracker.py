@@ -20,6 +20,7 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     smooth_states,
 )
+from gyro_calibration.heading.stationary import RestScatter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
@@ -306,6 +307,24 @@ def test_the_first_rate_after_a_gap_or_a_jump_back_is_corrected_by_the_bias_esti
         rate = 0.2 + 0.3 * DEGREE
         assert tracker.add(time, rate, np.array([-rate, -1.0]), None, np.array([0.0, -1.0]))
         assert tracker.rate == pytest.approx(0.2, abs=0.05 * DEGREE)
+
+
+def test_a_mean_that_no_possible_scatter_explains_leaves_probabilities():
+    scatter = RestScatter()
+    scatter.begin_rest(0.0)
+    found = scatter.probabilities(np.where(scatter.counts > 0.0, -1e6, 0.0))
+    np.testing.assert_allclose(found, scatter.counts / scatter.counts.sum())
+
+
+@pytest.mark.parametrize('change', [0.001, 0.01, 0.02])
+def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(change):
+    noise, generator = Noise(1e-5), np.random.default_rng(13)
+    tracker = HeadingTracker(noise, np.diag([1e-12]), Settings())
+    for index, bias in enumerate([0.0] * 1200 + [change] * 2400 + [0.0] * 2400):
+        drawn = noise.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL)
+        assert not tracker.add(INTERVAL * index, bias + drawn, np.array([-1.0]), False)
+    assert tracker.is_resting and tracker.bias[0] == pytest.approx(0.0, abs=1e-4)
+    assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
 
 
 @pytest.mark.parametrize('interval', [0.45, 0.5], ids=['lost samples', '2 Hz'])
