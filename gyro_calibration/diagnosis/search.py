@@ -51,10 +51,14 @@ from gyro_calibration.diagnosis.findings import (
 from gyro_calibration.diagnosis.regression import (
     build_problem,
     column_evidence,
+    ColumnGroups,
     fit_causes,
     free_amplitude,
+    group_columns,
     Indices,
     is_rate_distortion,
+    likelihood_with,
+    likelihood_without,
     RegressionFit,
     RegressionProblem,
 )
@@ -129,7 +133,7 @@ class Search:
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
     # columns_cache, step_cache: caches of columns and of steps, by the named causes
-    columns_cache: dict[tuple[Any, ...], tuple[Array, list[range]]] = field(default_factory=dict)
+    columns_cache: dict[tuple[Any, ...], ColumnGroups] = field(default_factory=dict)
     step_cache: dict[tuple[Any, ...], tuple[Candidate | None, list[Scored]]] = field(
         default_factory=dict)
     # is called with None and the name of each step that begins
@@ -142,13 +146,14 @@ class Search:
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
             known = self.columns_cache.popitem()[1] if self.columns_cache else None
-            self.columns_cache[key] = self._candidate_columns(fit, known)
-        columns, groups = self.columns_cache[key]
-        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in groups])
-        return column_evidence(fit, columns, groups) - penalty
+            self.columns_cache[key] = group_columns(self.problem,
+                                                    *self._candidate_columns(fit, known))
+        columns = self.columns_cache[key]
+        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in columns.groups])
+        return column_evidence(fit, columns) - penalty
 
-    def _candidate_columns(self, fit: RegressionFit, known: tuple[Array, list[range]] | None,
-                           ) -> tuple[Array, list[range]]:
+    def _candidate_columns(self, fit: RegressionFit,
+                           known: ColumnGroups | None) -> tuple[Array, Sequence[Sequence[int]]]:
         """Return whitened columns and those of each candidate; known ones for another rate."""
         deviation = self.problem.deviation
         if known is None:
@@ -157,11 +162,10 @@ class Search:
             ends = np.cumsum([len(part) for part in parts]).tolist()
             return np.concatenate([np.empty((0, len(deviation))), *parts]), [
                 range(end - len(part), end) for end, part in zip(ends, parts)]
-        columns, groups = known
-        for each, own in zip(self.candidates, groups):
+        for each, own in zip(self.candidates, known.groups):
             if depends_on_rate(each):
-                columns[own.start:own.stop] = candidate_transforms(each, fit.distorted) / deviation
-        return columns, groups
+                known.columns[own] = candidate_transforms(each, fit.distorted) / deviation
+        return known.columns, known.groups
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
@@ -273,14 +277,13 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
             return with_shape(start, place, first + by if half else first * math.exp(by))
 
         best = minimize_scalar(
-            lambda by: -fit_causes(fit.problem, [*fit.causes, moved(by)]).log_likelihood,
-            bounds=(-half_range, half_range), method='bounded',
-            options={'xatol': 4e-3 * half_range, 'maxiter': 14})
+            lambda by: -likelihood_with(fit, moved(by)), bounds=(-half_range, half_range),
+            method='bounded', options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    done = fit_causes(fit.problem, [*fit.causes, candidate])
-    return candidate, (
-        done.log_likelihood - VALUE_PENALTY * max(done.column_counts[-1] - 1, 0)
-        - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
+    count = (0 if candidate.amplitude is not None
+             else len(candidate.columns(fit.problem.replays[0])))
+    return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * max(count - 1, 0)
+                       - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
 
 
 def is_lasting(candidate: Candidate) -> bool:
@@ -448,7 +451,8 @@ def _with_part_of_log(search: Search, causes: Causes) -> Causes:
         return ()
     fit = fit_causes(search.problem, causes)
     columns = np.concatenate([candidate_transforms(each, fit.distorted) for each in steps])
-    evidence = column_evidence(fit, columns / search.problem.deviation, pairs)
+    evidence = column_evidence(fit, group_columns(
+        search.problem, columns / search.problem.deviation, pairs))
     # with the best times, which are tried where the pair is likelier than chance
     likely = 2.0 * math.log(MAX_STEP_TIMES)
     least = likely - math.log(search.rate)
@@ -494,9 +498,8 @@ def complexity_penalty(cause: Candidate) -> float:
 
 def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
     """Return the evidence for one of the causes given the others."""
-    others = [*causes[:cause_index], *causes[cause_index + 1:]]
-    return (fit_causes(search.problem, causes).log_likelihood
-            - fit_causes(search.problem, others).log_likelihood
+    fit = fit_causes(search.problem, causes)
+    return (fit.log_likelihood - likelihood_without(fit, cause_index)
             - complexity_penalty(causes[cause_index]))
 
 
