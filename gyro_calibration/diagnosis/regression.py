@@ -165,10 +165,9 @@ class RegressionFit:
     # the logs with the rate that the gyro senses, distorted by causes
     distorted: tuple[Replay, ...]
     causes: tuple[Candidate, ...]  # causes
-    residual: Array  # whitened, less the columns of causes of fixed amplitude, shape (m,)
-    # whitened and independent: scale factor error, those of the causes, and derivatives with
-    # respect to their shapes, shape (q, m)
-    columns: Array
+    # whitened, shape (q + 1, m): the independent columns of scale factor error, causes, and
+    # derivatives with respect to their shapes; the residual less the causes of fixed amplitude
+    rows: Array
     # of each column: (index of the cause; index of its value, or -1 less index of its shape); -1
     # and 0 for the scale factor error, -1 and more for the nuisance
     column_owners: tuple[tuple[int, int], ...]
@@ -184,6 +183,11 @@ class RegressionFit:
     lasting_only: bool = False
 
     # the likelihood
+
+    @property
+    def columns(self) -> Array:
+        """Return the whitened independent columns, shape (q, m)."""
+        return self.rows[:-1]
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -225,7 +229,7 @@ class RegressionFit:
         probable = self.noise_probability
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
-        covariance = self.inverse_information[kept]
+        covariance = np.linalg.inv(self.information[kept])
         values = np.einsum('gpq,gq->gp', covariance, self.scores[kept])
         mean = weights @ values
         variances = weights * self.residual_squares[kept] / self.degrees_of_freedom
@@ -236,7 +240,7 @@ class RegressionFit:
 
     def residual_transforms(self) -> list[Array]:
         """Return each log's residual whitened by the first noise: shape (points - 1,)."""
-        return self.problem.split_by_log(self.residual - self.estimates[0] @ self.columns)
+        return self.problem.split_by_log(self.rows[-1] - self.estimates[0] @ self.columns)
 
     def whitening_factors(self) -> list[Array]:
         """Return the factors to variance 1 of each log's coefficients, by the likeliest noise."""
@@ -443,20 +447,20 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
             owners.append((place, -1 - shape))
     rows = np.concatenate([*columns, residual[None]]) / problem.deviation
     of_bands = problem.band_products(rows, rows)
-    kept = _independent_columns(of_bands.sum(axis=0)[:-1, :-1])
-    sums = np.tensordot(problem.weights, of_bands[:, [*kept, -1]][:, :, kept], 1)
-    of, residual = rows[kept], rows[-1].copy()
+    kept = [*_independent_columns(of_bands.sum(axis=0)[:-1, :-1]), len(rows) - 1]
+    rows = rows if len(kept) == len(rows) else rows[kept]
+    sums = np.tensordot(problem.weights, of_bands[:, kept][:, :, kept], 1)[:, :, :-1]
     information, scores = sums[:, :-1], sums[:, -1]
     # of what the values for one noise leave, as the difference of the whole sums is rounded
-    left = residual - np.linalg.solve(information[0], scores[0]) @ of
-    pull = problem.products(np.concatenate([of, left[None]]), left[None])
-    squares = pull[:, -1, 0] - np.einsum(
-        'gq,gq->g', np.linalg.solve(information, pull[:, :-1])[:, :, 0], pull[:, :-1, 0])
+    left = np.append(-np.linalg.solve(information[0], scores[0]), 1.0) @ rows
+    pull, squares = (problem.products(each, left[None]) for each in (rows[:-1], left[None]))
+    squares = squares[:, 0, 0] - np.einsum(
+        'gq,gq->g', np.linalg.solve(information, pull)[:, :, 0], pull[:, :, 0])
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
-    likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
-    return RegressionFit(problem, distorted, causes, residual, of,
-                         tuple(owners[place] for place in kept), tuple(widths),
-                         len(kept) < len(owners), information, scores, squares, likelihood)
+    likelihood = -0.5 * ((len(left) - len(rows) + 1) * np.log(squares) + determinants)
+    return RegressionFit(problem, distorted, causes, rows,
+                         tuple(owners[place] for place in kept[:-1]), tuple(widths),
+                         len(rows) <= len(owners), information, scores, squares, likelihood)
 
 
 @lru_cache(maxsize=32)
@@ -529,8 +533,7 @@ class _LeftOfColumns(NamedTuple):
 
 def _left_of_columns(fit: RegressionFit, groups: ColumnGroups) -> Iterator[_LeftOfColumns]:
     """Give what a fit leaves of groups of columns, for each width."""
-    crossing = fit.problem.products(groups.columns,
-                                    np.concatenate([fit.columns, fit.residual[None]]))
+    crossing = fit.problem.products(groups.columns, fit.rows)
     crossing, pull = crossing[:, :, :-1], crossing[:, :, -1]
     towards = crossing @ fit.inverse_information
     pull = pull - np.einsum('gpq,gq->gp', towards, fit.scores)
@@ -577,7 +580,7 @@ def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
 
 def _extended_fit(fit: RegressionFit, candidate: Candidate) -> tuple[float, float]:
     """Return the log-likelihood with one more cause, and the value of its first column."""
-    problem, columns = fit.problem, _transforms(candidate, fit.distorted)
+    problem, columns = fit.problem, candidate_transforms(candidate, fit.distorted)
     left = next(_left_of_columns(fit, group_columns(problem, columns / problem.deviation,
                                                     [range(len(columns))])))
     if not len(left.places):
