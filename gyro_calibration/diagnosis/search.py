@@ -280,10 +280,13 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
             lambda by: -likelihood_with(fit, moved(by)), bounds=(-half_range, half_range),
             method='bounded', options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    count = (0 if candidate.amplitude is not None
-             else len(candidate.columns(fit.problem.replays[0])))
-    return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * max(count - 1, 0)
+    more = max(_free_column_count(candidate, fit.problem) - 1, 0)
+    return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * more
                        - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
+
+
+def _free_column_count(candidate: Candidate, problem: RegressionProblem) -> int:
+    return 0 if candidate.amplitude is not None else len(candidate.columns(problem.replays[0]))
 
 
 def is_lasting(candidate: Candidate) -> bool:
@@ -677,8 +680,7 @@ def _alternatives(search: Search, named: Causes, place: int,
     """Return the simplest alternative of a cause, or itself, and all with their deficits."""
     def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
-        return len(fitted_shape_indices(known)) + (
-            0 if known.amplitude is not None else len(known.columns(search.problem.replays[0])))
+        return len(fitted_shape_indices(known)) + _free_column_count(known, search.problem)
 
     own = named[place]
     _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
