@@ -351,14 +351,13 @@ class Spans:
     def step_columns(self, times: Array) -> Array:
         """Return the columns of steps of the bias, each between two samples, shape (n + r, k)."""
         time = np.asarray(self.log.time)
-        between = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
-        begin = between[np.searchsorted(time, times)]
+        between = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), [math.inf]])
+        begin, at = between[np.searchsorted(time, times)], self.gyro_stamps(self.value_times)
         # the time in motion since the step, as a mean over the values of each point
-        at, since = (np.interp(each, time, self.time_in_motion)
-                     for each in (self.gyro_stamps(self.value_times), begin))
-        total, end = np.append(0.0, np.cumsum(at)), np.cumsum(np.bincount(self.point_index))
-        first = np.clip(np.searchsorted(at, since, side='right'),
-                        np.append(0, end[:-1])[:, None], end[:, None])
+        moved, since = (np.interp(each, time, integrate_with_curvature(
+            time, self.is_in_motion.astype(float))) for each in (at, begin))
+        total, end = np.append(0.0, np.cumsum(moved)), np.cumsum(np.bincount(self.point_index))
+        first = np.clip(np.searchsorted(at, begin), np.append(0, end[:-1])[:, None], end[:, None])
         means = ((total[end][:, None] - total[first] - since * (end[:, None] - first))
                  / np.bincount(self.point_index)[:, None])
         at_rest = np.diff(np.maximum(time[self.rests][:, :, None] - begin, 0.0), axis=1)[:, 0]
