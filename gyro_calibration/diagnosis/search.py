@@ -189,9 +189,9 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
 
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
-    """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
+    """Return a silent search for some causes in other parts of the logs, at another rate."""
     return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate,
-                   columns_cache={}, step_cache={},
+                   columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
                    scanned_causes=search.scanned_causes & frozenset(causes),
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
 
@@ -210,7 +210,6 @@ def find_strongest(search: Search, causes: Sequence[Candidate],
     key = tuple((each.cause, each.log_index, *each.shapes) for each in causes)
     if key in search.step_cache:
         return search.step_cache[key]
-    search.on_progress(None, f'search for causes, {len(causes)} found')
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit)
     significant = [each for each, evidence in first
@@ -431,6 +430,7 @@ def _select_forward(search: Search) -> Causes:
     """Add causes one by one (forward selection)."""
     named: Causes = ()
     for _ in range(2 * MAX_CAUSES):  # some are removed again
+        search.on_progress(None, f'search for causes, {len(named)} found')
         one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
         more = _with_part_of_log(search, named) if one_more is None else (*named, one_more)
         if not more:
