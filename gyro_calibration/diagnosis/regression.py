@@ -569,36 +569,32 @@ def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
 
 def likelihood_with(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the log-likelihood of a fit with one more cause, whose shapes are fixed."""
-    return (fit_causes(fit.problem, [*fit.causes, candidate]).log_likelihood
-            if is_rate_distortion(candidate.cause) else _extended_fit(fit, candidate)[0])
+    if not is_rate_distortion(candidate.cause):
+        columns = candidate_transforms(candidate, fit.distorted)
+        if len(columns) == 1:  # several may depend on each other
+            return _fit_with_column(fit, columns, candidate.amplitude)[0]
+    return fit_causes(fit.problem, [*fit.causes, candidate]).log_likelihood
 
 
 def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the amplitude that fits best for a cause whose amplitude is fixed."""
-    return _extended_fit(fit, replace(candidate, amplitude=None))[1]
+    return _fit_with_column(fit, candidate_transforms(candidate, fit.distorted), None)[1]
 
 
-def _extended_fit(fit: RegressionFit, candidate: Candidate) -> tuple[float, float]:
-    """Return the log-likelihood with one more cause, and the value of its first column."""
-    problem, columns = fit.problem, candidate_transforms(candidate, fit.distorted)
-    left = next(_left_of_columns(fit, group_columns(problem, columns / problem.deviation,
-                                                    [range(len(columns))])))
+def _fit_with_column(fit: RegressionFit, column: Array,
+                     amplitude: float | None) -> tuple[float, float]:
+    """Return the log-likelihood with one more column, shape (1, m), and its coefficient."""
+    left = next(_left_of_columns(fit, group_columns(fit.problem, column / fit.problem.deviation,
+                                                    [[0]])))
     if not len(left.places):
         return fit.log_likelihood, 0.0
-    products, pull = left.products[:, 0], left.pull[:, 0]
-    before = fit.residual_squares
-    if candidate.amplitude is None:
-        values = np.linalg.solve(products, pull[:, :, None])[:, :, 0]
-        squares, added = before - np.einsum('gp,gp->g', pull, values), len(columns)
-        determinants = np.linalg.slogdet(products)[1]
-    else:
-        values = np.full_like(pull, candidate.amplitude)
-        squares, added = before + (values * (values * products[:, 0] - 2.0 * pull))[:, 0], 0
-        determinants = np.zeros(len(squares))
-    likelihood, log_likelihood = _changed_likelihood(fit, added, squares, determinants)
+    product, pull = left.products[:, 0, 0, 0], left.pull[:, 0, 0]
+    values = pull / product if amplitude is None else np.full_like(pull, amplitude)
+    likelihood, log_likelihood = _changed_likelihood(
+        fit, amplitude is None, fit.residual_squares + values * (values * product - 2.0 * pull),
+        np.log(product) * (amplitude is None))
     probable = np.exp(likelihood - likelihood.max())
-    return log_likelihood, float(np.average(values[:, 0],
-                                            weights=probable * (probable > 1e-3)))
+    return log_likelihood, float(np.average(values, weights=probable * (probable > 1e-3)))
 
 
 def likelihood_without(fit: RegressionFit, cause_index: int) -> float:
