@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 from typing import Any, NamedTuple
 
@@ -202,7 +203,7 @@ class Spans:
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
 
-    @property
+    @cached_property
     def is_measured(self) -> Mask:
         """Tell which spans and rests the output covers, shape (n + r,)."""
         assert self.log.time is not None
@@ -250,9 +251,12 @@ class Spans:
 
     def value_slice(self, causes: Sequence[CauseTerm], cause: CauseTerm) -> slice:
         """Return the places of the values of one of the causes."""
-        before = causes[:causes.index(cause)]
-        start = len(BASE_VALUES) + sum(self.cause_columns(each).shape[1] for each in before)
-        return slice(start, start + self.cause_columns(cause).shape[1])
+        counts = [2 if each.cause == 'reference_once_per_rev'
+                  else max(len(CATALOGUE[each.cause].coefficients), 1)
+                  if each.cause in CATALOGUE else 1 for each in causes]
+        place = causes.index(cause)
+        start = len(BASE_VALUES) + sum(counts[:place])
+        return slice(start, start + counts[place])
 
     def correction(self, causes: Sequence[CauseTerm], count: int) -> Array:
         """Return the values for which the stamps are corrected, and 0 for the others."""
@@ -262,12 +266,12 @@ class Spans:
             values[self.value_slice(causes, _CLOCK_TERM)] = self.clock_rate
         return values
 
-    @property
+    @cached_property
     def is_in_motion(self) -> Mask:
         """Tell which samples are not in a rest."""
         return ~mark_rows(self.rests, len(self.log))
 
-    @property
+    @cached_property
     def time_in_motion(self) -> Array:
         """Return the time without the rests, s, shape (m,)."""
         assert self.log.time is not None
@@ -348,6 +352,22 @@ class Spans:
             return (self.span_integrals(rate) - self.span_changes(time * rate))[:, None]
         columns = CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)
         return np.column_stack([-self.span_integrals(np.asarray(each)) for each in columns])
+
+    def step_columns(self, times: Array) -> Array:
+        """Return the columns of steps of the bias, each between two samples, shape (n + r, k)."""
+        time = np.asarray(self.log.time)
+        between = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), [math.inf]])
+        begin, at = between[np.searchsorted(time, times)], self.gyro_stamps(self.value_times)
+        # the time in motion since the step, as a mean over the values of each point
+        moved, since = (np.interp(each, time, integrate_with_curvature(
+            time, self.is_in_motion.astype(float))) for each in (at, begin))
+        total, end = np.append(0.0, np.cumsum(moved)), np.cumsum(np.bincount(self.point_index))
+        first = np.clip(np.searchsorted(at, begin), np.append(0, end[:-1])[:, None], end[:, None])
+        means = ((total[end][:, None] - total[first] - since * (end[:, None] - first))
+                 / np.bincount(self.point_index)[:, None])
+        at_rest = np.diff(np.maximum(time[self.rests][:, :, None] - begin, 0.0), axis=1)[:, 0]
+        turned = np.concatenate([np.diff(means, axis=0), at_rest])
+        return np.asarray(-turned * self.is_measured[:, None])
 
     def with_corrected_rate(self, values: Array, causes: Sequence[CauseTerm] = ()) -> Spans:
         """

@@ -338,7 +338,8 @@ class _Regression:
 
         Returns
         -------
-        log likelihoods, shape (k,); values, shape (k, m + q); inverse normal matrices
+        log likelihoods, shape (k,); values, shape (k, m + q); the first m columns of the inverse
+        normal matrices, shape (k, m + q, m)
 
         """
         weighted = covariance.solve(np.column_stack([self.columns, self.observed]))
@@ -347,15 +348,17 @@ class _Regression:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(gram[:, :-1]) + precisions, 1e-300))
         normal = ((gram[:, :-1] + precisions[:, :, None] * np.eye(len(gram))) * scale[:, :, None]
                   * scale[:, None, :])
-        inverse = (np.linalg.pinv(normal, rcond=1e-12, hermitian=True) if self.value_count
-                   and np.linalg.cond(normal[0]) > 1e12 else np.linalg.inv(normal))
+        solve = ((lambda a, b: np.linalg.pinv(a, rcond=1e-12, hermitian=True) @ b)
+                 if self.value_count and np.linalg.cond(normal[0]) > 1e12 else np.linalg.solve)
         log_determinant = np.linalg.slogdet(normal)[1] - 2.0 * np.log(scale).sum(axis=1)
-        inverse = inverse * scale[:, :, None] * scale[:, None, :]
-        values = inverse @ gram[:, -1]
-        # not by the difference of two sums, of which rounding leaves nothing
-        residual = self.observed[:, None] - self.columns @ values.T
-        squares = ((residual * covariance.solve(residual)).sum(axis=0)
-                   + (precisions * values**2).sum(axis=1))
+        sought = np.column_stack([np.eye(len(gram), self.value_count), gram[:, -1]])
+        found = scale[:, :, None] * solve(normal, scale[:, :, None] * sought)
+        inverse, values = found[:, :, :-1], found[:, :, -1]
+        # by the residual of the first values, as rounding leaves nothing of the difference of sums
+        residual, change = self.observed - self.columns @ values[0], values - values[0]
+        solved = covariance.solve(residual)
+        squares = (residual @ solved - 2.0 * change @ (self.columns.T @ solved)
+                   + ((change @ gram[:, :-1]) * change + precisions * values**2).sum(axis=1))
         proper = np.log(np.where(precisions > 0.0, precisions, 1.0)).sum(axis=1)
         return (-0.5 * (covariance.log_determinant + log_determinant - proper + squares), values,
                 inverse)
@@ -461,7 +464,7 @@ def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
         log_likelihood, values, inverse = regression.solve(
             regression.banded_covariance(sizes), precisions)
         found.append((np.column_stack([np.tile(sizes, (len(inner), 1)), inner]), log_likelihood,
-                      values[:, :count], inverse[:, :count, :count]))
+                      values[:, :count], inverse[:, :count]))
     return _Grid(*(np.concatenate(each) for each in zip(*found)))
 
 
@@ -485,7 +488,7 @@ def _average_grid(regression: _Regression, grid: _Grid, weights: Array, mean: Ar
         all_values = corrected
     residual = regression.observed - regression.columns @ all_values
     of_values = regression.observed - regression.columns[:, :count] @ all_values[:count]
-    influence = noise.solve(regression.columns) @ inverse[:, :count] * of_values[:, None]
+    influence = noise.solve(regression.columns) @ inverse * of_values[:, None]
     return GridFit(values + mean, covariance, {name: _interval_95(grid.sizes[:, place], weights)
                                                for place, name in enumerate(names)},
                    likeliest_sizes, float(grid.log_likelihood[best]),

@@ -22,8 +22,9 @@ better than no cause; otherwise it is suspected.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 import math
 from typing import NamedTuple
 
@@ -578,14 +579,15 @@ def _follows_the_rate(cause: str) -> bool:
 def search_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
-    steps = _find_steps(fit, (), false_alarm_rate)
+    fit_with = cache(lambda *causes: fit_spans(fit.spans, causes))
+    steps = _find_steps(fit, fit_with, (), false_alarm_rate)
     found, candidates = list(steps), propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in candidates
                if not each.is_single_event and each.cause != SINE_RESPONSE.name}
     rich = [*columns.values(), *(each.cause_term for each in steps)]
     # of a log with fewer spans than columns, the noise is that without them
-    rich_fit = (fit_spans(fit.spans, rich)
+    rich_fit = (fit_with(*rich)
                 if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
@@ -601,7 +603,7 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
                                                      'inputs', ()):
                 break
             # once more, at the rate without this cause: similar ones differ in higher order
-            at = fit_spans(fit.spans, [*found_terms, best.cause_term])
+            at = fit_with(*found_terms, best.cause_term)
         if best is None:
             break
         found.append(best)
@@ -609,10 +611,10 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
     causes = [each for each in found if each not in steps]
     if causes:
         # a step may have been part of another cause, or have been hidden by it
-        found = causes + _find_steps(fit, [each.cause_term for each in causes
-                                           if each.is_established], false_alarm_rate)
+        found = causes + _find_steps(fit, fit_with, [
+            each.cause_term for each in causes if each.is_established], false_alarm_rate)
     while established := [each.cause_term for each in found if each.is_established]:
-        extended = fit_spans(fit.spans, established)
+        extended = fit_with(*established)
         worst = max(established, key=lambda each: _implausibility(extended, each))
         if _implausibility(extended, worst) < 1.0:
             return extended, found
@@ -640,7 +642,7 @@ def _fit_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm) -> list[
     return []
 
 
-def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
+def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence[CauseTerm],
                 false_alarm_rate: float) -> list[FoundCause]:
     """
     Return the steps of the bias given some causes, at most three.
@@ -658,7 +660,7 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
 
     def given_noise(others: Sequence[CauseTerm]) -> WhitenedRegression:
         """Return the regression on causes and other steps, under the noise with them."""
-        with_steps = fit_spans(fit.spans, [*causes, *others]) if causes or others else fit
+        with_steps = fit_with(*causes, *others) if causes or others else fit
         return whiten_regression(with_steps, with_steps.causes)
 
     def refined(data: WhitenedRegression, place: int) -> tuple[CauseTerm, float]:
@@ -684,7 +686,7 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
         for number, place in enumerate(pair):
             steps[number] = refined(given_noise([steps[1 - number]]), every * place)[0]
     while steps:
-        with_steps = fit_spans(fit.spans, [*causes, *steps])
+        with_steps = fit_with(*causes, *steps)
         places = [with_steps.value_slice(each).start for each in steps]
         deviations = np.sqrt(np.diag(with_steps.covariance)[places])
         sigmas = np.abs(with_steps.values[places]) / deviations
@@ -705,8 +707,7 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
 def _best_pair(fit: SpanFit, data: WhitenedRegression,
                times: Array) -> tuple[float, tuple[int, int]]:
     """Return the largest gain in log-likelihood by two steps of the bias, and their places."""
-    columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
-    step, left = _given_design(data, data.whiten_columns(np.column_stack(columns)))
+    step, left = _given_design(data, data.whiten_columns(fit.spans.step_columns(times)))
     size = np.sqrt(np.sum(step ** 2, axis=0)) + 1e-100
     alone, alike = left @ step / size, step.T @ step / np.outer(size, size)
     gains = 0.5 * (alone ** 2 + alone[:, None] ** 2 - 2.0 * alike * np.outer(alone, alone)) / (
@@ -718,8 +719,7 @@ def _best_pair(fit: SpanFit, data: WhitenedRegression,
 
 def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> tuple[Array, Array]:
     """Return the gain in log-likelihood by a step of the bias at each time, and its size."""
-    columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
-    whole = data.whiten_columns(np.column_stack(columns))
+    whole = data.whiten_columns(fit.spans.step_columns(times))
     step, left = _given_design(data, whole)
     score, information = left @ step, np.maximum(np.sum(step ** 2, axis=0), 1e-300)
     # a step that these spans do not distinguish from another explains nothing

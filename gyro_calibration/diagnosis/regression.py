@@ -24,9 +24,10 @@ Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candid
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
@@ -94,16 +95,15 @@ class RegressionProblem:
         return np.split(coefficients,
                         np.cumsum([each.point_count - 1 for each in self.replays])[:-1])
 
+    def band_products(self, one: Array, other: Array) -> Array:
+        """Return the products of rows (..., r, m) and (..., s, m) in each band, (b, ..., r, s)."""
+        edges = [*self.band_starts, one.shape[-1]]
+        return np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
+                         for begin, end in zip(edges, edges[1:])])
+
     def products(self, one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, rows, rows of the other)."""
-        edges = [*self.band_starts, one.shape[1]]
-        return np.tensordot(self.weights, np.array(
-            [one[:, begin:end] @ other[:, begin:end].T
-             for begin, end in zip(edges, edges[1:])]), 1)
-
-    def squares(self, rows: Array) -> Array:
-        """Return the sum of squares of each row under each noise, shape (g, rows)."""
-        return self.weights @ np.add.reduceat(rows ** 2, self.band_starts, axis=1).T
+        return np.tensordot(self.weights, self.band_products(one, other), 1)
 
 
 def build_problem(replays: Sequence[Replay],
@@ -165,14 +165,14 @@ class RegressionFit:
     # the logs with the rate that the gyro senses, distorted by causes
     distorted: tuple[Replay, ...]
     causes: tuple[Candidate, ...]  # causes
-    residual: Array  # whitened, less the columns of causes of fixed amplitude, shape (m,)
-    # whitened and independent: scale factor error, those of the causes, and derivatives with
-    # respect to their shapes, shape (q, m)
-    columns: Array
+    # whitened, shape (q + 1, m): the independent columns of scale factor error, causes, and
+    # derivatives with respect to their shapes; the residual less the causes of fixed amplitude
+    rows: Array
     # of each column: (index of the cause; index of its value, or -1 less index of its shape); -1
     # and 0 for the scale factor error, -1 and more for the nuisance
     column_owners: tuple[tuple[int, int], ...]
     column_counts: tuple[int, ...]  # number of columns with free values of each cause
+    lacks_columns: bool  # whether some columns depend on others, and are left out
     # information, scores: of the columns under each noise, shapes (g, q, q) and (g, q)
     information: Array
     scores: Array
@@ -183,6 +183,11 @@ class RegressionFit:
     lasting_only: bool = False
 
     # the likelihood
+
+    @property
+    def columns(self) -> Array:
+        """Return the whitened independent columns, shape (q, m)."""
+        return self.rows[:-1]
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -214,6 +219,11 @@ class RegressionFit:
             logarithm - len(self.columns) * np.log(self.residual_squares[best])))
 
     @cached_property
+    def inverse_information(self) -> Array:
+        """Return the inverse of the information under each noise, shape (g, q, q)."""
+        return np.linalg.inv(self.information)
+
+    @cached_property
     def estimates(self) -> tuple[Array, Array]:
         """Return the values of the independent columns and covariance, averaged over noises."""
         probable = self.noise_probability
@@ -230,7 +240,7 @@ class RegressionFit:
 
     def residual_transforms(self) -> list[Array]:
         """Return each log's residual whitened by the first noise: shape (points - 1,)."""
-        return self.problem.split_by_log(self.residual - self.estimates[0] @ self.columns)
+        return self.problem.split_by_log(self.rows[-1] - self.estimates[0] @ self.columns)
 
     def whitening_factors(self) -> list[Array]:
         """Return the factors to variance 1 of each log's coefficients, by the likeliest noise."""
@@ -400,7 +410,8 @@ def _transforms_without_causes(replays: tuple[Replay, ...],
 
 def forget_fits() -> None:
     """Release the logs and columns that fits keep for the next ones."""
-    for kept in (with_distorted_rate, _transforms, _transforms_without_causes, _fit_causes):
+    for kept in (with_distorted_rate, _transforms, _transforms_without_causes, _shape_derivative,
+                 _fit_causes):
         kept.cache_clear()
 
 
@@ -432,26 +443,28 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
         elif not distorts:
             residual = residual - known.amplitude * own[0]
         for shape in smooth_shapes(known) if known.values else ():
-            columns.append(_shape_derivative(known, shape, replays, own)[None])
+            columns.append(_shape_derivative(known, shape, replays)[None])
             owners.append((place, -1 - shape))
-    whitened, residual = np.concatenate(columns) / problem.deviation, residual / problem.deviation
-    kept = _independent_columns(whitened)
-    of = whitened[kept]
-    information, scores = problem.products(of, of), problem.products(residual[None], of)[:, 0]
+    rows = np.concatenate([*columns, residual[None]]) / problem.deviation
+    of_bands = problem.band_products(rows, rows)
+    kept = [*_independent_columns(of_bands.sum(axis=0)[:-1, :-1]), len(rows) - 1]
+    rows = rows if len(kept) == len(rows) else rows[kept]
+    sums = np.tensordot(problem.weights, of_bands[:, kept][:, :, kept], 1)[:, :, :-1]
+    information, scores = sums[:, :-1], sums[:, -1]
     # of what the values for one noise leave, as the difference of the whole sums is rounded
-    left = residual - np.linalg.solve(information[0], scores[0]) @ of
-    pull = problem.products(left[None], of)[:, 0]
-    squares = problem.squares(left[None])[:, 0] - np.einsum(
-        'gq,gq->g', np.linalg.solve(information, pull[:, :, None])[:, :, 0], pull)
+    left = np.append(-np.linalg.solve(information[0], scores[0]), 1.0) @ rows
+    pull, squares = (problem.products(each, left[None]) for each in (rows[:-1], left[None]))
+    squares = squares[:, 0, 0] - np.einsum(
+        'gq,gq->g', np.linalg.solve(information, pull)[:, :, 0], pull[:, :, 0])
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
-    likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
-    return RegressionFit(problem, distorted, causes, residual, of,
-                         tuple(owners[place] for place in kept), tuple(widths), information,
-                         scores, squares, likelihood)
+    likelihood = -0.5 * ((len(left) - len(rows) + 1) * np.log(squares) + determinants)
+    return RegressionFit(problem, distorted, causes, rows,
+                         tuple(owners[place] for place in kept[:-1]), tuple(widths),
+                         len(rows) <= len(owners), information, scores, squares, likelihood)
 
 
-def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay, ...],
-                      columns: Array) -> Array:
+@lru_cache(maxsize=32)
+def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay, ...]) -> Array:
     """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
     shape = cause.shapes[shape_index]
     # so small that the phase of a wave changes little up to the end of a log
@@ -459,63 +472,163 @@ def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay,
     moved = with_shape(cause, shape_index, shape + step)
     if moved.shapes[shape_index] == shape:  # at its upper bound
         moved = with_shape(cause, shape_index, shape - step)
-    change = np.tensordot(cause.values, _transforms(moved, replays) - columns, 1)
+    change = np.tensordot(
+        cause.values, candidate_transforms(moved, replays) - _transforms(cause, replays), 1)
     return np.asarray(change / (moved.shapes[shape_index] - shape))
 
 
-def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
-    """Return the amplitude that fits best for a cause whose amplitude is fixed."""
-    free = replace(candidate, cause='', amplitude=None)
-    return fit_causes(fit.problem, [*fit.causes, free]).coefficients(len(fit.causes))[0].value
-
-
-def _independent_columns(columns: Array) -> list[int]:
-    """Return the columns that are linearly independent of those before them."""
-    product = columns @ columns.T
+def _independent_columns(product: Array) -> list[int]:
+    """Return the columns that are linearly independent of those before, by their products."""
     length = np.sqrt(np.diag(product))
-    kept: list[int] = []
-    for place in np.flatnonzero(length > 0.0).tolist():
-        tried = [*kept, place]
+
+    def are_independent(places: list[int]) -> bool:
         # the least eigenvalue is at most the share of any column that is independent of the others
-        own = product[np.ix_(tried, tried)] / np.outer(length[tried], length[tried])
-        if np.linalg.eigvalsh(own)[0] > 1e-9:
-            kept = tried
+        own = product[np.ix_(places, places)] / np.outer(length[places], length[places])
+        return bool(np.linalg.eigvalsh(own)[0] > 1e-9)
+
+    kept: list[int] = []
+    every = np.flatnonzero(length > 0.0).tolist()
+    if not every or are_independent(every):
+        return every
+    for place in every:
+        if are_independent([*kept, place]):
+            kept.append(place)
     return kept
 
 
 # evidence
 
-def column_evidence(fit: RegressionFit, columns: Array,
-                    groups: Sequence[Sequence[int]]) -> Array:
-    """
-    Return the evidence of groups of columns given a fit, shape (groups,), -inf if unidentifiable.
+@dataclass(frozen=True)
+class ColumnGroups:
+    """Groups of columns of candidates."""
 
-    The columns of the candidates are whitened, shape (p, m).
+    columns: Array  # whitened, shape (p, m)
+    groups: Sequence[Sequence[int]]  # the columns of each group
+    # of all groups of one width: their places, shape (n,), their columns, shape (n, width), and
+    # the products of these under each noise, shape (g, n, width, width)
+    of_width: list[tuple[Indices, Indices, Array]]
 
-    """
-    problem, freedom = fit.problem, fit.degrees_of_freedom
-    crossing = problem.products(fit.columns, columns)
-    towards = np.linalg.solve(fit.information, crossing)
-    pull = (problem.products(fit.residual[None], columns)
-            - fit.scores[:, None] @ towards)[:, 0]
-    squares, total = problem.squares(columns), logsumexp(fit.noise_log_likelihood)
-    found = np.full(len(groups), -np.inf)
-    for place, group in enumerate(map(list, groups)):
-        whole = (squares[:, group, None] if len(group) == 1
-                 else problem.products(columns[group], columns[group]))
-        part = whole - np.swapaxes(crossing[:, :, group], 1, 2) @ towards[:, :, group]
-        if (np.einsum('gpp->gp', part)
-                <= MIN_INDEPENDENT_SHARE * np.einsum('gpp->gp', whole)).any():
-            continue
-        part = part + 1e-10 * np.eye(len(group)) * np.einsum('gpp->gp', part)[:, None]
-        explained = np.einsum('gp,gp->g', pull[:, group], np.linalg.solve(
-            part, pull[:, group, None])[:, :, 0])
-        ratio = np.log1p(-np.minimum(explained / fit.residual_squares, 1.0 - 1e-9))
-        scale = 0.5 * (len(group) * np.log(fit.residual_squares) - np.linalg.slogdet(part)[1])
-        change = scale - 0.5 * (freedom - len(group)) * ratio
-        found[place] = (logsumexp(fit.noise_log_likelihood + change) - total
-                        - scale[fit.best_noise])
+
+def group_columns(problem: RegressionProblem, columns: Array,
+                  groups: Sequence[Sequence[int]]) -> ColumnGroups:
+    """Return groups of whitened columns, shape (p, m)."""
+    of_width = []
+    for width in sorted({len(group) for group in groups}):
+        places = np.array([place for place, group in enumerate(groups) if len(group) == width])
+        members = np.array([groups[place] for place in places])
+        edges = [*problem.band_starts, columns.shape[1]]
+        of_bands = [part @ np.swapaxes(part, 1, 2) for part in (
+            columns[:, begin:end][members] for begin, end in zip(edges, edges[1:]))]
+        of_width.append((places, members, np.tensordot(problem.weights, np.array(of_bands), 1)))
+    return ColumnGroups(columns, groups, of_width)
+
+
+class _LeftOfColumns(NamedTuple):
+    """What a fit leaves of the groups of columns of one width."""
+
+    places: Indices  # of the groups of which it leaves something, shape (n,)
+    products: Array  # of the columns of each group under each noise, shape (g, n, width, width)
+    pull: Array  # products of the columns with the residual, shape (g, n, width)
+
+
+def _left_of_columns(fit: RegressionFit, groups: ColumnGroups) -> Iterator[_LeftOfColumns]:
+    """Give what a fit leaves of groups of columns, for each width."""
+    crossing = fit.problem.products(groups.columns, fit.rows)
+    crossing, pull = crossing[:, :, :-1], crossing[:, :, -1]
+    towards = crossing @ fit.inverse_information
+    pull = pull - np.einsum('gpq,gq->gp', towards, fit.scores)
+    own = np.einsum('gpq,gpq->gp', crossing, towards)
+    for places, members, whole in groups.of_width:
+        left = whole.copy()
+        for row, column in np.ndindex(left.shape[2:]):
+            one, other = members[:, row], members[:, column]
+            left[:, :, row, column] -= (own[:, one] if row == column else np.einsum(
+                'gnq,gnq->gn', crossing[:, one], towards[:, other]))
+        of_left, of_whole = (np.einsum('gnpp->gnp', each) for each in (left, whole))
+        shown = (of_left > MIN_INDEPENDENT_SHARE * of_whole).all(axis=(0, 2))
+        if len(members[0]) > 1:  # columns that depend on each other count as one
+            left = left * (1.0 + 1e-10 * np.eye(len(members[0])))
+        yield _LeftOfColumns(places[shown], left[:, shown], pull[:, members[shown]])
+
+
+def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
+    """Return the evidence of groups of columns given a fit, -inf if unidentifiable."""
+    squares, likelihood = fit.residual_squares[:, None], fit.noise_log_likelihood[:, None]
+    found = np.full(len(groups.groups), -np.inf)
+    for places, products, pull in _left_of_columns(fit, groups):
+        width = pull.shape[2]
+        explained = np.einsum('gnp,gnp->gn', pull,
+                              np.linalg.solve(products, pull[..., None])[..., 0])
+        ratio = np.log1p(-np.minimum(explained / squares, 1.0 - 1e-9))
+        scale = 0.5 * (width * np.log(squares) - np.linalg.slogdet(products)[1])
+        change = scale - 0.5 * (fit.degrees_of_freedom - width) * ratio
+        found[places] = (logsumexp(likelihood + change, axis=0) - logsumexp(likelihood)
+                         - scale[fit.best_noise])
     return found
+
+
+def likelihood_with(fit: RegressionFit, candidate: Candidate) -> float:
+    """Return the log-likelihood of a fit with one more cause, whose shapes are fixed."""
+    if not is_rate_distortion(candidate.cause):
+        columns = candidate_transforms(candidate, fit.distorted)
+        if len(columns) == 1:  # several may depend on each other
+            return _fit_with_column(fit, columns, candidate.amplitude)[0]
+    return fit_causes(fit.problem, [*fit.causes, candidate]).log_likelihood
+
+
+def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
+    """Return the amplitude that fits best for a cause whose amplitude is fixed."""
+    return _fit_with_column(fit, candidate_transforms(candidate, fit.distorted), None)[1]
+
+
+def _fit_with_column(fit: RegressionFit, column: Array,
+                     amplitude: float | None) -> tuple[float, float]:
+    """Return the log-likelihood with one more column, shape (1, m), and its coefficient."""
+    left = next(_left_of_columns(fit, group_columns(fit.problem, column / fit.problem.deviation,
+                                                    [[0]])))
+    if not len(left.places):
+        return fit.log_likelihood, 0.0
+    product, pull = left.products[:, 0, 0, 0], left.pull[:, 0, 0]
+    values = pull / product if amplitude is None else np.full_like(pull, amplitude)
+    likelihood, log_likelihood = _changed_likelihood(
+        fit, amplitude is None, fit.residual_squares + values * (values * product - 2.0 * pull),
+        np.log(product) * (amplitude is None))
+    probable = np.exp(likelihood - likelihood.max())
+    return log_likelihood, float(np.average(values, weights=probable * (probable > 1e-3)))
+
+
+def likelihood_without(fit: RegressionFit, cause_index: int) -> float:
+    """Return the log-likelihood of a fit without one of its causes."""
+    removed, known = fit.causes[cause_index], fit.column_owners
+    if is_rate_distortion(removed.cause) or removed.amplitude is not None or fit.lacks_columns:
+        return fit_causes(fit.problem, [*fit.causes[:cause_index],
+                                        *fit.causes[cause_index + 1:]]).log_likelihood
+    own = [rank for rank, (place, _) in enumerate(known) if place == cause_index]
+    covariance = fit.inverse_information[:, own]
+    values = np.einsum('gpq,gq->gp', covariance, fit.scores)
+    covariance = covariance[:, :, own]
+    squares = fit.residual_squares + np.einsum(
+        'gp,gp->g', values, np.linalg.solve(covariance, values[:, :, None])[:, :, 0])
+    return _changed_likelihood(fit, -len(own), squares, np.linalg.slogdet(covariance)[1])[1]
+
+
+def _changed_likelihood(fit: RegressionFit, added: int, squares: Array,
+                        determinants: Array) -> tuple[Array, float]:
+    """
+    Return the likelihood of each noise, and that of a fit, with more or fewer columns.
+
+    Given are the squares that they leave, and the logarithm of the factor of the determinant of
+    the information, shape (g,).
+
+    """
+    freedom = fit.degrees_of_freedom
+    likelihood = fit.noise_log_likelihood + 0.5 * (
+        freedom * np.log(fit.residual_squares) - (freedom - added) * np.log(squares)
+        - determinants)
+    best = int(likelihood.argmax())
+    logarithm = np.linalg.slogdet(fit.information[best])[1] + determinants[best]
+    return likelihood, float(logsumexp(likelihood) + 0.5 * (
+        logarithm - (len(fit.columns) + added) * np.log(squares[best])))
 
 
 # deviations of discontinuous shapes
@@ -523,14 +636,14 @@ def column_evidence(fit: RegressionFit, columns: Array,
 def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
     """Return the standard deviation of a shape by the profile of the likelihood, to 1 %."""
     candidate = fit.causes[cause_index]
-    others = fit.causes[:cause_index] + fit.causes[cause_index + 1:]
+    rest = fit_causes(fit.problem, fit.causes[:cause_index] + fit.causes[cause_index + 1:])
     shape = candidate.shapes[shape_index]
     if candidate.half_width:
-        return _time_deviation(fit_causes(fit.problem, others), candidate, shape_index)
+        return _time_deviation(rest, candidate, shape_index)
 
     def likelihood(by: float) -> float:
         moved = with_shape(candidate, shape_index, shape + by)
-        return fit_causes(fit.problem, [*others, moved]).log_likelihood
+        return likelihood_with(rest, moved)
 
     least = likelihood(0.0) - 0.5 * NORMAL_QUANTILE_975 ** 2
     first, ends = 1e-3 * shape, []
@@ -549,8 +662,8 @@ def shifted_evidence(fit: RegressionFit, candidate: Candidate, shape_index: int,
     columns = np.concatenate([candidate_transforms(with_shape(
         candidate, shape_index, candidate.shapes[shape_index] + by), fit.distorted)
         for by in shifts.tolist()])
-    return shifts, column_evidence(fit, columns / fit.problem.deviation,
-                                   np.arange(len(shifts))[:, None].tolist())
+    return shifts, column_evidence(fit, group_columns(
+        fit.problem, columns / fit.problem.deviation, np.arange(len(shifts))[:, None].tolist()))
 
 
 def _time_deviation(fit: RegressionFit, candidate: Candidate, shape_index: int) -> float:

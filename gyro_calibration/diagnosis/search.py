@@ -51,10 +51,14 @@ from gyro_calibration.diagnosis.findings import (
 from gyro_calibration.diagnosis.regression import (
     build_problem,
     column_evidence,
+    ColumnGroups,
     fit_causes,
     free_amplitude,
+    group_columns,
     Indices,
     is_rate_distortion,
+    likelihood_with,
+    likelihood_without,
     RegressionFit,
     RegressionProblem,
 )
@@ -129,7 +133,7 @@ class Search:
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
     # columns_cache, step_cache: caches of columns and of steps, by the named causes
-    columns_cache: dict[tuple[Any, ...], tuple[Array, list[range]]] = field(default_factory=dict)
+    columns_cache: dict[tuple[Any, ...], ColumnGroups] = field(default_factory=dict)
     step_cache: dict[tuple[Any, ...], tuple[Candidate | None, list[Scored]]] = field(
         default_factory=dict)
     # is called with None and the name of each step that begins
@@ -142,13 +146,14 @@ class Search:
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
             known = self.columns_cache.popitem()[1] if self.columns_cache else None
-            self.columns_cache[key] = self._candidate_columns(fit, known)
-        columns, groups = self.columns_cache[key]
-        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in groups])
-        return column_evidence(fit, columns, groups) - penalty
+            self.columns_cache[key] = group_columns(self.problem,
+                                                    *self._candidate_columns(fit, known))
+        columns = self.columns_cache[key]
+        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in columns.groups])
+        return column_evidence(fit, columns) - penalty
 
-    def _candidate_columns(self, fit: RegressionFit, known: tuple[Array, list[range]] | None,
-                           ) -> tuple[Array, list[range]]:
+    def _candidate_columns(self, fit: RegressionFit,
+                           known: ColumnGroups | None) -> tuple[Array, Sequence[Sequence[int]]]:
         """Return whitened columns and those of each candidate; known ones for another rate."""
         deviation = self.problem.deviation
         if known is None:
@@ -157,11 +162,10 @@ class Search:
             ends = np.cumsum([len(part) for part in parts]).tolist()
             return np.concatenate([np.empty((0, len(deviation))), *parts]), [
                 range(end - len(part), end) for end, part in zip(ends, parts)]
-        columns, groups = known
-        for each, own in zip(self.candidates, groups):
+        for each, own in zip(self.candidates, known.groups):
             if depends_on_rate(each):
-                columns[own.start:own.stop] = candidate_transforms(each, fit.distorted) / deviation
-        return columns, groups
+                known.columns[own] = candidate_transforms(each, fit.distorted) / deviation
+        return known.columns, known.groups
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
@@ -185,9 +189,9 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
 
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
-    """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
+    """Return a silent search for some causes in other parts of the logs, at another rate."""
     return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate,
-                   columns_cache={}, step_cache={},
+                   columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
                    scanned_causes=search.scanned_causes & frozenset(causes),
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
 
@@ -206,7 +210,6 @@ def find_strongest(search: Search, causes: Sequence[Candidate],
     key = tuple((each.cause, each.log_index, *each.shapes) for each in causes)
     if key in search.step_cache:
         return search.step_cache[key]
-    search.on_progress(None, f'search for causes, {len(causes)} found')
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit)
     significant = [each for each, evidence in first
@@ -273,14 +276,16 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
             return with_shape(start, place, first + by if half else first * math.exp(by))
 
         best = minimize_scalar(
-            lambda by: -fit_causes(fit.problem, [*fit.causes, moved(by)]).log_likelihood,
-            bounds=(-half_range, half_range), method='bounded',
-            options={'xatol': 4e-3 * half_range, 'maxiter': 14})
+            lambda by: -likelihood_with(fit, moved(by)), bounds=(-half_range, half_range),
+            method='bounded', options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    done = fit_causes(fit.problem, [*fit.causes, candidate])
-    return candidate, (
-        done.log_likelihood - VALUE_PENALTY * max(done.column_counts[-1] - 1, 0)
-        - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
+    more = max(_free_column_count(candidate, fit.problem) - 1, 0)
+    return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * more
+                       - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
+
+
+def _free_column_count(candidate: Candidate, problem: RegressionProblem) -> int:
+    return 0 if candidate.amplitude is not None else len(candidate.columns(problem.replays[0]))
 
 
 def is_lasting(candidate: Candidate) -> bool:
@@ -425,6 +430,7 @@ def _select_forward(search: Search) -> Causes:
     """Add causes one by one (forward selection)."""
     named: Causes = ()
     for _ in range(2 * MAX_CAUSES):  # some are removed again
+        search.on_progress(None, f'search for causes, {len(named)} found')
         one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
         more = _with_part_of_log(search, named) if one_more is None else (*named, one_more)
         if not more:
@@ -448,7 +454,8 @@ def _with_part_of_log(search: Search, causes: Causes) -> Causes:
         return ()
     fit = fit_causes(search.problem, causes)
     columns = np.concatenate([candidate_transforms(each, fit.distorted) for each in steps])
-    evidence = column_evidence(fit, columns / search.problem.deviation, pairs)
+    evidence = column_evidence(fit, group_columns(
+        search.problem, columns / search.problem.deviation, pairs))
     # with the best times, which are tried where the pair is likelier than chance
     likely = 2.0 * math.log(MAX_STEP_TIMES)
     least = likely - math.log(search.rate)
@@ -494,9 +501,8 @@ def complexity_penalty(cause: Candidate) -> float:
 
 def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
     """Return the evidence for one of the causes given the others."""
-    others = [*causes[:cause_index], *causes[cause_index + 1:]]
-    return (fit_causes(search.problem, causes).log_likelihood
-            - fit_causes(search.problem, others).log_likelihood
+    fit = fit_causes(search.problem, causes)
+    return (fit.log_likelihood - likelihood_without(fit, cause_index)
             - complexity_penalty(causes[cause_index]))
 
 
@@ -674,8 +680,7 @@ def _alternatives(search: Search, named: Causes, place: int,
     """Return the simplest alternative of a cause, or itself, and all with their deficits."""
     def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
-        return len(fitted_shape_indices(known)) + (
-            0 if known.amplitude is not None else len(known.columns(search.problem.replays[0])))
+        return len(fitted_shape_indices(known)) + _free_column_count(known, search.problem)
 
     own = named[place]
     _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))

@@ -433,11 +433,15 @@ def _interpolate(new_time: Array, time: Array, signal: Array) -> Array:
 
 def _filter_lag(signal: Array, time: Array, time_constant: float) -> Array:
     """Return the signal through a lag, interpolated at 4 points a sample."""
-    count = len(time)
-    finer = np.interp(np.arange(4 * (count - 1) + 1) / 4, np.arange(count), time)
-    signal = _interpolate(finer, time, signal)
-    interval, change = np.diff(finer, prepend=finer[:1]), np.diff(signal, prepend=signal[:1])
-    return (signal + lag_difference(interval, change, time_constant))[::4]
+    interval, coefficients = np.diff(time), CubicSpline(time, signal).c
+    within = [signal[:-1], *(np.polyval(coefficients, share * interval)
+                             for share in (0.25, 0.5, 0.75)), signal[1:]]
+    # `lag_difference` over the quarters, of equal length, in one step of the recurrence
+    x = np.maximum(0.25 * interval / time_constant, 1e-300)
+    fallen = np.expm1(-x)
+    added = np.polyval(np.diff(within, axis=0), fallen + 1.0) * (fallen / x)
+    return signal + _solve_recurrence(np.append(1.0, (fallen + 1.0) ** 4), np.append(0.0, added),
+                                      0.0)
 
 
 _FAST_REVERSALS = ('swing fast with quick reversals: a lag reduces the amplitude of fast motion, '

@@ -543,6 +543,18 @@ def test_a_second_step_at_the_time_of_the_first_explains_nothing():
     assert gains[0] == sizes[0] == 0.0 < gains[1]
 
 
+@pytest.mark.parametrize('spans', [lay_out_spans(drive(3), 'course'),
+                                   lay_out_spans(odometry(3, 0.0)[0])])
+def test_columns_of_steps_are_those_of_the_effect_but_beside_the_step(spans):
+    times = np.append(spans.time[[5, 40, 60]] + 0.01, [-9.0, 1e4])
+    exact = np.column_stack([spans.cause_columns(CauseTerm('bias_step', (time,)))
+                             for time in times.tolist()])
+    off = np.abs(spans.step_columns(times) - exact)
+    assert off.max() < 1e-3 * np.abs(exact).max()
+    assert (off > 1e-9).sum(axis=0).max() <= 3
+    assert not exact[:, -1].any() and not off[:, -1].any()
+
+
 @pytest.mark.parametrize('delay', [-4.0, 0.0, 4.0])
 def test_spans_before_and_after_the_log_of_the_gyro_are_not_compared(delay):
     spans = replace(lay_out_spans(drive(4), 'course'), delay=delay)
