@@ -477,29 +477,19 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
     time, measured = log.time - log.time[0], log.output
     output, white = bridge_gaps(measured), white_noise_deviation(measured)
-    reference, noisier, rate = log.reference_heading, 0.0, log.reference_rate
-    measured_rows, at = np.isfinite(measured), time
-    used = rate if reference is None else reference
-    assert used is not None
-    own, values = np.isfinite(used), used
-    if instants is not None and np.isfinite(instants.time[own]).all():
-        at, values = instants.time - log.time[0], instants.values
-    if reference is None:
-        assert rate is not None
+    reference, at = _place_values(log, instants)
+    measured_rows, noisier, rate = np.isfinite(measured), 0.0, log.reference_rate
+    if given is None and rate is not None:
+        measured_rows &= ~find_lost_reference(np.isfinite(rate))
         if is_slow(rate):  # its integral errs by what happens between its values
-            reference = np.full(len(time), np.nan)
-            reference[own] = CubicSpline(at[own], values[own]).antiderivative()(at[own])
-            measured_rows &= ~find_lost_reference(np.isfinite(rate))
             treatment = replace(treatment, errs_as_heading=True)
         else:
-            measured_rows &= np.isfinite(rate) | ~find_lost_reference(np.isfinite(rate))
             noisier = rate_noise_share(log)
             white = math.hypot(white, white_noise_deviation(rate))
-            reference = integrate_with_curvature(time, bridge_gaps(rate))
-    else:
-        reference = np.where(own, values, np.nan)
-    given = reference if given is None else given
-    log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
+    at_samples = reference if log.reference_heading is None else log.reference_heading
+    given = at_samples if given is None else given
+    log = replace(log, time=time, output=output, reference_heading=at_samples,
+                  reference_rate=None)
     walks = [white * math.sqrt(float(np.median(np.diff(time))))]
     if treatment.is_fine:
         # vibration adds white noise without a random walk, and a filter reduces the white noise
@@ -509,7 +499,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
             treatment = replace(treatment, errs_as_heading=True)
     else:
         walks = [min(walks[0], _MAX_VEHICLE_WALK)]
-    by_code = kind == 'encoder' and at is time and encoder_step(reference) > 0.0
+    by_code = kind == 'encoder' and encoder_step(reference) > 0.0 and (at == time).all()
     if by_code:
         # between two samples with different codes the shaft was in the middle of both; a single
         # code gives only a range, and its error at rest or at a reversal is systematic
@@ -539,6 +529,26 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
                  find_holes(time[measured_rows], length),
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
+
+
+def _place_values(log: Log, instants: OwnInstants | None) -> tuple[Array, Array]:
+    """Return the known headings of a reference, nan where there is none, and their times, (n,)."""
+    assert log.time is not None
+    rate, heading = log.reference_rate, log.reference_heading
+    values = rate if heading is None else heading
+    assert values is not None
+    own, at = np.isfinite(values), log.time - log.time[0]
+    if instants is not None and np.isfinite(instants.time[own]).all():
+        values = instants.values
+        at = np.where(own, instants.time - log.time[0], at)
+    if heading is not None:
+        return np.where(own, values, np.nan), at
+    assert rate is not None
+    if not is_slow(rate):
+        return integrate_with_curvature(at, bridge_gaps(rate)), at
+    turned = np.full(len(at), np.nan)
+    turned[own] = CubicSpline(at[own], values[own]).antiderivative()(at[own])
+    return turned, at
 
 
 @dataclass(frozen=True)
