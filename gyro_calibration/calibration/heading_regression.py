@@ -172,6 +172,14 @@ class CauseTerm(NamedTuple):
         """Tell whether it happens once, at its first shape."""
         return self.cause in ('bias_step', 'reference_slip')
 
+    @property
+    def value_count(self) -> int:
+        """Return the number of its columns."""
+        if self.cause == 'reference_once_per_rev':
+            return 2
+        effect = CATALOGUE.get(self.cause)
+        return max(len(effect.coefficients), 1) if effect is not None else 1
+
 
 _CLOCK_TERM = CauseTerm('clock_rate')
 
@@ -251,12 +259,9 @@ class Spans:
 
     def value_slice(self, causes: Sequence[CauseTerm], cause: CauseTerm) -> slice:
         """Return the places of the values of one of the causes."""
-        counts = [2 if each.cause == 'reference_once_per_rev'
-                  else max(len(CATALOGUE[each.cause].coefficients), 1)
-                  if each.cause in CATALOGUE else 1 for each in causes]
-        place = causes.index(cause)
-        start = len(BASE_VALUES) + sum(counts[:place])
-        return slice(start, start + counts[place])
+        before = causes[:causes.index(cause)]
+        start = len(BASE_VALUES) + sum(each.value_count for each in before)
+        return slice(start, start + cause.value_count)
 
     def correction(self, causes: Sequence[CauseTerm], count: int) -> Array:
         """Return the values for which the stamps are corrected, and 0 for the others."""

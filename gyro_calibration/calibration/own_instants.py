@@ -144,8 +144,8 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
             continue
         stamps = log.time[known]
         found = find_own_instants(stamps, given[known])
-        if found is None or found.interval > _LONGEST_INTERVAL and not (
-                found.is_held and is_heading):
+        if found is None or not (found.interval <= _LONGEST_INTERVAL
+                                 or found.is_held and is_heading):
             continue
         if found.is_held and not is_heading and _is_command(log, given):
             continue

@@ -226,8 +226,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
     on_progress(None, 'replay of the model')
     replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
-                      generator, clean.heading_step, clean.output_step,
-                      model)
+                      generator, clean.heading_step, clean.output_step, model)
                for log, clean in zip(logs, quality)]
     searched = _search_logs(logs, replays, rate, on_progress, is_command)
     search = searched.search
