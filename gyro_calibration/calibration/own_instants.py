@@ -178,8 +178,9 @@ def _is_command(log: Log, held: Array) -> bool:
     sample = float(np.median(np.diff(log.time)))
     delays = sample * np.arange(-round(_LONGEST_INTERVAL / sample),
                                 round(_LONGEST_INTERVAL / sample) + 1)
-    alike = [np.corrcoef(output, np.interp(log.time - delay, log.time[known], held[known]))[0, 1]
-             for delay in delays.tolist()]
+    late = (np.interp(log.time - delay, log.time[known], held[known]) for delay in delays.tolist())
+    # correlations but for the scatter of the output, which a dead gyro does not have
+    alike = [(output - output.mean()) @ each / max(each.std(), 1e-300) for each in late]
     return bool(delays[int(np.argmax(alike))] > 0.0)
 
 
