@@ -579,6 +579,13 @@ class SpanFit:
         return of_prior if value_index == 0 and self.lacks_turns else min(half, of_prior)
 
     @property
+    def normal_covariance(self) -> Array:
+        """Return the covariance whose normal intervals are as wide as Student's."""
+        widening = np.array([self.half_width(place) for place in range(len(self.values))]) / (
+            NORMAL_QUANTILE_975 * np.sqrt(np.diag(self.covariance)))
+        return self.covariance * np.outer(widening, widening)
+
+    @property
     def lacks_turns(self) -> bool:
         """Tell whether too few stretches turn to show the scale factor error."""
         return bool(self.effective_stretches[0] < MIN_STRETCHES)
@@ -588,8 +595,8 @@ class SpanFit:
         return self.spans.value_slice(self.causes, cause)
 
     def noise_size(self, name: str) -> float:
-        """Return the likeliest size of a part of the noise."""
-        return float(self.fit.likeliest_sizes.get(name, 0.0))
+        """Return the estimate of a part of the noise; 0 if the reference has no such part."""
+        return self.fit.size(name) if name in self.fit.sizes else 0.0
 
 
 def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
@@ -934,16 +941,14 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                           f'by {residual / DEGREE:.1f} deg (robust standard deviations): the gyro '
                           'does not follow the course. Check that both belong to one drive, and '
                           'check axis, sign, units, and that the gyro responds')
-    # intervals of a normal distribution, as wide as those of Student's
-    deviations = np.array([fit.half_width(place)
-                           for place in range(len(fit.values))]) / NORMAL_QUANTILE_975
-    widening = deviations / np.sqrt(np.diag(fit.covariance))
-    covariance = fit.covariance * np.outer(widening, widening)
+    covariance = fit.normal_covariance
     scale, bias, delay, *drifts = fit.values.tolist()
     drift = (drifts[0], fit.half_width(len(BASE_VALUES))) if drifts else None
-    return ScaleBiasFit(scale, bias, covariance[:2, :2], delay, fit.fit.size('angle_random_walk'),
-                        fit.fit.size('reference'), time_offset_deviation=float(deviations[2]),
-                        reference_drift=drift, reference_adds_up=spans.adds_up)
+    return ScaleBiasFit(scale, bias, covariance[:2, :2], delay,
+                        fit.noise_size('angle_random_walk'), fit.noise_size('reference'),
+                        time_offset_deviation=math.sqrt(covariance[2, 2]), reference_drift=drift,
+                        # a course may be lost in the rests before and after the drive alone
+                        reference_adds_up=spans.adds_up and bool(spans.stands.all()))
 
 
 def find_drift(log: Log) -> tuple[float, float] | None:

@@ -403,7 +403,8 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log,
             terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
             rows += of_term
             slopes += [1.0] * (len(rows) - len(slopes))
-    covariance = np.pad(fit.covariance, (0, 1))[np.ix_(rows, rows)] * np.outer(slopes, slopes)
+    covariance = (np.pad(fit.normal_covariance, (0, 1))[np.ix_(rows, rows)]
+                  * np.outer(slopes, slopes))
     assert log.output is not None
     new = add_terms(base_model, terms, covariance, [log.output[np.isfinite(log.output)]],
                     [] if log.temperature is None else [log.temperature])
