@@ -165,3 +165,20 @@ def test_intervals_hold_the_truth():
         off = np.array([fit.scale_factor_error - (SCALE - 1.0), fit.bias - BIAS])
         held.append(np.abs(off) < 1.96 * np.sqrt(np.diag(fit.covariance)))
     assert (np.mean(held, axis=0) > 0.85).all()
+
+
+def test_a_motion_capture_that_loses_its_markers_is_no_course():
+    """It errs by less than a course, and by more than the gyro, as where its axes are oblique."""
+    generator = np.random.default_rng(4)
+    log = drive(4, late=0.0)
+    heading = SCALE ** -1 * np.cumsum(log.output - BIAS) / 50.0
+    heading += 0.05 * DEGREE * generator.standard_normal(len(heading))
+    leaking = 0.005 * np.interp(log.time, np.arange(0.0, 181.0, 1.0),
+                                20.0 * DEGREE * generator.standard_normal(181))
+    for begin in range(10, 170, 20):
+        heading[(log.time > begin) & (log.time < begin + 0.5)] = math.nan
+    found = calibrate_encoder(replace(log, output=log.output + leaking, reference_heading=heading))
+    assert found.method == 'likelihood'
+    deviations = np.sqrt(np.diag(found.fit.covariance))
+    assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=4.5 * deviations[0])
+    assert deviations[0] < 0.002
