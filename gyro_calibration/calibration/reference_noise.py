@@ -140,7 +140,9 @@ def heading_difference(log: Log) -> HeadingDifference:
     turned, slope, output, heading, time = (each[own] for each in (
         integrate_with_curvature(log.time, output), np.gradient(output, log.time), output,
         log.reference_heading, log.time))
-    interval = float(np.median(np.diff(time)))
+    # a slow reference has its values at the samples next to its own instants
+    apart = np.diff(time)
+    interval = float(apart[apart < 2.0 * np.median(apart)].mean())
     longest = max(round(_COMPARISON_SPAN / interval), 4)
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:

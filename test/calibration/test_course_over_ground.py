@@ -14,6 +14,8 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.reference_noise import heading_difference
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 import numpy as np
@@ -182,3 +184,17 @@ def test_a_motion_capture_that_loses_its_markers_is_no_course():
     deviations = np.sqrt(np.diag(found.fit.covariance))
     assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=4.5 * deviations[0])
     assert deviations[0] < 0.002
+
+
+def test_the_errors_of_a_reference_at_an_uneven_part_of_the_samples_are_found():
+    """A motion capture at 120 Hz, on straight lines at the 285.7 Hz of the gyro."""
+    generator = np.random.default_rng(5)
+    time, at = np.arange(17000) / 285.7, np.arange(7200) / 120.0
+    rate = 30.0 * DEGREE * np.sin(2.0 * time)
+    drift = np.cumsum(0.2 * DEGREE * generator.standard_normal(len(at))) / math.sqrt(120.0)
+    heading = np.interp(time, at, 15.0 * DEGREE * (1.0 - np.cos(2.0 * at)) + drift)
+    log, _ = keep_own_instants(Log(
+        time=time, reference_heading=heading,
+        output=rate + 0.1 * DEGREE * generator.standard_normal(len(time))))
+    assert np.isfinite(log.reference_heading).mean() < 0.5
+    assert heading_difference(log).total_walk == pytest.approx(0.2 * DEGREE, rel=0.2)
