@@ -63,6 +63,7 @@ from gyro_calibration.calibration.own_instants import (
 from gyro_calibration.calibration.reference_noise import (
     find_rests,
     heading_difference,
+    MIN_COURSE_NOISE,
     rate_noise_share,
 )
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
@@ -122,9 +123,9 @@ _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
 #: vibration.
 _MAX_VEHICLE_WALK = 5e-4
-#: Least noise of a course from span to span, rad, least number of spans to determine it, and
-#: largest deviation of the turn of a course in a span from that of a gyro that follows it, rad.
-MIN_COURSE_NOISE, MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 0.25 * DEGREE, 10, 3.0 * DEGREE
+#: Least number of spans to determine the noise of a course, and largest deviation of its turn in
+#: a span from that of a gyro that follows it, rad.
+MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
 
 
 @dataclass(frozen=True)

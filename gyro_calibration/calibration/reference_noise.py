@@ -50,6 +50,9 @@ MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
 #: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
 _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
+#: Least noise of a course, rad, over a second or from span to span; by RTK fixes of a car in town
+#: it is 0.4 deg, and a motion capture with short gaps has less.
+MIN_COURSE_NOISE = 0.25 * DEGREE
 #: Chance by which a heading that rests is taken for one that is repeated in motion.
 _DETECTION_LEVEL = 0.01
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
@@ -137,7 +140,9 @@ def heading_difference(log: Log) -> HeadingDifference:
     turned, slope, output, heading, time = (each[own] for each in (
         integrate_with_curvature(log.time, output), np.gradient(output, log.time), output,
         log.reference_heading, log.time))
-    interval = float(np.median(np.diff(time)))
+    # a slow reference has its values at the samples next to its own instants
+    apart = np.diff(time)
+    interval = float(apart[apart < 2.0 * np.median(apart)].mean())
     longest = max(round(_COMPARISON_SPAN / interval), 4)
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
@@ -227,8 +232,8 @@ def is_course(log: Log) -> bool:
     # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
     # the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
-    return heading_difference(log).total_walk > max(
-        larger * walk, MAX_ROUNDING_RATIO * rounding) > 0.0
+    return heading_difference(log).total_walk > max(larger * walk, MAX_ROUNDING_RATIO * rounding,
+                                                    MIN_COURSE_NOISE)
 
 
 def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:

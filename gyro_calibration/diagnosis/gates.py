@@ -470,6 +470,8 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: Least residual over the longest spans, and least rotation of the reference, rad, for which
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
+#: Relative difference of mean rates over spans that is rounding.
+_EQUAL_RATES = 1e-9
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
 _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 
@@ -515,8 +517,8 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
         differs = not np.ptp(reference) > 0.0 and not is_at_rest(still)
         evidence, remedy = (('the reference stands, and the gyro turns',
                              'give a reference of this motion') if differs
-                            else ('the reference turns too little to compare it with the gyro',
-                                  ''))
+                            else ('the reference turns too little, or too evenly, to compare it '
+                                  'with the gyro', ''))
         yield Gate('motion', False if differs else None, evidence, remedy)
         return
     best = max(by_length, key=lambda each: each.coherence)
@@ -634,7 +636,8 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     number = np.floor((log.time[known] - log.time[0]) / span)
     chosen = known[np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0)]
     at, heading = log.time[chosen], reference[chosen]
-    if not np.ptp(heading) > 0.0:
+    rates = np.diff(heading) / np.diff(at)
+    if not np.ptp(rates) > _EQUAL_RATES * np.abs(rates).max():
         return []
     white = white_noise_deviation(output) ** 2 * float(np.median(np.diff(log.time)))
     return [_regress_at_best_lag(log.time, turned, at[::together], heading[::together], span,
@@ -668,8 +671,11 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
         values = np.linalg.lstsq(columns[kept], change[kept], rcond=None)[0]
         off = change - columns @ values
         kept = np.abs(off) <= 6.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-15
-        # Beside long rests, all turns of the gyro are outlying if the reference makes others.
-        if kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum():
+        rates = change[kept] / steps[kept]
+        # Beside long rests, all turns of the gyro are outlying if the reference makes others; and
+        # beside a commanded rate that stays the same, all others.
+        if (kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum()
+                or np.ptp(rates) <= _EQUAL_RATES * np.abs(rates).max()):
             kept[:] = True
     variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
     if (left >= (1.0 - _MIN_MOTION_COHERENCE) * variance

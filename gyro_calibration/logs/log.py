@@ -200,9 +200,9 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
             last = _refuse_unordered_time(places, arrays.get('time'), last)
-            rotation.replace_attitude(arrays)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
+            rotation.replace_attitude(arrays)
             if on_progress is not None and file.seekable():
                 on_progress(file.tell())
             if count > 1:
@@ -501,13 +501,16 @@ class _AxisRotation:
     Integrates attitudes to the angle that a gyro with one axis turns, tilted or not.
 
     The rotations between neighbouring attitudes are added by their component along the axis of
-    the sensor. A quaternion turns axes of the sensor into those of the room.
+    the sensor, less what coning adds to it (Bortz 1971). A quaternion turns axes of the sensor
+    into those of the room. Over a gap in which the axis of the rotation changes, that component is
+    not the angle: there the gyro's own angle is taken, if it drifts by less.
 
     """
 
     def __init__(self, axis: str):
         self._axis = AXES.index(axis)
-        self._angle, self._last = 0.0, np.empty((0, 4))
+        self._angle, self._output = 0.0, np.empty((0, 3))  # time, output and its integral
+        self._last = np.empty((0, 6))  # time, integral of the output, quaternion
 
     def replace_attitude(self, arrays: dict[str, Array]) -> None:
         """Replace the parts of a quaternion, in quantity -> values, by the reference heading."""
@@ -515,15 +518,61 @@ class _AxisRotation:
             return
         attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
         known = np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < 0.4  # as in recordings
+        time, by_gyro = self._integrate_output(arrays, len(attitude))
         heading = np.full(len(attitude), np.nan)
         if known.any():
-            path = np.concatenate([self._last, attitude[known]])
-            rotation = Rotation.from_quat(path[:, [1, 2, 3, 0]])
-            turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()[:, self._axis]
+            rows = np.column_stack([time, by_gyro, attitude])[known]
+            path = np.concatenate([self._last, rows])
+            turned = self._turned(path)[max(len(self._last) - 1, 0):]
             angles = self._angle + np.cumsum(turned)
             heading[known] = angles if len(self._last) else np.concatenate([[0.0], angles])
-            self._angle, self._last = float(heading[known][-1]), path[-1:]
+            self._angle, self._last = float(heading[known][-1]), rows
         arrays['reference_heading'] = heading
+
+    def _integrate_output(self, arrays: Mapping[str, Array], count: int) -> tuple[Array, Array]:
+        """Return time, s or rows, and the integral of the output, rad, nan without an output."""
+        first, begin = (self._output[-1, 0] + 1.0, self._output[-1, 2]) if len(
+            self._output) else (0.0, 0.0)
+        time = arrays.get('time', first + np.arange(count))
+        output = arrays.get('output', np.full(count, np.nan))
+        known = np.isfinite(output)
+        if known.any():
+            output = np.interp(time, time[known], output[known])
+        at, rate = (np.append(self._output[-1:, column], values)
+                    for column, values in enumerate((time, output)))
+        steps = 0.5 * np.diff(at) * (rate[1:] + rate[:-1])
+        angle = begin + np.cumsum(np.append(np.zeros(count - len(steps)), steps))
+        self._output = np.array([[time[-1], output[-1], angle[-1]]])
+        return time, angle
+
+    def _turned(self, path: Array) -> Array:
+        """Return the angles from row to row of time, integral and quaternion, rad, (n - 1,)."""
+        if len(path) < 2:
+            return np.empty(0)
+        time, apart, by_gyro = path[:, 0], np.diff(path[:, 0]), np.diff(path[:, 1])
+        attitude = Rotation.from_quat(path[:, [3, 4, 5, 2]])
+        step = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+        usual = apart < 1.5 * np.median(apart)
+        turned = step[:, self._axis].copy()
+        coning = np.cross(step[:-1], step[1:])[:, self._axis] / 12.0
+        turned[1:] -= np.where(usual[:-1] & usual[1:], coning, 0.0)
+        gap = np.flatnonzero(~usual)
+        if not len(gap) or not np.isfinite(by_gyro).all():
+            return turned
+        drift = abs((by_gyro - turned)[usual].sum()) / apart[usual].sum()
+        turned[gap] += 2.0 * np.pi * np.rint((by_gyro - turned)[gap] / (2.0 * np.pi))
+        # the coning that rotations as long as the gap, before and after it, would add
+        first = np.searchsorted(time, time[gap] - apart[gap])
+        last = np.minimum(np.searchsorted(time, time[gap + 1] + apart[gap]), len(time) - 1)
+        largest = np.zeros(len(gap))
+        for begin, end in ((first, gap), (gap + 1, last)):
+            near = (attitude[begin].inv() * attitude[end]).as_rotvec()
+            longer = apart[gap] / np.maximum(time[end] - time[begin], np.median(apart))
+            added = np.linalg.norm(np.cross(step[gap], near), axis=1) * longer / 12.0
+            largest = np.maximum(largest, added)
+        unsure = gap[largest > drift * apart[gap]]
+        turned[unsure] = by_gyro[unsure]
+        return turned
 
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.

@@ -14,6 +14,8 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.reference_noise import heading_difference
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 import numpy as np
@@ -165,3 +167,34 @@ def test_intervals_hold_the_truth():
         off = np.array([fit.scale_factor_error - (SCALE - 1.0), fit.bias - BIAS])
         held.append(np.abs(off) < 1.96 * np.sqrt(np.diag(fit.covariance)))
     assert (np.mean(held, axis=0) > 0.85).all()
+
+
+def test_a_motion_capture_that_loses_its_markers_is_no_course():
+    """It errs by less than a course, and by more than the gyro, as where its axes are oblique."""
+    generator = np.random.default_rng(4)
+    log = drive(4, late=0.0)
+    heading = SCALE ** -1 * np.cumsum(log.output - BIAS) / 50.0
+    heading += 0.05 * DEGREE * generator.standard_normal(len(heading))
+    leaking = 0.005 * np.interp(log.time, np.arange(0.0, 181.0, 1.0),
+                                20.0 * DEGREE * generator.standard_normal(181))
+    for begin in range(10, 170, 20):
+        heading[(log.time > begin) & (log.time < begin + 0.5)] = math.nan
+    found = calibrate_encoder(replace(log, output=log.output + leaking, reference_heading=heading))
+    assert found.method == 'likelihood'
+    deviations = np.sqrt(np.diag(found.fit.covariance))
+    assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=4.5 * deviations[0])
+    assert deviations[0] < 0.002
+
+
+def test_the_errors_of_a_reference_at_an_uneven_part_of_the_samples_are_found():
+    """A motion capture at 120 Hz, on straight lines at the 285.7 Hz of the gyro."""
+    generator = np.random.default_rng(5)
+    time, at = np.arange(17000) / 285.7, np.arange(7200) / 120.0
+    rate = 30.0 * DEGREE * np.sin(2.0 * time)
+    drift = np.cumsum(0.2 * DEGREE * generator.standard_normal(len(at))) / math.sqrt(120.0)
+    heading = np.interp(time, at, 15.0 * DEGREE * (1.0 - np.cos(2.0 * at)) + drift)
+    log, _ = keep_own_instants(Log(
+        time=time, reference_heading=heading,
+        output=rate + 0.1 * DEGREE * generator.standard_normal(len(time))))
+    assert np.isfinite(log.reference_heading).mean() < 0.5
+    assert heading_difference(log).total_walk == pytest.approx(0.2 * DEGREE, rel=0.2)

@@ -175,3 +175,12 @@ def test_a_late_reference_passes_all_gates():
     log = drive(2, 1.0 * DEGREE)
     assert all(gate.passed for gate in check_gates(
         replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading))))
+
+
+def test_a_commanded_rate_that_hardly_changes_shows_no_unit():
+    generator = np.random.default_rng(1)
+    time = np.arange(0.0, 27.0, 1.0 / 64.0)
+    command = np.where(np.arange(len(time)) < len(time) - 1, -0.4259, 0.0)
+    log = Log(output=command + 0.01 + 0.02 * generator.standard_normal(len(time)), time=time,
+              reference_rate=command)
+    assert all(gate.passed is not False for gate in check_gates(log))
