@@ -62,6 +62,7 @@ from gyro_calibration.diagnosis.findings import (
     Finding,
     Gain,
     Gate,
+    MIN_PROBABILITY,
     NOT_OFFERED,
     OnProgress,
     probabilities,
@@ -80,7 +81,12 @@ from gyro_calibration.diagnosis.gates import (
     refuse_unusable,
 )
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
-from gyro_calibration.diagnosis.reference_lag import follow_reference, HIDDEN_CAUSES
+from gyro_calibration.diagnosis.reference_lag import (
+    follow_reference,
+    follows_rate,
+    HIDDEN_CAUSES,
+    is_late,
+)
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
     build_problem,
@@ -129,6 +135,10 @@ _SETTLED_REMARK = (
     'Between the dwells, gyro and reference differ by more than the causes explain, as where a '
     'robot follows its command with a lag and overshoot; the log is diagnosed by its dwells '
     'alone: use a measured rate or heading as the reference to see more.')
+_MOTION_REMARK = (
+    'Gyro and reference rate show the motion with different dynamics, as where a robot follows '
+    'its command, or a rate was smoothed. What is left along rate, heading or time may be of '
+    'these, and of commands at uneven times: use a measured rate or heading as the reference.')
 #: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
@@ -299,31 +309,56 @@ class _Searched:
 
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                  on_progress: OnProgress, is_command: bool) -> _Searched:
-    """Search for causes; again where noise is filtered, or the motion follows its reference."""
+    """Search for causes, beside the motion that follows where a log follows its reference."""
+    def find_settled(fit: RegressionFit, follows: bool) -> tuple[Mask, Unexplained] | None:
+        """Return the samples in dwells if the residual is larger between them."""
+        return (_find_settled(logs[0], fit, rate, follows)
+                if len(logs) == 1 and logs[0].reference_rate is not None else None)
+
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
-    search = start_search(plain.problem.replays, SEARCH_ALARM_SHARE * rate, on_progress)
+    replays = plain.problem.replays
+    follows = follows_rate(replays) and (is_command or is_late(replays))
+    settled = None
+    if not follows:
+        found = _search_replays(replays, rate, on_progress)
+        replays = found.search.problem.replays
+        responds = RESPONSE.cause in {each.cause for each in found.causes}
+        settled = find_settled(fit_causes(found.search.problem, found.causes), responds)
+        if not responds and not settled:
+            return found
+    followed = follow_reference(replays)
+    moved = fit_causes(build_problem(followed.replays), [])
+    if follows:
+        settled = find_settled(moved, True)
+    replays = ([drop_samples(followed.replays[0], ~settled[0])] if settled
+               else followed.replays)
+    found = _search_replays(replays, rate, on_progress, {RESPONSE.cause, *HIDDEN_CAUSES})
+    if follows:
+        found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero))
+    elif settled:
+        found = replace(found, unexplained=[settled[1]])
+    else:
+        before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
+                         for each in (fit_causes(plain.problem, []), moved))
+        found = replace(found, unexplained=[Unexplained(
+            'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
+    return replace(found, remarks=[_SETTLED_REMARK] if settled else [_MOTION_REMARK])
+
+
+def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgress,
+                    without: Collection[str] = ()) -> _Searched:
+    """Search for causes, some left out; again where noise is filtered."""
+    search = start_search(replays, SEARCH_ALARM_SHARE * rate, on_progress, without)
     causes = search_causes(search)
     averaged = average_filtered_noise(fit_causes(search.problem, causes)).problem.replays
     if averaged is not search.problem.replays:
-        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
+        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress, without)
         causes = search_causes(search)
-    followed = follow_reference(search, causes, is_command)
-    settled = (_find_settled(logs[0], fit_causes(search.problem, causes), rate)
-               if len(logs) == 1 and logs[0].reference_rate is not None else None)
-    if not followed and not settled:
-        return _Searched(search, causes)
-    moved = search.problem.replays if followed is None else followed.replays
-    search = start_search(
-        [drop_samples(moved[0], ~settled[0])] if settled else moved, SEARCH_ALARM_SHARE * rate,
-        on_progress, {RESPONSE.cause, *HIDDEN_CAUSES}, RESPONSE)
-    structure = settled[1] if settled else followed and followed.unexplained
-    return _Searched(search, search_causes(search), HIDDEN_CAUSES,
-                     [followed.finding] if followed and followed.finding else [],
-                     [structure] if structure else [], [_SETTLED_REMARK] if settled else [])
+    return _Searched(search, causes, without)
 
 
-def _find_settled(log: Log, fit: RegressionFit,
-                  false_alarm_rate: float) -> tuple[Mask, Unexplained] | None:
+def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
+                  follows: bool) -> tuple[Mask, Unexplained] | None:
     """
     Return the samples of a log in dwells if the residual is larger between them; otherwise None.
 
@@ -349,7 +384,6 @@ def _find_settled(log: Log, fit: RegressionFit,
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
     squares = np.add.reduceat(white ** 2, begin) / np.diff(np.append(begin, len(white)))
     steady, between = squares[inside[begin]], squares[~inside[begin]]
-    follows = RESPONSE.cause in {each.cause for each in fit.causes}
     if (min(len(steady), len(between)) < MIN_STRETCHES
             or not follows and np.median(between) < 2.0 * np.median(steady)):
         return None

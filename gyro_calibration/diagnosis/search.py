@@ -170,12 +170,12 @@ class Search:
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
                  on_progress: OnProgress = lambda share, words: None,
-                 without: Collection[str] = (), nuisance: Candidate | None = None) -> Search:
-    """Set up a search: candidates, some causes left out, noises, and a nuisance if any."""
+                 without: Collection[str] = ()) -> Search:
+    """Set up a search: candidates, some causes left out, and noises."""
     on_progress(None, 'candidate causes')
     found = tuple(each for each in (*propose_candidates(replays), *generic_terms(replays))
                   if each.cause not in without)
-    problem, places = build_problem(replays, nuisance), indices_by_cause(found)
+    problem, places = build_problem(replays), indices_by_cause(found)
     fit = fit_causes(problem, [])
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
@@ -190,7 +190,7 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
     """Return a silent search for some causes in other parts of the logs, at another rate."""
-    return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate,
+    return replace(search, problem=build_problem(replays), rate=rate,
                    columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
                    scanned_causes=search.scanned_causes & frozenset(causes),
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
