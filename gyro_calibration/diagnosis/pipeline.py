@@ -66,6 +66,7 @@ from gyro_calibration.diagnosis.findings import (
     NOT_OFFERED,
     OnProgress,
     probabilities,
+    Reference,
     SEARCH_ALARM_SHARE,
     Unexplained,
     VALUE_ALARM_SHARE,
@@ -83,6 +84,7 @@ from gyro_calibration.diagnosis.gates import (
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference,
+    FollowedReference,
     follows_rate,
     HIDDEN_CAUSES,
     is_late,
@@ -136,9 +138,10 @@ _SETTLED_REMARK = (
     'robot follows its command with a lag and overshoot; the log is diagnosed by its dwells '
     'alone: use a measured rate or heading as the reference to see more.')
 _MOTION_REMARK = (
-    'Gyro and reference rate show the motion with different dynamics, as where a robot follows '
-    'its command, or a rate was smoothed. What is left along rate, heading or time may be of '
-    'these, and of commands at uneven times: use a measured rate or heading as the reference.')
+    'The motion has more of its own than a response to its command, as a wobble, a limit of '
+    'acceleration, or commands at uneven times: use a measured rate or heading as the reference '
+    'to see more.')
+_HIDDEN_REASON = 'the motion follows the reference with a lag of its own'
 #: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
@@ -205,10 +208,9 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         try:
             found = _diagnose_by_exact_reference(
                 logs, generator, model, false_alarm_rate, names, on_progress,
-                reference_kind == 'rate_command')
+                references, reference_kind == 'rate_command')
         finally:
             forget_fits()
-        found = replace(found, reference=references[0] if len(logs) == 1 else None)
     if given_model is not None and found.model is model:
         # with its self-calibration separate
         found = replace(found, before=given_model, model=given_model)
@@ -230,7 +232,8 @@ def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | No
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                                  model: GyroModel | None, rate: float, names: Sequence[str],
-                                 on_progress: OnProgress, is_command: bool) -> Diagnosis:
+                                 on_progress: OnProgress, references: Sequence[Reference],
+                                 is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
     on_progress(None, 'data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
@@ -241,6 +244,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     searched = _search_logs(logs, replays, rate, on_progress, is_command)
     search = searched.search
     selection = confirm_causes(search, searched.causes)
+    if searched.followed is not None and selection.unnamed and len(logs) == 1:
+        return _diagnose_beside_motion(logs[0], searched, replays[0], references[0], model, rate,
+                                       on_progress)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
     on_progress(None, 'noise figures')
@@ -292,7 +298,25 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      residual_curves(left, shown), heading_error_curve(left, shown),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
-                      *searched.remarks), rate, heading_shares=of_heading)
+                      *searched.remarks), rate, heading_shares=of_heading,
+                     reference=references[0] if len(logs) == 1 else None)
+
+
+def _diagnose_beside_motion(log: Log, searched: _Searched, given: Replay, reference: Reference,
+                            model: GyroModel | None, rate: float,
+                            on_progress: OnProgress) -> Diagnosis:
+    """Diagnose a log by spans, if its motion has more of its own than a response to a command."""
+    assert searched.followed is not None and log.reference_rate is not None
+    motion = searched.followed.replays[0]
+    of_motion = np.where(motion.valid, log.reference_rate + motion.reference - given.reference,
+                         np.nan)
+    found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
+                                        rate, on_progress)
+    hidden = {name: _HIDDEN_REASON for name in searched.hidden if name in CAUSES}
+    return replace(found, findings=(*(each for each in found.findings
+                                      if each.effect not in hidden), *searched.findings),
+                   cannot_show={**found.cannot_show, **hidden},
+                   remarks=(*found.remarks, _MOTION_REMARK))
 
 
 @dataclass(frozen=True)
@@ -305,6 +329,7 @@ class _Searched:
     findings: Sequence[Finding] = ()
     unexplained: Sequence[Unexplained] = ()
     remarks: Sequence[str] = ()
+    followed: FollowedReference | None = None
 
 
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
@@ -334,7 +359,8 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                else followed.replays)
     found = _search_replays(replays, rate, on_progress, {RESPONSE.cause, *HIDDEN_CAUSES})
     if follows:
-        found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero))
+        found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
+                        followed=followed)
     elif settled:
         found = replace(found, unexplained=[settled[1]])
     else:
@@ -342,7 +368,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                          for each in (fit_causes(plain.problem, []), moved))
         found = replace(found, unexplained=[Unexplained(
             'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
-    return replace(found, remarks=[_SETTLED_REMARK] if settled else [_MOTION_REMARK])
+    return replace(found, remarks=[_SETTLED_REMARK] if settled else [])
 
 
 def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgress,
@@ -475,7 +501,7 @@ def _untestable_causes(search: Search, logs: Sequence[Log],
         if not moves and cause.required_channels & of_motion:
             return 'the reference shows no motion'
         if cause.name in hidden:
-            return 'the motion follows the reference with a lag of its own'
+            return _HIDDEN_REASON
         if unchanging := sorted(cause.required_channels & constant):
             return _CONSTANT_REASONS[unchanging[0]]
         return ('in these logs it cannot be distinguished from a bias or a scale factor error'
