@@ -500,10 +500,21 @@ def complexity_penalty(cause: Candidate) -> float:
 
 
 def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
-    """Return the evidence for one of the causes given the others."""
+    """
+    Return the evidence for one of the causes given the others.
+
+    Of two distortions of the rate, such as a delay and a lag, one may stand in for the other:
+    without one, the shape of the other is refined.
+
+    """
     fit = fit_causes(search.problem, causes)
-    return (fit.log_likelihood - likelihood_without(fit, cause_index)
-            - complexity_penalty(causes[cause_index]))
+    rest = (*causes[:cause_index], *causes[cause_index + 1:])
+    without = likelihood_without(fit, cause_index)
+    if is_rate_distortion(causes[cause_index].cause) and any(
+            is_rate_distortion(each.cause) for each in rest):
+        without = max(without, fit_causes(
+            search.problem, refine_jointly(search, rest)).log_likelihood)
+    return fit.log_likelihood - without - complexity_penalty(causes[cause_index])
 
 
 def eliminate_backward(search: Search, causes: Causes) -> Causes:
