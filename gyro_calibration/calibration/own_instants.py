@@ -147,7 +147,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         if found is None or not (found.interval <= _LONGEST_INTERVAL
                                  or found.is_held and is_heading):
             continue
-        if found.is_held and not is_heading and _is_command(log, given):
+        if found.is_held and not is_heading and is_command(log, given):
             continue
         # not those in gaps
         after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
@@ -166,7 +166,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     return log, kept
 
 
-def _is_command(log: Log, held: Array) -> bool:
+def is_command(log: Log, held: Array) -> bool:
     """
     Tell whether the gyro is later than a held rate, as a robot that follows its command.
 

@@ -16,7 +16,11 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
+from gyro_calibration.calibration.own_instants import (
+    find_own_instants,
+    is_command,
+    keep_own_instants,
+)
 from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
@@ -164,17 +168,20 @@ def rate_noise_share(log: Log) -> float:
     """
     Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
 
-    It is estimated where the reference is quietest, by the updates of a held one. White noise is
-    detected by third differences of alternating sign, other noise by changes from sample to sample
-    that the gyro does not show.
+    A command has none, however it jumps. It is estimated where the reference is quietest, by the
+    updates of a held one. White noise is detected by third differences of alternating sign, other
+    noise by changes from sample to sample that the gyro does not show.
 
     """
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
     rate, output = log.reference_rate[known], log.output[known]
+    begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
+    if log.time is not None and len(begins) < 0.5 * len(rate) and is_command(
+            log, log.reference_rate):
+        return 0.0
     slow = None if log.time is None else find_own_instants(log.time[known], rate)
     if slow is not None and slow.is_held:
-        begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
         counts = np.diff(begins, append=len(rate))
         rate, output = rate[begins], np.add.reduceat(output, begins) / counts
     if len(rate) < 100 or not np.ptp(rate) > 0.0:

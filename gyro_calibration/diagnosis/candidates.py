@@ -365,15 +365,12 @@ def _spline_columns(variable: Variable) -> ColumnFunction:
     return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
 
 
-def response_edges(interval: float) -> Array:
-    """Return the lags between which a response is constant, whole samples, s, shape (k + 1,)."""
-    return np.unique(np.rint(np.array(_RESPONSE_LAGS) / interval)) * interval
-
-
 def _response_columns(each: Replay) -> Sequence[Array]:
     """Return the mean rate between two lags less the rate, for each pair of neighbouring lags."""
     time, rate = each.channels.time, each.channels.rate
-    edges, turned = response_edges(each.interval), integrate(time, rate)
+    # whole samples
+    edges = np.unique(np.rint(np.array(_RESPONSE_LAGS) / each.interval)) * each.interval
+    turned = integrate(time, rate)
     late = np.interp(time - edges[:, None], time, turned)
     return [*((late[:-1] - late[1:]) / np.diff(edges)[:, None] - rate)]
 

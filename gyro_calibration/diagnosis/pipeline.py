@@ -62,9 +62,11 @@ from gyro_calibration.diagnosis.findings import (
     Finding,
     Gain,
     Gate,
+    MIN_PROBABILITY,
     NOT_OFFERED,
     OnProgress,
     probabilities,
+    Reference,
     SEARCH_ALARM_SHARE,
     Unexplained,
     VALUE_ALARM_SHARE,
@@ -80,7 +82,13 @@ from gyro_calibration.diagnosis.gates import (
     refuse_unusable,
 )
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
-from gyro_calibration.diagnosis.reference_lag import follow_reference, HIDDEN_CAUSES
+from gyro_calibration.diagnosis.reference_lag import (
+    follow_reference,
+    FollowedReference,
+    follows_rate,
+    HIDDEN_CAUSES,
+    is_late,
+)
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
     build_problem,
@@ -129,6 +137,11 @@ _SETTLED_REMARK = (
     'Between the dwells, gyro and reference differ by more than the causes explain, as where a '
     'robot follows its command with a lag and overshoot; the log is diagnosed by its dwells '
     'alone: use a measured rate or heading as the reference to see more.')
+_MOTION_REMARK = (
+    'The motion has more of its own than a response to its command, as a wobble, a limit of '
+    'acceleration, or commands at uneven times: use a measured rate or heading as the reference '
+    'to see more.')
+_HIDDEN_REASON = 'the motion follows the reference with a lag of its own'
 #: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
@@ -195,10 +208,9 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         try:
             found = _diagnose_by_exact_reference(
                 logs, generator, model, false_alarm_rate, names, on_progress,
-                reference_kind == 'rate_command')
+                references, reference_kind == 'rate_command')
         finally:
             forget_fits()
-        found = replace(found, reference=references[0] if len(logs) == 1 else None)
     if given_model is not None and found.model is model:
         # with its self-calibration separate
         found = replace(found, before=given_model, model=given_model)
@@ -220,7 +232,8 @@ def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | No
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                                  model: GyroModel | None, rate: float, names: Sequence[str],
-                                 on_progress: OnProgress, is_command: bool) -> Diagnosis:
+                                 on_progress: OnProgress, references: Sequence[Reference],
+                                 is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
     on_progress(None, 'data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
@@ -231,6 +244,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     searched = _search_logs(logs, replays, rate, on_progress, is_command)
     search = searched.search
     selection = confirm_causes(search, searched.causes)
+    if searched.followed is not None and selection.unnamed and len(logs) == 1:
+        return _diagnose_beside_motion(logs[0], searched, replays[0], references[0], model, rate,
+                                       on_progress)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
     on_progress(None, 'noise figures')
@@ -282,7 +298,25 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      residual_curves(left, shown), heading_error_curve(left, shown),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
-                      *searched.remarks), rate, heading_shares=of_heading)
+                      *searched.remarks), rate, heading_shares=of_heading,
+                     reference=references[0] if len(logs) == 1 else None)
+
+
+def _diagnose_beside_motion(log: Log, searched: _Searched, given: Replay, reference: Reference,
+                            model: GyroModel | None, rate: float,
+                            on_progress: OnProgress) -> Diagnosis:
+    """Diagnose a log by spans, if its motion has more of its own than a response to a command."""
+    assert searched.followed is not None and log.reference_rate is not None
+    motion = searched.followed.replays[0]
+    of_motion = np.where(motion.valid, log.reference_rate + motion.reference - given.reference,
+                         np.nan)
+    found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
+                                        rate, on_progress)
+    hidden = {name: _HIDDEN_REASON for name in searched.hidden if name in CAUSES}
+    return replace(found, findings=(*(each for each in found.findings
+                                      if each.effect not in hidden), *searched.findings),
+                   cannot_show={**found.cannot_show, **hidden},
+                   remarks=(*found.remarks, _MOTION_REMARK))
 
 
 @dataclass(frozen=True)
@@ -295,35 +329,62 @@ class _Searched:
     findings: Sequence[Finding] = ()
     unexplained: Sequence[Unexplained] = ()
     remarks: Sequence[str] = ()
+    followed: FollowedReference | None = None
 
 
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                  on_progress: OnProgress, is_command: bool) -> _Searched:
-    """Search for causes; again where noise is filtered, or the motion follows its reference."""
+    """Search for causes, beside the motion that follows where a log follows its reference."""
+    def find_settled(fit: RegressionFit, follows: bool) -> tuple[Mask, Unexplained] | None:
+        """Return the samples in dwells if the residual is larger between them."""
+        return (_find_settled(logs[0], fit, rate, follows)
+                if len(logs) == 1 and logs[0].reference_rate is not None else None)
+
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
-    search = start_search(plain.problem.replays, SEARCH_ALARM_SHARE * rate, on_progress)
+    replays = plain.problem.replays
+    follows = follows_rate(replays) and (is_command or is_late(replays))
+    settled = None
+    if not follows:
+        found = _search_replays(replays, rate, on_progress)
+        replays = found.search.problem.replays
+        responds = RESPONSE.cause in {each.cause for each in found.causes}
+        settled = find_settled(fit_causes(found.search.problem, found.causes), responds)
+        if not responds and not settled:
+            return found
+    followed = follow_reference(replays)
+    moved = fit_causes(build_problem(followed.replays), [])
+    if follows:
+        settled = find_settled(moved, True)
+    replays = ([drop_samples(followed.replays[0], ~settled[0])] if settled
+               else followed.replays)
+    found = _search_replays(replays, rate, on_progress, {RESPONSE.cause, *HIDDEN_CAUSES})
+    if follows:
+        found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
+                        followed=followed)
+    elif settled:
+        found = replace(found, unexplained=[settled[1]])
+    else:
+        before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
+                         for each in (fit_causes(plain.problem, []), moved))
+        found = replace(found, unexplained=[Unexplained(
+            'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
+    return replace(found, remarks=[_SETTLED_REMARK] if settled else [])
+
+
+def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgress,
+                    without: Collection[str] = ()) -> _Searched:
+    """Search for causes, some left out; again where noise is filtered."""
+    search = start_search(replays, SEARCH_ALARM_SHARE * rate, on_progress, without)
     causes = search_causes(search)
     averaged = average_filtered_noise(fit_causes(search.problem, causes)).problem.replays
     if averaged is not search.problem.replays:
-        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
+        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress, without)
         causes = search_causes(search)
-    followed = follow_reference(search, causes, is_command)
-    settled = (_find_settled(logs[0], fit_causes(search.problem, causes), rate)
-               if len(logs) == 1 and logs[0].reference_rate is not None else None)
-    if not followed and not settled:
-        return _Searched(search, causes)
-    moved = search.problem.replays if followed is None else followed.replays
-    search = start_search(
-        [drop_samples(moved[0], ~settled[0])] if settled else moved, SEARCH_ALARM_SHARE * rate,
-        on_progress, {RESPONSE.cause, *HIDDEN_CAUSES}, RESPONSE)
-    structure = settled[1] if settled else followed and followed.unexplained
-    return _Searched(search, search_causes(search), HIDDEN_CAUSES,
-                     [followed.finding] if followed and followed.finding else [],
-                     [structure] if structure else [], [_SETTLED_REMARK] if settled else [])
+    return _Searched(search, causes, without)
 
 
-def _find_settled(log: Log, fit: RegressionFit,
-                  false_alarm_rate: float) -> tuple[Mask, Unexplained] | None:
+def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
+                  follows: bool) -> tuple[Mask, Unexplained] | None:
     """
     Return the samples of a log in dwells if the residual is larger between them; otherwise None.
 
@@ -349,7 +410,6 @@ def _find_settled(log: Log, fit: RegressionFit,
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
     squares = np.add.reduceat(white ** 2, begin) / np.diff(np.append(begin, len(white)))
     steady, between = squares[inside[begin]], squares[~inside[begin]]
-    follows = RESPONSE.cause in {each.cause for each in fit.causes}
     if (min(len(steady), len(between)) < MIN_STRETCHES
             or not follows and np.median(between) < 2.0 * np.median(steady)):
         return None
@@ -441,7 +501,7 @@ def _untestable_causes(search: Search, logs: Sequence[Log],
         if not moves and cause.required_channels & of_motion:
             return 'the reference shows no motion'
         if cause.name in hidden:
-            return 'the motion follows the reference with a lag of its own'
+            return _HIDDEN_REASON
         if unchanging := sorted(cause.required_channels & constant):
             return _CONSTANT_REASONS[unchanging[0]]
         return ('in these logs it cannot be distinguished from a bias or a scale factor error'

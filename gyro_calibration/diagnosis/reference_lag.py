@@ -11,10 +11,10 @@
 """
 A motion that follows its reference rate with dynamics of its own, as a robot follows its command.
 
-Its delay, lag and overshoot are those of the drives, not of the gyro. They are fitted as a delay,
-a first-order lag, or a linear response of any shape, and the log is then diagnosed against the
-motion that follows. A delay, a lag or a clock rate of the gyro cannot be known beside them, and
-neither can a slip.
+Its delay, lag and overshoot are those of the drives, not of the gyro. They are fitted as a linear
+response of any shape, and the log is then diagnosed against the motion that follows, without what
+any other such response would explain. A delay, a lag or a clock rate of the gyro cannot be known
+beside them, and neither can a slip.
 
 """
 
@@ -23,25 +23,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.diagnosis.candidates import (
-    Candidate,
-    is_named,
-    RESPONSE,
-    response_edges,
-)
+from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
-from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY, Unexplained
+from gyro_calibration.diagnosis.extended_model import drop_samples
+from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
 from gyro_calibration.diagnosis.noisy_reference import MAX_GYRO_LAG
-from gyro_calibration.diagnosis.regression import fit_causes, RegressionFit
-from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.search import evidence_for, p_value, refine_jointly, Search
-from gyro_calibration.logs.log import NORMAL_QUANTILE_975
+from gyro_calibration.diagnosis.replay import (
+    cosine_transform,
+    kernel_lags,
+    MIN_RESPONSE_POWER,
+    Replay,
+    response_kernels,
+)
+from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 import numpy as np
+from scipy.stats import norm
 
-#: Causes that cannot be known beside the dynamics of a motion, and those that describe these.
+#: Causes that cannot be known beside the dynamics of a motion, which may also vibrate.
 HIDDEN_CAUSES = frozenset({
-    'clock_rate', *(name for name, cause in CAUSES.items() if cause.along == 'rate_change')})
-_DYNAMICS = ('time_offset', 'bandwidth', RESPONSE.cause)
+    'clock_rate', 'interference_tone',
+    *(name for name, cause in CAUSES.items() if cause.along == 'rate_change')})
+#: Effects of the gyro along the motion, linear in their sizes.
+_MOTION_EFFECTS = ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
+                   'heading_sensitivity')
+#: Longest lag of a motion as a share of the duration of a log.
+_MAX_LAG_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -49,72 +55,89 @@ class FollowedReference:
     """A motion that follows its reference, and what is reported of it."""
 
     replays: tuple[Replay, ...]  # the logs, with the motion that follows as the reference
-    finding: Finding | None  # the lag, where it is longer than that of a gyro
-    unexplained: Unexplained | None  # otherwise: a response that is no delay and lag
+    lag: Estimate  # mean delay of the motion, s
 
-
-def follow_reference(search: Search, causes: Sequence[Candidate],
-                     is_command: bool) -> FollowedReference | None:
-    """
-    Return the motion of logs that follows their reference rate, if causes tell that it does.
-
-    Parameters
-    ----------
-    causes : that the search found
-    is_command : whether the reference is stated to be a commanded rate, so that any lag is that of
-        the motion
-
-    """
-    kept = refine_jointly(search, [
-        each for each in causes if each.cause in _DYNAMICS or each.cause not in HIDDEN_CAUSES])
-    fit = fit_causes(search.problem, kept)
-    places = [place for place, each in enumerate(kept) if each.cause in _DYNAMICS]
-    if not places or 'reference_rate' not in fit.problem.replays[0].available_channels:
-        return None
-    lag = _mean_lag(fit, places)
-    chance = max(min(p_value(kept[place].cause, evidence_for(search, kept, place))
-                     for place in places), MIN_PROBABILITY)
-    finding = unexplained = None
-    if lag.estimate > MAX_GYRO_LAG or is_command:
-        finding = make_finding(
-            'reference_lag', {'reference_lag': lag}, chance, evidence=f'the motion is '
-            f'{1e3 * lag.estimate:.0f} ms behind the reference rate on average, and the output is '
-            'compared with the motion that follows',
+    def finding(self) -> Finding:
+        """Return the finding of the lag."""
+        return make_finding(
+            'reference_lag', {'reference_lag': self.lag},
+            max(float(2.0 * norm.sf(abs(self.lag.estimate) / self.lag.deviation)),
+                MIN_PROBABILITY),
+            evidence=f'the motion is {1e3 * self.lag.estimate:.0f} ms behind the reference rate '
+            'on average, and the output is compared with the motion that follows',
             remedy='use a measured rate or heading as the reference')
-    elif all(map(is_named, (kept[place] for place in places))):
-        return None
-    replays = tuple(_followed(fit, run) for run in range(len(fit.problem.replays)))
-    if finding is None:
-        before, after = (sum(float(np.sum((each.channels.output - rate)[each.valid] ** 2))
-                             for each, rate in zip(replays, rates))
-                         for rates in ([each.reference for each in fit.problem.replays],
-                                       [each.reference for each in replays]))
-        unexplained = Unexplained('rate_change', max(1.0 - after / before, 0.0), chance)
-    return FollowedReference(replays, finding, unexplained)
 
 
-def _mean_lag(fit: RegressionFit, places: Sequence[int]) -> Estimate:
-    """Return the mean delay of the response, s."""
-    lag, weights = 0.0, np.zeros(len(fit.covariance))
-    for place in places:
-        if is_named(fit.causes[place]):
-            lag += fit.causes[place].shapes[0]
-            weights[fit.estimate_index(place, -1)] = 1.0
-            continue
-        edges = response_edges(fit.problem.replays[0].interval)
-        middles = 0.5 * (edges[1:] + edges[:-1]) / (1.0 + fit.scale_factor_error.value)
-        for number, (value, middle) in enumerate(zip(fit.coefficients(place), middles.tolist())):
-            lag += value.value * middle
-            if (rank := fit.estimate_index(place, number)) is not None:
-                weights[rank] = middle
-    return Estimate.from_half_width(
-        lag, NORMAL_QUANTILE_975 * float(np.sqrt(weights @ fit.covariance @ weights)), 's')
+def is_late(replays: Sequence[Replay]) -> bool:
+    """
+    Tell whether the output is later than the reference rate of logs by more than a gyro would be.
+
+    The headings of a motion and of one that is late differ by the rate times the delay.
+
+    """
+    delays = []
+    for each in replays:
+        rate = each.resample(each.channels.rate)
+        difference = np.cumsum(each.resample(each.channels.output - each.reference))
+        columns = np.column_stack([
+            rate, np.cumsum(rate), np.arange(len(rate)), np.ones(len(rate))])
+        delays.append(-each.point_interval * np.linalg.lstsq(columns, difference)[0][0])
+    return follows_rate(replays) and float(np.mean(delays)) > MAX_GYRO_LAG
 
 
-def _followed(fit: RegressionFit, run: int) -> Replay:
-    """Return a log with the motion that follows as the reference, and as that of effects."""
-    each = fit.problem.replays[run]
-    parts = fit.contributions(each, run)
-    change = (parts.get('time_offset', 0.0) + parts.get('bandwidth', 0.0)
-              + parts.get(RESPONSE.cause, 0.0) / (1.0 + fit.scale_factor_error.value))
-    return replace(each.with_rate(each.channels.rate + change), reference=each.reference + change)
+def follows_rate(replays: Sequence[Replay]) -> bool:
+    """Tell whether the motion may follow the reference of logs, which is a rate that changes."""
+    return all('reference_rate' in each.available_channels and np.ptp(each.channels.rate) > 0.0
+               for each in replays)
+
+
+def follow_reference(replays: Sequence[Replay]) -> FollowedReference:
+    """Return the motion that follows the reference rate of logs."""
+    followed, lags = zip(*map(_follow, replays))
+    weights = np.array([each.deviation for each in lags]) ** -2
+    mean = float(np.average([each.estimate for each in lags], weights=weights))
+    return FollowedReference(followed, Estimate.from_half_width(
+        mean, NORMAL_QUANTILE_975 * float(weights.sum() ** -0.5), 's'))
+
+
+def _follow(replay: Replay) -> tuple[Replay, Estimate]:
+    """
+    Return a log with the motion that follows as the reference, and its mean delay, s.
+
+    The number of lags is the likeliest one by the information criterion of Bayes, beside effects
+    of the gyro along the motion.
+
+    """
+    kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
+    longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]
+    kernels = kernels[longest < _MAX_LAG_SHARE * replay.duration]
+    # at first the motion follows commands from before the log
+    late = drop_samples(replace(replay, command=replay.channels.rate),
+                        replay.channels.time < replay.channels.time[0] + longest[len(kernels) - 1])
+    delayed = [cosine_transform(late.resample(each)) for each in late.delayed_commands(kernels)]
+    others: list[Array] = []
+    for _ in range(2):
+        first = 1 + len(others)
+        columns = np.array([*(cosine_transform(late.resample(each))
+                              for each in (replay.channels.rate, *others)), *delayed])
+        left = cosine_transform(late.resample(replay.channels.output - replay.reference))
+        squares = left @ left - np.cumsum((np.linalg.qr(columns.T)[0].T @ left) ** 2)
+        penalties = np.log(len(left)) * np.arange(len(columns))
+        criterion = len(left) * np.log(squares) + penalties
+        lag_count = 1 + int(np.argmin(criterion[first:]))
+        columns = columns[:first + lag_count]
+        inverse = np.linalg.pinv(columns @ columns.T, MIN_RESPONSE_POWER, hermitian=True)
+        values = inverse @ columns @ left
+        # of a gain of 1 plus the scale factor error
+        response = values[first:] / (1.0 + values[0]) @ kernels[:lag_count]
+        change = next(late.delayed_commands(response[None]))
+        # effects along this motion would otherwise pass for a longer response
+        moved = late.with_rate(replay.channels.rate + change)
+        others = [column for name in _MOTION_EFFECTS
+                  for column in effect_candidate(name).columns(moved)]
+    moments = kernels[:lag_count] @ lags
+    covariance = squares[first + lag_count - 1] / (len(left) - len(columns)) * inverse
+    late = replace(late.with_rate(replay.channels.rate + change), lag_count=lag_count,
+                   reference=replay.reference + change)
+    return late, Estimate.from_half_width(float(response @ lags), NORMAL_QUANTILE_975 * float(
+        np.sqrt(moments @ covariance[first:, first:] @ moments)), 's')

@@ -76,8 +76,6 @@ class RegressionProblem:
     noise_shapes: tuple[NoiseShape, ...]  # noises that are tried
     weights: Array  # one over the variance of each band relative to the first noise, shape (g, b)
     log_determinants: Array  # of the relative variances, and of the prior probability, shape (g,)
-    # columns of the undistorted rate that are fitted with any causes, and belong to none
-    nuisance: Candidate | None = None
 
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
@@ -106,9 +104,8 @@ class RegressionProblem:
         return np.tensordot(self.weights, self.band_products(one, other), 1)
 
 
-def build_problem(replays: Sequence[Replay],
-                  nuisance: Candidate | None = None) -> RegressionProblem:
-    """Set up the regression of logs with a grid of noises, and a nuisance if any."""
+def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
+    """Set up the regression of logs with a grid of noises."""
     logs, rounding_ratio = tuple(replays), 0.0
     if any(each.heading_step for each in logs):
         # the most likely variance of the rounding of a heading, relative to white noise
@@ -116,10 +113,10 @@ def build_problem(replays: Sequence[Replay],
             NoiseShape(walk, rounding_ratio=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))
             for walk in (0.0, 1e-4, 1e-2)])
         rounding_ratio = tried.noise_shapes[fit_causes(tried, []).best_noise].rounding_ratio
-    return replace(_assemble_problem(
+    return _assemble_problem(
         logs, NoiseShape(rounding_ratio=rounding_ratio),
         noise_grid(min(each.point_interval for each in logs),
-                   max(each.duration for each in logs), rounding_ratio)), nuisance=nuisance)
+                   max(each.duration for each in logs), rounding_ratio))
 
 
 def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
@@ -169,7 +166,7 @@ class RegressionFit:
     # derivatives with respect to their shapes; the residual less the causes of fixed amplitude
     rows: Array
     # of each column: (index of the cause; index of its value, or -1 less index of its shape); -1
-    # and 0 for the scale factor error, -1 and more for the nuisance
+    # and 0 for the scale factor error
     column_owners: tuple[tuple[int, int], ...]
     column_counts: tuple[int, ...]  # number of columns with free values of each cause
     lacks_columns: bool  # whether some columns depend on others, and are left out
@@ -308,7 +305,7 @@ class RegressionFit:
     # contributions to the output
 
     def contributions(self, replay: Replay, log_index: int) -> dict[str, Array]:
-        """Return the contributions of scale, causes and nuisance to a log, rad/s, shape (n,)."""
+        """Return the contributions of scale, causes and reference to a log, rad/s, (n,)."""
         found: dict[str, Array] = {}
         new = replay
         for known in self.causes:
@@ -316,11 +313,6 @@ class RegressionFit:
                 before, new = new, with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
-        if self.problem.nuisance is not None:
-            columns = self.problem.nuisance.columns(replay)
-            found['reference'] = np.asarray(sum(
-                self._column_value(-1, 1 + number).value * column
-                for number, column in enumerate(columns)))
         for place, known in enumerate(self.causes):
             if (is_rate_distortion(known.cause) or known.log_index not in (None, log_index)
                     or not self.is_included(place)):
@@ -329,6 +321,10 @@ class RegressionFit:
                       else [one.value for one in self.coefficients(place)])
             for value, column in zip(values, known.columns(new)):
                 found[known.cause] = found.get(known.cause, 0.0) + value * column
+        if replay.command is not None:
+            fitted = self.problem.replays[log_index]
+            found['reference'] = fitted.response(
+                replay.channels.output - replay.reference - np.asarray(sum(found.values())))
         return found
 
     def total_contribution(self, replay: Replay, log_index: int) -> Array:
@@ -355,18 +351,16 @@ class RegressionFit:
     @property
     def bias_variance(self) -> float:
         """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
-        means, nuisance = np.zeros(len(self.columns)), self.problem.nuisance
+        means = np.zeros(len(self.columns))
         for rank, (place, number) in enumerate(self.column_owners):
             if place < 0:
-                parts = ([each.channels.rate for each in self.distorted] if nuisance is None
-                         or number == 0 else [nuisance.columns(each)[number - 1]
-                                              for each in self.problem.replays])
+                parts = [each.channels.rate for each in self.distorted]
             elif number >= 0 and self.is_included(place):
                 parts = [self.causes[place].columns(each)[number]
                          for each in self.distorted]
             else:
                 continue
-            means[rank] = np.mean([part[each.valid].mean()
+            means[rank] = np.mean([(part - each.response(part))[each.valid].mean()
                                    for part, each in zip(parts, self.distorted)])
         return float(means @ self.estimates[1] @ means)
 
@@ -429,9 +423,6 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
     distorted = tuple(with_distorted_rate(each, distortions) for each in problem.replays)
     residual, rate = _transforms_without_causes(problem.replays, distorted)
     columns, owners, widths = [rate[None]], [(-1, 0)], []
-    if problem.nuisance is not None:
-        columns.append(_transforms(problem.nuisance, problem.replays))
-        owners += [(-1, 1 + number) for number in range(len(columns[-1]))]
     for place, known in enumerate(causes):
         distorts = is_rate_distortion(known.cause)
         replays = problem.replays if distorts else distorted
@@ -697,8 +688,8 @@ def average_filtered_noise(fit: RegressionFit,
             and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME
             for each, part in zip(fit.problem.replays, fit.residual_transforms())]):
         fit = fit_causes(build_problem([replace(each, decimation=each.decimation * (1 + more))
-                                        for each, more in zip(fit.problem.replays, is_filtered)],
-                                       fit.problem.nuisance), fit.causes)
+                                        for each, more in zip(fit.problem.replays, is_filtered)]),
+                         fit.causes)
     return fit
 
 

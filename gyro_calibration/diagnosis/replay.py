@@ -21,8 +21,9 @@ its variance by ``(3 sin / (2 + cos))²``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 import math
 
 from gyro_calibration.diagnosis.gates import (
@@ -44,6 +45,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
+from scipy.signal import oaconvolve
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,11 @@ _GAP_MARGIN_SAMPLES = 4
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
 
 
+#: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1;
+#: and least power of an independent response to the command as a share of the strongest.
+_LEAD, _LONGEST_LAG, _LAG_RATIO, MIN_RESPONSE_POWER = 0.1, 5.0, 0.05, 1e-12
+
+
 @dataclass(frozen=True, eq=False)
 class Replay:
     """One log prepared for the search: n samples, of which some are used."""
@@ -157,6 +164,10 @@ class Replay:
     # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
     rounding_variance: float = 0.0  # variance of a sample by quantization of the output, (rad/s)²
+    # commanded rate, shape (n,), and number of the lags of `response_kernels`, if the motion
+    # follows it with any linear response, which is then taken out of the residual and all columns
+    command: Array | None = None
+    lag_count: int = 0
 
     @property
     def point_interval(self) -> float:
@@ -200,16 +211,82 @@ class Replay:
 
     def transform_residual(self, values: Array) -> Array:
         """Return the cosine transform of a residual; interpolated points get white noise."""
-        return cosine_transform(self.resample(values, white_noise_deviation(values[self.valid]),
-                                              self._least_reach))
+        return self._without_response(cosine_transform(self.resample(
+            values, white_noise_deviation(values[self.valid]), self._least_reach)))
 
     def transform_samples(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
+        return self._without_response(self._transform(values))
+
+    def _transform(self, values: Array) -> Array:
         return cosine_transform(self.resample(values, least_reach=self._least_reach))
+
+    # the response to a command
+
+    def delayed_commands(self, kernels: Array) -> Iterator[Array]:
+        """Give the change of the commanded rate by each response of gain 1, rad/s, shape (n,)."""
+        assert self.command is not None
+        time, first = self.channels.time, -_leading_lags(self.interval)
+        grid = np.rint((time - time[0]) / self.interval).astype(int)
+        known = np.searchsorted(grid, np.arange(grid[-1] + 1), 'right') - 1
+        last = first + kernels.shape[1] - 1
+        padded = np.pad(self.command[known], (last, -first), mode='edge')
+        for kernel in kernels:
+            yield oaconvolve(padded, kernel, 'valid')[grid] - kernel.sum() * self.command
+
+    @cached_property
+    def _response_basis(self) -> tuple[Array, Array]:
+        """Return the transforms of all responses, orthonormal, and their kernels."""
+        kernels = response_kernels(self.interval)[:self.lag_count]
+        columns = np.array([self._transform(each) for each in self.delayed_commands(kernels)])
+        values, vectors = np.linalg.eigh(columns @ columns.T)
+        kept = values > MIN_RESPONSE_POWER * values[-1]
+        scaled = vectors[:, kept].T / np.sqrt(values[kept])[:, None]
+        return scaled @ columns, scaled @ kernels
+
+    def _without_response(self, transform: Array) -> Array:
+        if self.command is None:
+            return transform
+        basis = self._response_basis[0]
+        return transform - (basis @ transform) @ basis
+
+    def response(self, values: Array) -> Array:
+        """Return the response to the command that fits samples best, rad/s, shape (n,)."""
+        if self.command is None:
+            return np.zeros(len(values))
+        basis, kernels = self._response_basis
+        return next(self.delayed_commands((basis @ self._transform(values) @ kernels)[None]))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
         return replace(self, channels=replace(self.channels, rate=rate))
+
+
+def _leading_lags(interval: float) -> int:
+    """Return the number of lags before 0, where a reference is late by its stamps."""
+    return round(_LEAD / interval)
+
+
+@cache
+def response_kernels(interval: float) -> Array:
+    """
+    Return responses of gain 1 at growing lags, one a row: shape (k, lags), lags in samples.
+
+    Together they are any response that is linear between lags, of which each is later by a
+    sample or `_LAG_RATIO`, whichever is more: what is slow in a motion is smooth.
+
+    """
+    lags = [-_leading_lags(interval), 1 - _leading_lags(interval)]
+    while lags[-1] * interval < _LONGEST_LAG:
+        lags.append(lags[-1] + max(round(_LAG_RATIO * lags[-1]), 1))
+    hats = np.array([np.interp(np.arange(lags[0], lags[-1] + 1), lags, each)
+                     for each in np.eye(len(lags))])
+    return np.asarray(hats / hats.sum(axis=1, keepdims=True))
+
+
+def kernel_lags(interval: float) -> Array:
+    """Return the lags of `response_kernels`, s."""
+    return interval * (np.arange(response_kernels(interval).shape[1]) - _leading_lags(interval))
 
 
 def replay(log: Log, usable: Mask, generator: np.random.Generator,

@@ -170,12 +170,12 @@ class Search:
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
                  on_progress: OnProgress = lambda share, words: None,
-                 without: Collection[str] = (), nuisance: Candidate | None = None) -> Search:
-    """Set up a search: candidates, some causes left out, noises, and a nuisance if any."""
+                 without: Collection[str] = ()) -> Search:
+    """Set up a search: candidates, some causes left out, and noises."""
     on_progress(None, 'candidate causes')
     found = tuple(each for each in (*propose_candidates(replays), *generic_terms(replays))
                   if each.cause not in without)
-    problem, places = build_problem(replays, nuisance), indices_by_cause(found)
+    problem, places = build_problem(replays), indices_by_cause(found)
     fit = fit_causes(problem, [])
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
@@ -190,7 +190,7 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
     """Return a silent search for some causes in other parts of the logs, at another rate."""
-    return replace(search, problem=build_problem(replays, search.problem.nuisance), rate=rate,
+    return replace(search, problem=build_problem(replays), rate=rate,
                    columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
                    scanned_causes=search.scanned_causes & frozenset(causes),
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
@@ -500,10 +500,21 @@ def complexity_penalty(cause: Candidate) -> float:
 
 
 def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
-    """Return the evidence for one of the causes given the others."""
+    """
+    Return the evidence for one of the causes given the others.
+
+    Of two distortions of the rate, such as a delay and a lag, one may stand in for the other:
+    without one, the shape of the other is refined.
+
+    """
     fit = fit_causes(search.problem, causes)
-    return (fit.log_likelihood - likelihood_without(fit, cause_index)
-            - complexity_penalty(causes[cause_index]))
+    rest = (*causes[:cause_index], *causes[cause_index + 1:])
+    without = likelihood_without(fit, cause_index)
+    if is_rate_distortion(causes[cause_index].cause) and any(
+            is_rate_distortion(each.cause) for each in rest):
+        without = max(without, fit_causes(
+            search.problem, refine_jointly(search, rest)).log_likelihood)
+    return fit.log_likelihood - without - complexity_penalty(causes[cause_index])
 
 
 def eliminate_backward(search: Search, causes: Causes) -> Causes:

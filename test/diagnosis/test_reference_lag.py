@@ -10,6 +10,7 @@
 
 """What a motion does beside its commanded rate is not named as an effect of the gyro."""
 
+from chance import seeds
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.reference_noise import rate_noise_share
 from gyro_calibration.diagnosis.pipeline import diagnose
@@ -50,10 +51,15 @@ def followed(command, delay, frequency, damping):
     return np.array(rates)
 
 
-def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0):
-    """Return a log of a robot with its command as the reference rate."""
+def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0, period=0.0, jitter=0.0):
+    """Return a log of a robot with its command, which may be held, as the reference rate."""
     generator = np.random.default_rng(seed)
     command = commanded(kind, generator)
+    if period:
+        every = round(period / INTERVAL * SUBSTEPS)
+        sent = np.arange(0, len(command), every)
+        sent[1:] += np.rint(jitter * every * generator.standard_normal(len(sent) - 1)).astype(int)
+        command = command[np.repeat(sent, np.diff(sent, append=len(command)))]
     rate = followed(command, 0.08, 8.0, 0.7)[::SUBSTEPS]
     time = np.arange(COUNT) * INTERVAL
     output = ((1.0 + SCALE) * rate + BIAS + added(rate, time)
@@ -84,6 +90,22 @@ def test_an_effect_of_the_gyro_is_found_beside_the_lag(kind, effect, added):
     found = diagnose([commanded_log(kind, 2e-4, 2, added)], np.random.default_rng(0))
     assert {each.effect for each in found.findings if each.status == 'established'} == {
         'reference_lag', effect}
+
+
+@pytest.mark.parametrize('asymmetry', [0.0, 0.02])
+@pytest.mark.parametrize('kind, jitter', [('steps', 0.0), ('steps', 0.1), ('trapezoids', 0.0),
+                                          ('trapezoids', 0.1), ('swing', 0.0)])
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_command_at_5_hz_shows_the_gyro_and_the_lag_alone(kind, jitter, asymmetry, seed):
+    log = commanded_log(kind, 1e-4, 40 + seed, lambda rate, time: asymmetry * np.abs(rate), 0.2,
+                        jitter)
+    found = diagnose([log], np.random.default_rng(0))
+    assert {each.effect for each in found.findings if each.status == 'established'} == {
+        'reference_lag', *['scale_factor_asymmetry'] * bool(asymmetry)}
+    assert not found.unexplained
+    values = {term.effect.name: term.values[0] for term in found.model.terms}
+    assert values['scale_factor_error'] == pytest.approx(SCALE, abs=2e-3)
+    assert values['bias'] == pytest.approx(BIAS, abs=0.03 * DEGREE)
 
 
 def test_a_command_that_is_held_between_updates_has_no_noise():
