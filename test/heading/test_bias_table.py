@@ -13,7 +13,7 @@
 from dataclasses import replace
 import math
 
-from bias_history import (
+from bias_table import (
     answers,
     CALIBRATION,
     carried_answers,
