@@ -27,7 +27,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
-from robot import now, Robot, RosRobot
+from rig import now, Robot, RosRobot
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray
