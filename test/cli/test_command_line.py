@@ -68,30 +68,49 @@ def test_a_verb_follows_the_technology_or_says_why_not(run, verb):
         assert code == 2 and ('give one of the two' if follows else 'reads it from') in error
 
 
-@pytest.mark.parametrize('words, said', [
-    *((words, f'perhaps {near} is meant') for words, near in (
-        ('compnsate log.csv', 'compensate'), ('allan log.csv --unwarp', '--unwrap'),
-        ('fit log.csv --technology mem', 'mems'), ('fit log.csv --effects bais', 'bias'),
-        ('allan log.csv --columns tim=t', 'time'),
-        ('allan log.csv --columns gyro=w:deg/sec', 'deg/s'),
-        ('allan log.csv --columns gyro=gyro_dsp', 'gyro_dps'),
-        ('compensate log.csv --model model.yaml --out out.csv', 'bias'),
-        ('simulate --model noise.yaml --motion robt --out out.csv', 'robot'),
-        ('emulate --protocol kvh_dsp300 --model noise.yaml', 'kvh_dsp3000'),
-        ('plan --limits limits.yaml', 'maximum_rate_dps'))),
-    ('diagnose log.csv --seed x', "'x' is no number"),
-    ('allan log.csv --rate 0', 'give a number above 0'),
-    ('diagnose log.csv --out log.csv', 'log.csv: is a file, but must be a folder'),
-    ('fleet log.csv --out log.csv', 'log.csv: is a file, but must be a folder')])
-def test_a_wrong_name_or_value_is_answered_in_one_line_with_what_is_right(
+#: A command line, and what its answer says; an unset variable of the shell is an empty argument.
+WRONG = {
+    **{words: f'perhaps {near} is meant' for words, near in {
+        'compnsate log.csv': 'compensate', 'allan log.csv --unwarp': '--unwrap',
+        'fit log.csv --technology mem': 'mems', 'fit log.csv --effects bais': 'bias',
+        'allan log.csv --columns tim=t': 'time', 'allan log.csv --columns gyro=w:deg/sec': 'deg/s',
+        'allan log.csv --columns gyro=gyro_dsp': 'gyro_dps',
+        'compensate log.csv --model bais.yaml --out x.csv': 'bias',
+        'simulate --model model.yaml --motion robt --out x.csv': 'robot',
+        'emulate --protocol kvh_dsp300 --model model.yaml': 'kvh_dsp3000',
+        'plan --limits limits.yaml': 'maximum_rate_dps'}.items()},
+    'diagnose log.csv --seed x': "'x' is no number", 'allan log.csv --rate 0': 'a number above 0',
+    'diagnose log.csv --out log.csv': 'log.csv: is a file, but must be a folder',
+    'fleet log.csv --out log.csv': 'log.csv: is a file, but must be a folder',
+    'compensate missing.csv --model model.yaml --out x.csv': 'missing.csv: cannot be read',
+    'compensate log.csv --model missing.yaml --out x.csv': 'missing.yaml: there is no such file',
+    'compensate log.csv --model model.yaml --out ""': 'is empty; give a value or omit it',
+    'fit ""': 'is empty; give a value or omit it',
+    'emulate --protocol morse --model model.yaml': "protocol 'morse' is not known",
+    'emulate --protocol fizoptika --model model.yaml': 'sensitivity is not set',
+    'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
+    'reproduce newton': 'hong_park',
+    'simulate --model model.yaml --motion waltz --out x.csv': 'waltz: there is no such motion',
+    'compensate log.csv --model model.yaml --out x.csv --threshold -1': 'a number of 0 or more',
+    **{f'simulate --model model.yaml --motion rest --out x.csv {option}': said
+       for option, said in {
+           '--sample-rate 1e-300': '', '--sample-rate 1e300': '', '--sample-rate 1e9': '',
+           '--temperature nan': '', '--temperature 1e9': '',
+           '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
+
+
+@pytest.mark.parametrize('words, said', WRONG.items(), ids=WRONG)
+def test_wrong_use_is_answered_in_one_line_with_what_is_right_and_writes_nothing(
         run, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,w\n0,1,1\n1,2,2\n')
-    (tmp_path / 'model.yaml').write_text('effects: {bais: {bias: 0.1}}')
-    (tmp_path / 'noise.yaml').write_text(NOISY_GYRO)
-    (tmp_path / 'limits.yaml').write_text('maximum_rat_dps: 1')
-    code, text, error = run(*words.split())
-    assert (code, text, error.count('\n')) == (2, '', 1) and said in error
+    for name, text in {'log.csv': 'time_s,gyro_dps,w\n0,1,1\n1,2,2\n', 'model.yaml': NOISY_GYRO,
+                       'bais.yaml': 'effects: {bais: {bias: 0.1}}',
+                       'limits.yaml': 'maximum_rat_dps: 1'}.items():
+        (tmp_path / name).write_text(text)
+    before = os.listdir()
+    code, text, error = run(*shlex.split(words))
+    assert (code, text, error.count('\n')) == (2, '', 1) and said in error, error
+    assert os.listdir() == before
 
 
 def test_simulate_then_compensate_gives_the_true_heading_back(compensate, model, log):
@@ -177,35 +196,6 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
                             '--model', tmp_path / 'model.yaml', '--json', *words)
     assert code == 0, error
     assert abs(json.loads(text)['bias']) < 1e-5
-
-
-#: An unset variable of the shell leaves an empty argument.
-EMPTY = 'is empty; give a value or omit it'
-WRONG = {
-    'compensate missing.csv --model MODEL --out x.csv': 'missing.csv: cannot be read',
-    'compensate LOG --model missing.yaml --out x.csv': 'missing.yaml: there is no such file',
-    'compensate LOG --model MODEL --out ""': EMPTY, 'fit ""': EMPTY,
-    'emulate --protocol morse --model MODEL': "protocol 'morse' is not known",
-    'emulate --protocol fizoptika --model MODEL': 'sensitivity is not set',
-    'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
-    'reproduce newton': 'hong_park',
-    'simulate --model MODEL --motion waltz --out x.csv': 'waltz: there is no such motion',
-    'compensate LOG --model MODEL --out x.csv --threshold -1': 'give a number of 0 or more',
-    **{f'simulate --model MODEL --motion rest --out x.csv {option}': said for option, said in {
-        '--sample-rate 1e-300': '', '--sample-rate 1e300': '', '--sample-rate 1e9': '',
-        '--temperature nan': '', '--temperature 1e9': '',
-        '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
-
-
-@pytest.mark.parametrize('words, said', WRONG.items(), ids=WRONG)
-def test_wrong_use_ends_with_2_says_why_and_writes_nothing(
-        run, model, log, tmp_path, monkeypatch, words, said):
-    monkeypatch.chdir(tmp_path)
-    before = os.listdir()
-    code, text, error = run(*[{'MODEL': model, 'LOG': log}.get(word, word)
-                              for word in shlex.split(words)])
-    assert code == 2 and not text and said in error and 'Traceback' not in error
-    assert os.listdir() == before and (said != EMPTY or error.count('\n') == 1)
 
 
 def test_a_log_of_counts_wants_its_sensitivity(compensate, model):
@@ -295,19 +285,6 @@ def test_a_method_that_gives_no_standard_deviation_claims_none(run, compensate, 
     assert code == 0 and '+-' not in text
     assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
     assert np.isnan(compensate(log, tmp_path / 'new.yaml').columns['heading_std_rad'][-1])
-
-
-def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run, log, tmp_path):
-    lines = log.read_text().splitlines()
-    header = next(line for line in lines if not line.startswith('#')).split(',')
-    rows = [line.split(',') for line in lines if not line.startswith('#')][1:]
-    for row in rows[:300]:
-        for name in ('reference_heading_rad', 'reference_rate_rad_s'):
-            row[header.index(name)] = 'nan'
-    (tmp_path / 'lost.csv').write_text('\n'.join(','.join(row) for row in [header, *rows]) + '\n')
-    answer = json.loads(run('self-calibrate', tmp_path / 'lost.csv', '--json')[1])
-    assert (answer['scale_factor_error'] == pytest.approx(-0.1, abs=1e-6)
-            and abs(answer['time_offset_s']) < 1e-3)
 
 
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):

@@ -117,6 +117,20 @@ def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_be
             and live.age(later) == pytest.approx(300.0 * 86400.0))
 
 
+@pytest.mark.parametrize('ahead, known', [(-7200.0, True), (60.0, True), (3e7, False)])
+def test_a_calibration_from_the_future_has_no_known_age_until_the_clock_is_set(ahead, known):
+    date = datetime.fromtimestamp(NOW + ahead, timezone.utc).isoformat()
+    live = begun(replace(MODEL, self_calibration=replace(CALIBRATED, time=date)))
+    live.add(0.0, 0.1 * DEGREE, NOW)
+    assert (live.age(NOW) == max(-ahead, 0.0)) == known == (
+        'later than the clock' not in live.calibration_message)
+    assert known or live.bias_variance > 100.0 * CALIBRATED.standard_deviations[1] ** 2
+    live.shift_clock(ahead + 60.0)
+    live.add(0.01, 0.1 * DEGREE, NOW + ahead + 60.0)
+    assert 'later than the clock' not in live.calibration_message
+    assert live.age(NOW + ahead + 60.0) == pytest.approx(60.0)
+
+
 def test_the_variance_grows_with_the_distance_of_the_temperature_and_a_rest_takes_that_back():
     coefficient = 0.03 * DEGREE
     gyro = Gyro(begun(), coefficient=coefficient).go(30.0).go(20.0, 0.3, (25.0, 35.0))
