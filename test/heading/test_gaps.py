@@ -25,7 +25,7 @@ from gyro_calibration.heading.integration import (
     Intervals,
 )
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
@@ -84,25 +84,6 @@ def test_lost_samples_are_counted_where_stamps_are_even_or_jitter(interval, jitt
     assert (intervals.lost_samples == (~comes).sum()
             and intervals.usual_interval == pytest.approx(interval, rel=0.05 + jitter))
     assert intervals.longest_gap == pytest.approx(np.diff(stamps).max())
-
-
-def test_samples_that_come_late_or_in_bursts_are_not_lost():
-    late = np.arange(0.0, 10.0, 0.01)
-    late[500:510] = late[509] - np.arange(9, -1, -1) * 2e-4
-    bursts = (np.ceil(np.arange(0.0, 10.0, 0.001) / 0.016 + 1e-9) * 0.016
-              + np.arange(10000) % 16 * 1e-5)
-    for stamps in (late, bursts):
-        intervals = Intervals()
-        for step in np.diff(stamps).tolist():
-            intervals.add(step)
-        assert intervals.lost_samples == 0
-
-
-def test_a_gyro_that_is_set_to_another_rate_loses_samples_for_a_while_only():
-    intervals = Intervals()
-    lost = [intervals.add(step) for step in [0.01] * 500 + [0.02] * 1000]
-    assert (sum(lost[:500]) == 0 < sum(lost) and not any(lost[-800:])
-            and intervals.usual_interval == 0.02)
 
 
 # what they leave unknown
@@ -178,21 +159,6 @@ def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap
     assert (tracker.intervals.lost_samples == losses * lost
             and tracker.intervals.longest_gap == pytest.approx(gap + INTERVAL))
     assert tracker.intervals.usual_interval == pytest.approx(INTERVAL)
-
-
-def test_a_correction_waits_for_motion_also_with_other_settings():
-    tracker = HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings())
-    still = np.array([0.0, -1.0])
-    generator, headings = np.random.default_rng(4), []
-    outputs = np.concatenate([np.full(1000, 0.1), np.zeros(3000)]) + 0.3 * DEGREE
-    outputs += simulate_noise(WHITE, len(outputs), INTERVAL, generator)
-    for index, output in enumerate(outputs.tolist()):
-        if index == 3000:
-            tracker.configure(Settings(maximum_gap=0.9))
-        tracker.add(INTERVAL * index, output, np.array([-output, -1.0]), None, still)
-        headings.append(tracker.heading)
-    assert tracker.is_resting and math.sqrt(tracker.variance) > 1.0 * DEGREE
-    assert np.ptp(headings[2900:]) == 0.0
 
 
 @pytest.mark.parametrize('option', [(), ('--rest',)])

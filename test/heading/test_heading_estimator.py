@@ -200,13 +200,6 @@ def test_a_gyro_that_was_without_power_may_have_another_bias():
             and abs(gyro.error) < 3.0 * gyro.deviation)
 
 
-def test_a_rest_corrects_an_old_calibration_and_ends_the_remark():
-    gyro = Gyro(begun(now=NOW + 1e7), now=NOW + 1e7)
-    gyro.go(INTERVAL)
-    assert gyro.live.calibration_message
-    assert not gyro.go(20.0).live.calibration_message
-
-
 def test_a_calibrated_model_takes_the_bias_of_earlier_runs():
     model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE)
     table = BiasTable(model, entries=[Entry(25.0, 0.003, 1e-10, NOW - 100.0, 0)])
@@ -279,20 +272,6 @@ def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
             and describe_change(CALIBRATED, warm, NOISE, 300.0))
     assert (bool(describe_change(live.current_calibration, replace(warm, bias=0.1 * DEGREE), NOISE,
                                  300.0)) == known)
-
-
-def test_a_model_without_a_calibration_claims_no_scale():
-    live = begun(GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE))
-    live.add(0.1, 0.0, NOW)
-    assert (live.current_calibration.covariance == ((math.inf, 0.0), (0.0, pytest.approx(1e-8)))
-            and live.current_calibration.bias == 0.0)
-
-
-def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
-    gyro = Gyro(begun()).go(12.0)
-    assert not gyro.live.table.entries
-    gyro.live.update_table(gyro.now + gyro.time, ending=True)
-    assert len(gyro.live.table.entries) == 1
 
 
 def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():

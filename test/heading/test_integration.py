@@ -20,7 +20,7 @@ from gyro_calibration.heading.integration import (
     ThresholdFilter,
 )
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import (
     compensate,
     rate_sensitivity,
@@ -49,12 +49,6 @@ def filtered_singly(settings, time, rate):
     return np.array([threshold.apply(*sample) for sample in zip(time.tolist(), rate.tolist())])
 
 
-def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
-    time = np.concatenate([[0.0], np.cumsum(np.random.default_rng(0).uniform(0.001, 0.1, 500))])
-    heading = integrate(time, 0.3 - 0.02 * time)
-    assert heading == pytest.approx(0.3 * time - 0.01 * time ** 2, abs=1e-12)
-
-
 SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(),
             'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
             'long': Threshold(1.0 * DEGREE, 1.0), 'off': Threshold(0.0)}
@@ -78,22 +72,6 @@ def test_a_log_in_blocks_or_samples_is_filtered_and_integrated_as_in_one_piece(s
         assert np.array_equal(filtered, other)
     assert np.array_equal(heading, whole[1]) and np.array_equal(heading, integrate(time, filtered))
     assert deviation == pytest.approx(whole[2], rel=1e-12)
-
-
-def test_a_log_longer_than_the_cache_is_integrated_by_the_trapezoid_rule():
-    generator, count = np.random.default_rng(0), 2 * CACHE_BLOCK_SAMPLES + 5
-    time, rate = np.cumsum(generator.uniform(0.001, 0.1, count)), generator.normal(size=count)
-    steps = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
-    assert np.array_equal(integrate(time, rate, 0.25), np.cumsum([0.25, *steps]))
-
-
-def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_little():
-    """0.3 deg/s is 0.72 sigma of a 100 Hz sample (47 % beyond), 3.2 of a mean of 20 (0.13 %)."""
-    time = np.arange(20001) * INTERVAL
-    rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    passed = {window: (filter_rates(Threshold(window=window), time, rate) != 0.0).mean()
-              for window in (0.0, 0.2)}
-    assert passed[0.0] == pytest.approx(0.472, abs=0.02) and passed[0.2] < 0.01
 
 
 def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():

@@ -92,16 +92,6 @@ def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_block
     assert in_blocks(model, log, size)[0] == pytest.approx(log.reference_rate, abs=1e-6)
 
 
-def test_before_its_first_value_a_reference_heading_is_that_value():
-    model = model_of(HEADING)
-    log = drive(model, lambda time: 0.0 * time)
-    heading = np.full(len(TIME), 1.5)
-    output = simulate_gyro_output(model, TIME, channels_from_log(
-        replace(log, reference_heading=heading)).with_rate(log.reference_rate, log.reference_rate))
-    late = replace(log, output=output, reference_heading=np.where(TIME < 5.0, np.nan, heading))
-    assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
-
-
 def test_rows_without_output_are_left_out(tmp_path, compensate):
     model = model_of(VALUES | HEADING)
     log = drive(model)

@@ -20,7 +20,6 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     smooth_states,
 )
-from gyro_calibration.heading.stationary import RestScatter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
@@ -267,14 +266,6 @@ def test_false_alarms_are_as_rare_as_stated():
     assert 0 < alarms <= poisson.isf(RARE, 20.0), alarms
 
 
-def test_noise_that_is_twice_what_the_model_claims_is_learned():
-    motion = constant_rate_motion([(40, 0), (4, 45), (30, 0), (4, -45), (30, 0)])
-    time, true, _, rate = gyro(motion, np.random.default_rng(8),
-                               Noise(2.0 * XV3500.angle_random_walk))
-    found = follow(time, rate)
-    assert found.resting[(true == 0.0) & (time > 20.0)].mean() > 0.9
-
-
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
 def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, later):
@@ -294,26 +285,6 @@ def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, la
     assert headings == pytest.approx([headings[0]] * 3, abs=0.5 * DEGREE), (
         'off by 30 degrees if what rests taught is taken for a turn')
     assert math.sqrt(variances[1] - variances[0]) == pytest.approx(0.05 * 600.0 * DEGREE, rel=0.01)
-
-
-def test_the_first_rate_after_a_gap_or_a_jump_back_is_corrected_by_the_bias_estimate():
-    tracker = HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings())
-    generator = np.random.default_rng(12)
-    for index, true in enumerate([0.0] * 1200 + [0.2] * 200):
-        rate = (true + 0.3 * DEGREE
-                + XV3500.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL))
-        tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]), None, np.array([0.0, -1.0]))
-    for time in (200.0, 20.0):
-        rate = 0.2 + 0.3 * DEGREE
-        assert tracker.add(time, rate, np.array([-rate, -1.0]), None, np.array([0.0, -1.0]))
-        assert tracker.rate == pytest.approx(0.2, abs=0.05 * DEGREE)
-
-
-def test_a_mean_that_no_possible_scatter_explains_leaves_probabilities():
-    scatter = RestScatter()
-    scatter.begin_rest(0.0)
-    found = scatter.probabilities(np.where(scatter.counts > 0.0, -1e6, 0.0))
-    np.testing.assert_allclose(found, scatter.counts / scatter.counts.sum())
 
 
 @pytest.mark.parametrize('change', [0.001, 0.01, 0.02])
@@ -347,12 +318,6 @@ def test_hindsight_does_not_reach_over_a_gap():
     assert later.variance[time < 20.0].max() < 1e-3 * later.variance[time > 20.0].min()
 
 
-def test_a_rest_is_found_where_samples_come_in_bursts():
-    generator, index = np.random.default_rng(10), np.arange(6000)
-    rate = 10.0 * XV3500.angle_random_walk * generator.standard_normal(len(index))
-    assert follow(index // 10 * 0.1 + index % 10 * 2e-4, rate).resting.mean() > 0.95
-
-
 def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
     tracker, doubtful = HeadingTracker(XV3500, KNOWN, Settings()), []
     for index, rate in enumerate([10.0 * DEGREE] * 200 + [0.0] * 1200 + [0.055 * DEGREE] * 8000):
@@ -363,17 +328,6 @@ def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
                 tracker.reset()
     assert len(doubtful) > 200 and tracker.is_resting
     assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(0.0, abs=1.0 * DEGREE)
-
-
-def test_another_calibration_and_a_reset_do_not_make_the_heading_jump():
-    tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    for index in range(100):
-        tracker.add(0.05 * index, 0.5, np.array([-0.5, -1.0]))
-    before, variance = tracker.heading, tracker.variance
-    tracker.use_calibration(XV3500, np.diag([1e-6, 1e-9]))
-    assert tracker.heading == before and tracker.variance == pytest.approx(variance)
-    tracker.reset()
-    assert tracker.heading == 0.0 and tracker.variance == 0.0
 
 
 def test_another_calibration_at_rest_keeps_the_correction_that_waits_for_motion():

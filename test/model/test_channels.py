@@ -96,15 +96,6 @@ def test_blocks_of_a_log_say_what_the_whole_says(cuts):
     assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
-def test_a_lag_goes_on_in_blocks_that_do_not_use_it():
-    history, (temperature, *_) = ChannelHistory(), surroundings(UNEVEN)
-    history.update(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
-    history.update(UNEVEN[10:2000], temperature[10:2000])
-    last = history.update(UNEVEN[2000:], temperature[2000:]).lagged('temperature', 20.0)
-    assert last == pytest.approx(
-        ChannelHistory().update(UNEVEN, temperature).lagged('temperature', 20.0)[2000:], rel=1e-12)
-
-
 def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
     history = ChannelHistory(default_temperature=33.0)
     early = history.update(0.0)
@@ -120,12 +111,6 @@ def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
     assert (channels.supply is None and not channels.time.any()
             and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN))
     assert set(lagged(UNEVEN, np.full(len(UNEVEN), 31.7), 50.0)) == {31.7}
-
-
-def test_beyond_its_bounds_the_nearest_temperature_is_followed():
-    history = ChannelHistory(min_temperature=20.0, max_temperature=30.0)
-    assert history.update(0.0, 5.0).lagged('temperature', 10.0) == 20.0
-    assert history.update(1.0, 10.0).lagged('temperature', 10.0) == 20.0
 
 
 def test_a_lag_of_a_log_loops_over_no_samples():

@@ -23,9 +23,7 @@ from gyro_calibration.model.compensation import (
 from gyro_calibration.model.effects import (
     BIAS,
     CATALOGUE,
-    Channels,
     polynomial_from_matrix,
-    rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
 )
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
@@ -82,17 +80,6 @@ def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces(calibration, g
             of_whole = np.broadcast_to(getattr(whole, name), count)[first:end]
             assert np.array_equal(of_whole,
                                   np.broadcast_to(getattr(piece, name), end - first)), name
-
-
-@pytest.mark.parametrize('orders', [(0, 0), (0, 2), (1, 0), (1, 1), (3, 2), (5, 3)])
-def test_the_shorter_way_to_a_polynomial_is_the_sum_of_its_columns(orders):
-    effect, generator = rate_temperature_polynomial(*orders), np.random.default_rng(0)
-    shapes, coefficients = (0.1, 1.7, 35.0, 10.0), generator.normal(size=len(effect.coefficients))
-    channels = Channels(np.zeros(50), generator.uniform(-2.0, 2.0, 50),
-                        generator.uniform(10.0, 50.0, 50))
-    error = effect.error_function((*shapes, *coefficients.tolist()))(channels)
-    assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)),
-                                  rel=1e-12, abs=1e-13)
 
 
 UNCERTAIN = {
