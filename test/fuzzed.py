@@ -47,11 +47,7 @@ from gyro_calibration.driver.protocols import (
 from gyro_calibration.driver.protocols.protocol import LineSplitter
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.files import InputError, MAX_MAGNITUDE
-from gyro_calibration.heading.bias_table import (
-    BiasTable,
-    read_bias_table,
-    write_bias_table,
-)
+from gyro_calibration.heading.bias_table import BiasTable, read_bias_table, write_bias_table
 from gyro_calibration.logs.cdr import IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.logs.log import (
     Log,

@@ -17,10 +17,7 @@ import math
 from pathlib import Path
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration_reproduction import bot_thoughts, hong_park, SOURCES
-from gyro_calibration_reproduction import ojeda_chung_borenstein as ojeda
 from gyro_calibration_reproduction.finding import Comparison, render_page
 import numpy as np
 import pytest
@@ -154,21 +151,6 @@ def test_eq_10_as_printed_puts_several_powers_into_one_column():
     assert (found['right'], found['cubic'], found['cubic_right']) == (12, 13, 16)
 
 
-def test_the_error_before_is_that_of_scale_and_sine():
-    gyro, speeds = ojeda.rd2100(), np.arange(5, 101, 5) * DEGREE
-    rates, temperatures = (axis.ravel() for axis in np.meshgrid(
-        np.concatenate([-speeds, speeds]), np.arange(25.0, 46.0, 2.0)))
-    scale = 1 + 0.02 / 115 * (temperatures - 25)
-    error = np.sin(0.1 * rates) / 0.1 + (scale - 1) * rates - rates
-    np.testing.assert_allclose(gyro.output(rates, temperatures)
-                               - gyro.output(0.0 * rates, temperatures) - rates, error, atol=1e-12)
-    assert ours('ojeda', 'rms error of the rate, static bias only').ours == pytest.approx(
-        np.sqrt(np.mean(error ** 2)) / DEGREE, rel=0.01)
-    turn = np.abs(error / rates).max() * 100
-    assert (ours('ojeda', 'largest error of a full turn, static bias only').ours
-            == pytest.approx(turn, rel=0.05))
-
-
 # Hong and Park
 
 def by_hand(motion, shift=0):
@@ -189,36 +171,6 @@ def test_the_rectangle_rule_has_the_errors_of_figure_6():
     assert found['trapezoid'] < 1e-6 and found['late_s'] > 0 > found['s']
     assert by_hand(hong_park.one_turn(3.0, 4.25)) == pytest.approx((-4.70, -20.61), abs=0.005), (
         'a motion in round numbers is near')
-
-
-@pytest.mark.evidence
-def test_calibration_and_filter_take_off_the_heading_error_what_the_page_on_results_says():
-    text = (Path(__file__).parents[1] / 'docs/explanation/scope.md').read_text()
-    for row, name in (
-            ('self-calibration', 'self-calibration by likelihood'),
-            ('threshold filter, single samples, as published', 'threshold filter, single samples'),
-            ('threshold filter, mean of 0.2 s', 'threshold filter, mean of 0.2 s'),
-            ('both, single samples, as published', 'likelihood and filter, single samples'),
-            ('both, mean of 0.2 s', 'likelihood and filter, mean of 0.2 s')):
-        found = ours('hong_park', f'off pure integration, {name}', MANY)
-        assert f'| {row} | {found.ours:.0f} % |' in text
-
-
-@pytest.mark.parametrize('runs, error',
-                         [(FEW, 0.4), pytest.param(MANY, 0.15, marks=pytest.mark.evidence)])
-def test_eq_7_is_as_far_from_the_bound_as_its_covariance_says(runs, error):
-    """Of a standard deviation, four standard errors of few runs, three of many."""
-    time = np.arange(2001) / 100
-    rate = CALIBRATION_MOTION.rate_at(time)
-    columns, bound = (np.column_stack([CALIBRATION_MOTION.heading_at(time), time]),
-                      np.column_stack([rate, np.ones(2001)]))
-    # a sum of white noise at the times t and u has the covariance min(t, u)
-    estimator = np.linalg.inv(columns.T @ columns) @ columns.T
-    covariance = estimator @ np.minimum.outer(time, time) @ estimator.T
-    ratio = np.sqrt(np.diag(covariance) / np.diag(np.linalg.inv(bound.T @ bound) * 100))
-    found = numbers('hong_park', 'Cramer-Rao', runs)
-    assert (found['s'], found['b']) == pytest.approx(tuple(ratio), rel=error)
-    assert max(found['likely_s'], found['likely_b']) < 1.0 + error
 
 
 # Bot Thoughts

@@ -28,7 +28,6 @@ from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, Channels, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import HealthMonitor
 import numpy as np
 import pytest
 
@@ -186,20 +185,3 @@ def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk)
                  for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
         assert found[index] == alone[-1]
     assert filter_rates(settings, time, rate).tolist() == found
-
-
-@tries(40)
-@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, FINITE),
-                           max_size=300))
-def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
-    check, time = HealthMonitor(NOISE, 1e-3), 0.0
-    for step, output, rate in samples:
-        time = time + step if math.isfinite(time + step) else step
-        if check.add(time, output, rate):
-            check.examine_stretch(1e-8, 0.0)
-    check.restart()
-    complete = []
-    rest_for_a_minute(lambda at, rate: complete.append(check.examine_stretch(1e-8, 0.0))
-                      if check.add(at, rate, rate) else None, 0.0)
-    assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio)
-                                      and rest.is_noise_normal for rest in complete)

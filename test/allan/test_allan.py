@@ -166,13 +166,6 @@ def test_a_filter_of_the_output_does_not_bias_the_angle_random_walk(numerator, d
     assert false <= most(10, 0.05)
 
 
-def test_a_line_that_the_gyro_picks_up_does_not_bias_the_angle_random_walk():
-    line = 0.01 * np.sin(2.0 * math.pi * 31.4 * stamps(100_000))
-    fit = fit_noise(
-        simulate_noise(WHITE, 100_000, INTERVAL, np.random.default_rng(8)) + line, INTERVAL)
-    assert fit.figures['N'].value == pytest.approx(1e-3, rel=0.05)
-
-
 def test_a_record_that_is_too_short_for_the_floor_says_so_and_bounds_the_bias_instability():
     generator = np.random.default_rng(9)
     short, long = (fit_noise(simulate_noise(Noise(1e-3, 3e-4), count, INTERVAL, generator),
@@ -204,31 +197,6 @@ def test_lost_samples_are_counted_and_do_not_change_the_figures():
     times = [0.01, 0.1, 1.0, 10.0, 50.0]
     np.testing.assert_allclose(*(allan_deviation(each, INTERVAL, times).deviation
                                  for each in (record.rate, rate)), rtol=0.05)
-
-
-@pytest.mark.parametrize('share, jitter', [(0.02, 0.1), (0.1, 0.0), (0.19, 0.1)])
-def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
-    generator = np.random.default_rng(int(1000 * share))
-    rate = simulate_noise(WHITE, 60_000, INTERVAL, generator)
-    kept = generator.random(60_000) > share
-    kept[[0, -1]] = True
-    record = build_rest_record(
-        (stamps(60_000) + jitter * INTERVAL * generator.standard_normal(60_000))[kept], rate[kept])
-    assert (record.interval == pytest.approx(INTERVAL, rel=1e-4)
-            and np.isnan(record.rate).sum() == pytest.approx((~kept).sum(), abs=3))
-    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(
-        1e-3, rel=0.015)
-
-
-def test_two_records_hours_apart_are_not_taken_for_one():
-    rate = (simulate_noise(WHITE, 40_000, INTERVAL, np.random.default_rng(11))
-            + np.where(np.arange(40_000) < 20_000, 0.0, 0.1))
-    record = build_rest_record(
-        stamps(40_000) + np.where(np.arange(40_000) < 20_000, 0.0, 1e7), rate)
-    assert len(record.rate) < 50_000
-    # as one record they would be refused as moved
-    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(
-        1e-3, rel=0.05)
 
 
 def test_every_averaging_time_of_a_chart_has_an_upper_bound_however_few_windows_fit_between_gaps():

@@ -67,17 +67,6 @@ def test_bounds_of_the_angle_random_walk_hold_it_and_are_written_beside_a_fine_r
     assert not calibrate_encoder(CLEAN).model.noise_bounds, 'its steps hide white noise'
 
 
-def test_a_wobble_that_repeats_itself_is_no_angle_random_walk():
-    """A wobble of 0.5 deg with a period of 2.5 s."""
-    true = 5e-4
-    log = log_of(SWING, 200.0, Noise(angle_random_walk=true), np.random.default_rng(62), step=1e-5)
-    wobble = 0.5 * DEGREE * 0.8 * np.pi * np.cos(0.8 * np.pi * log.time)
-    model = calibrate_encoder(replace(log, output=log.output + wobble)).model
-    assert 0.7 * true < model.noise.angle_random_walk < 2.0 * true
-    low, high = model.noise_bounds['angle_random_walk']
-    assert low < true < high
-
-
 def test_the_model_holds_what_was_found():
     found = calibrate_encoder(
         replace(CLEAN, temperature=np.linspace(20.0, 30.0, len(CLEAN))))
@@ -243,14 +232,6 @@ def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
     assert (scatter < 2.0 * stated).all() and scatter[1] > stated[1] / 3.0, (scatter, stated)
 
 
-def test_the_scale_of_one_gyro_is_the_same_in_a_slow_and_a_fast_swing(data):
-    """Measured: 0.597 and 0.686 %, 2.5 standard deviations apart."""
-    slow, fast = (calibrate_encoder(measured(data, name)).fit for name in ('yaw_slow', 'yaw_fast'))
-    deviation = np.sqrt(slow.covariance[0, 0] + fast.covariance[0, 0])
-    assert abs(fast.scale_factor_error - slow.scale_factor_error) < 3.0 * deviation
-    assert deviation < 0.001
-
-
 def shaken(bias, generator):
     """
     Return 20 s of a fast swing whose heading is off by 3 deg again and again.
@@ -277,17 +258,3 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
             errors.append(bias)
             refused += 1
     assert refused >= 10 and np.sqrt(np.mean(np.square(errors))) < 0.1 * DEGREE
-
-
-def test_noise_of_the_gyro_in_a_swing_of_one_frequency_is_no_lag():
-    """Delay, lag and scale factor error have the same shape there, and a prior alone limits it."""
-    time, errors = np.arange(9000) / 100.0, []
-    rate = 60.0 * np.sin(2.0 * np.pi * 0.8 * time)
-    heading = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]))) / 100.0
-    for seed in range(4):
-        generator = np.random.default_rng([8, seed])
-        log = Log(time=time, output=(1.02 * rate + 0.1 * generator.standard_normal(9000)) * DEGREE,
-                  reference_heading=(heading + 0.002 * generator.standard_normal(9000)) * DEGREE)
-        fit = calibrate_encoder(log, 'likelihood').fit
-        errors.append((fit.scale_factor_error - 0.02) / np.sqrt(fit.covariance[0, 0]))
-    assert np.sqrt(np.mean(np.square(errors))) < 3.0

@@ -15,12 +15,7 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
-from gyro_calibration.calibration.scatter import (
-    cross_validation_parts,
-    estimate_scatter,
-    find_inliers,
-    Scatter,
-)
+from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS,
@@ -49,10 +44,6 @@ def dwells(rate, error, temperature=None, deviation=None, sweep=None):
     return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan) if deviation is None
                   else deviation, np.zeros(len(rate), int) if sweep is None else sweep,
                   tuple(f'row {row + 1}' for row in range(len(rate))))
-
-
-def alike(table, size=1.0):
-    return Scatter(size, 0.0, 0.0, 0.0, np.ones(len(table), bool))
 
 
 def measured(terms=LINEAR, seed=1, **table):
@@ -121,22 +112,6 @@ def test_the_shape_of_a_sine_is_found_wherever_it_is(k):
     assert fit.terms[2].values[0] == pytest.approx(k, rel=1e-3)
 
 
-def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_scatter_alike():
-    table = measured(CUBIC, sweeps=3)
-    table = replace(table, sweep=np.zeros(len(table), int))
-    fit = fit_effects(table, [term.effect for term in CUBIC], alike(table))
-    columns = np.column_stack(
-        [column for term in fit.terms for column in term.columns(channels_of(table))])
-    error, freedom = table.output - table.rate, len(table) - len(CUBIC)
-    values, (misfit,), *_ = np.linalg.lstsq(columns, error, rcond=None)
-    widened = student.ppf(0.975, freedom) / 1.96
-    np.testing.assert_allclose([term.values[-1] for term in fit.terms], values, rtol=1e-9)
-    covariance = np.linalg.inv(columns.T @ columns) * misfit / freedom * widened ** 2
-    sizes = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(fit.model.covariance / np.outer(sizes, sizes),
-                               covariance / np.outer(sizes, sizes), atol=1e-5)
-
-
 # few dwells
 
 @pytest.mark.parametrize('runs', [40, pytest.param(400, marks=pytest.mark.evidence)])
@@ -152,12 +127,6 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
 
 
 # scatter
-
-def test_the_scatter_of_sweeps_is_found():
-    wander = 0.05 * DEGREE
-    found = estimate_scatter(measured(SINE, sweeps=24, sweep_bias=wander)).sweep_bias / wander
-    # One value is fitted to the biases of the sweeps, three to their change with temperature.
-    assert math.sqrt(chi2.ppf(RARE, 20) / 20) < found < math.sqrt(chi2.ppf(1 - RARE, 20) / 20)
 
 
 @pytest.mark.parametrize('rates', [[0.0, 0.2], np.zeros(30), np.linspace(-0.3, 0.3, 41)])
@@ -199,15 +168,6 @@ def test_what_is_left_out_of_one_of_few_sweeps_is_predicted_by_the_rest_of_the_s
             atol=1e-9)
 
 
-def test_what_one_sweep_alone_shows_cannot_be_left_out():
-    table = measured(LINEAR, sweeps=4)
-    rate = np.where(table.sweep == 0, table.rate, 0.0)
-    fit = fit_effects(replace(table, rate=rate, output=table.output - 1.01 * (table.rate - rate)),
-                      (BIAS, SCALE_FACTOR_ERROR))
-    assert (np.isinf(fit.left_out_residual[table.sweep == 0]).all()
-            and np.isfinite(fit.left_out_residual[table.sweep > 0]).all())
-
-
 def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():
     generator = np.random.default_rng(5)
     rate, sweep = np.tile(np.linspace(-2.0, 2.0, 11), 8), np.repeat(np.arange(8), 11)
@@ -215,20 +175,6 @@ def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():
     assert find_inliers(dwells(rate, error, sweep=sweep)).all()
     error[36] += 5e-3
     assert np.flatnonzero(~find_inliers(dwells(rate, error, sweep=sweep))).tolist() == [36]
-
-
-def test_an_outlying_dwell_is_not_fitted():
-    table = measured(SINE)
-    off = replace(table,
-                  output=table.output + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
-    effects, others = [term.effect for term in SINE], np.arange(len(table)) != 30
-    fit = fit_effects(off, effects)
-    clean = fit_effects(select_dwells(table, others), effects,
-                        replace(fit.scatter, inliers=np.ones(167, bool)))
-    assert np.flatnonzero(~fit.scatter.inliers).tolist() == [30]
-    np.testing.assert_allclose(fit.residual[fit.scatter.inliers], clean.residual, atol=1e-6)
-    assert (fit.residual[30] == pytest.approx(0.5 * DEGREE, abs=6 * 0.03 * DEGREE)
-            and np.isnan(fit.left_out_residual[30]))
 
 
 # refusals

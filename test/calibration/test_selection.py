@@ -24,7 +24,7 @@ from gyro_calibration.calibration.selection import (
     select_effects,
     TECHNOLOGY_EFFECTS,
 )
-from gyro_calibration.logs.log import DEGREE, Log, read_log
+from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -62,14 +62,6 @@ def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
     wrong = sum(names(select_effects(table.measure(GyroModel(LINEAR), generator)))
                 != {'bias', 'scale_factor_error', *SLOPES} for _ in range(runs))
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
-
-
-def test_biases_of_three_sweeps_are_no_curve_over_temperature():
-    table = Table(sweeps=3, sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True)
-    generator = np.random.default_rng(2)
-    wrong = sum('bias_temperature_quadratic' in names(select_effects(
-        table.measure(GyroModel(LINEAR), generator))) for _ in range(10))
-    assert wrong <= binom.ppf(1 - RARE, 10, FALSE_ALARM_RATE)
 
 
 def test_a_cubic_is_found_beside_slopes_over_temperature_in_two_sweeps():
@@ -132,16 +124,6 @@ def test_the_rate_that_is_proposed_distinguishes_confounders(runs):
     assert np.mean(sigmas) > MIN_DISTINGUISHING_SIGMAS - 3.7 / np.sqrt(runs), sigmas
 
 
-def test_a_sine_with_its_zeros_at_the_rates_of_the_dwells_is_no_response():
-    rate = 6.0 * DEGREE * np.tile(np.arange(-10.0, 11.0), 6)
-    sweeps = {'sweep': tuple(np.repeat(list('abcdef'), 21))}
-    for seed in range(4):
-        error = 1.2e-5 * np.random.default_rng(seed).standard_normal(len(rate))
-        table = dwells_from_table(Log(output=rate * (1.0 + 2e-5 * rate ** 2) + error,
-                                      reference_rate=rate, others=sweeps))
-        assert select_effects(table, 'open_loop_fog').calibration.min_non_monotonic_rate is None
-
-
 @pytest.mark.parametrize('technology', [None, 'open_loop_fog'])
 def test_a_sine_that_passes_through_evenly_spaced_rates_is_not_taken_for_a_cubic(technology):
     """Rates of multiples of 20 deg/s do not distinguish k from 18 s - k, of the other sign."""
@@ -166,12 +148,6 @@ def test_what_cannot_be_seen_says_what_would_show_it():
     cold = replace(measured(Table(), LINEAR), temperature=None)
     reasons = {choice.effect: choice.reason for choice in select_effects(cold).choices}
     assert 'record temperature_degc' in reasons['bias_temperature']
-
-
-def test_rests_show_a_bias_alone():
-    table = measured(Table(), LINEAR)
-    steady = replace(table, rate=np.zeros(len(table)), output=table.output - table.rate)
-    assert names(select_effects(steady)) == {'bias', 'bias_temperature'}
 
 
 def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():

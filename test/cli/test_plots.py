@@ -14,11 +14,7 @@ from dataclasses import replace
 from functools import cache
 
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
-from gyro_calibration.calibration.rate_table import (
-    compute_turn_errors,
-    fit_effects,
-    MIN_TURN_RATE,
-)
+from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects, MIN_TURN_RATE
 from gyro_calibration.cli.plots import (
     draw_error_surface,
     draw_headings,

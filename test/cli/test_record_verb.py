@@ -387,19 +387,6 @@ def test_a_killed_recording_can_be_read_up_to_the_last_second(record, wait_until
     assert np.median(lateness) < 1.0 and max(lateness) < 2.0, lateness  # the machine may be busy
 
 
-@pytest.mark.parametrize('name', KILLED)
-def test_what_came_before_a_silence_outlives_a_kill(record, wait_until, tmp_path, name):
-    samples = [Sample(1e-4 * number, 25.0, time=number / RATE) for number in range(500)]
-    columns = Settings(columns=('gyro_rad_s', 'temperature_degc'))
-    with Emulator(find_protocol('csv'), samples, columns, 2.0, tmp_path / 'gyro',
-                  wait_for_reader=True):
-        recording = record(*words_for(tmp_path / 'gyro', tmp_path / name))
-        wait_until(lambda: 'nothing comes' in recording.error)
-        recording.process.kill()
-        recording.process.join()
-    assert len(read(tmp_path / name)) > 475  # rows of the last 0.05 s wait for their temperature
-
-
 @pytest.mark.parametrize(('name', 'limit'),
                          [('a.csv', 60_000),
                           pytest.param('a.csv.gz', 25_000, marks=pytest.mark.evidence),

@@ -15,12 +15,7 @@ import zlib
 
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
-from gyro_calibration.diagnosis.causes import (
-    CAUSES,
-    make_finding,
-    mark_suspected,
-    next_experiment,
-)
+from gyro_calibration.diagnosis.causes import CAUSES, make_finding, mark_suspected, next_experiment
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE, QUANTITIES
 from gyro_calibration_bench.hidden import hide

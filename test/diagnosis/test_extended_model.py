@@ -199,23 +199,6 @@ def test_a_log_without_temperature_leaves_the_range_of_the_model():
     assert found.model.rate_range == (-1.5, 1.5)
 
 
-def at_rest(swing):
-    """Return a log of a gyro that does not turn, or hardly does beside its noise."""
-    rate = swing * np.sin(0.3 * TIME)
-    output = 1e-3 + rate + 7e-4 * np.random.default_rng(4).standard_normal(len(TIME))
-    return Log(time=TIME, output=output, temperature=TEMPERATURE,
-               reference_rate=rate if swing else None, moving=np.sign(swing) + 0.0 * TIME)
-
-
-@pytest.mark.parametrize('swing', [0.0, 2e-4], ids=['at rest', 'hardly in motion'])
-def test_a_log_without_motion_says_nothing_of_rates(swing):
-    found = diagnosed(at_rest(swing))
-    assert found.model.rate_range == (-np.inf, np.inf)
-    assert (value(found.model, 'scale_factor_error') == 0.0
-            and value(found.model, 'bias') == pytest.approx(1e-3, abs=1e-4))
-    assert any('is not added to the model' in remark for remark in found.remarks) == (swing > 0.0)
-
-
 # units, limit and steps
 
 @pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)],
@@ -236,14 +219,6 @@ def test_a_limit_and_steps_that_are_found_are_in_the_model(name, size):
             and is_in_extended_model(found.findings[0], found))
     assert found.model.covariance.shape == (3, 3) and found.model.terms[:2] == MODEL.terms
     assert diagnosed(drive(term(name, size), seed=5), found.model).verdict == 'adequate'
-
-
-def test_steps_that_go_into_the_model_are_not_in_its_noise_as_well():
-    steps = term('quantization', 1e-3)
-    found = diagnosed(drive(steps))
-    assert (names(found) == ['quantization']
-            and found.model.noise.angle_random_walk == pytest.approx(1.5e-4, rel=0.03))
-    assert diagnosed(drive(steps, seed=5), found.model).verdict == 'adequate'
 
 
 # where it comes from

@@ -20,11 +20,10 @@ from gyro_calibration.calibration.heading_regression import (
     find_drift,
     fit_spans,
     lay_out_spans,
-    whiten_regression,
 )
-from gyro_calibration.calibration.reference_noise import keep_own_instants, rate_noise_share
+from gyro_calibration.calibration.reference_noise import rate_noise_share
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
-from gyro_calibration.diagnosis.noisy_reference import _step_gains, search_causes
+from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
@@ -96,13 +95,6 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
             and 'course over ground' in render_report(found))
 
 
-def test_a_short_drive_with_more_channels_than_spans_shows_nothing():
-    log = drive(0, 40.0)
-    log = select_rows(log, log.time < 25.0)
-    log = replace(log, supply=4.8 + 0.02 * log.time, specific_force=9.8 + np.cos(0.3 * log.time))
-    assert not diagnosed(log).findings
-
-
 def test_nothing_is_compared_across_a_hole_in_the_samples():
     log = drive(3)
     rows = np.abs(log.time - 100.0) > 12.0
@@ -123,14 +115,6 @@ def test_a_course_that_is_repeated_between_its_fixes_is_a_course():
     found = diagnosed(replace(log, reference_heading=held[last]))
     assert found.reference.kind == 'course'
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.05 * DEGREE)
-
-
-def test_the_last_digit_of_a_file_is_no_step_of_an_encoder():
-    log = drive(0)
-    heading = np.cumsum(log.output) / RATE
-    kinds = [classify_reference(replace(log, reference_heading=step * np.round(heading / step)))
-             for step in (1e-6, 1e-4 * DEGREE, 2.0 * np.pi / 65536, 0.1 * DEGREE)]
-    assert [each.kind for each in kinds] == 2 * ['motion_capture'] + 2 * ['encoder']
 
 
 def test_a_bias_that_held_out_parts_contradict_is_not_offered():
@@ -222,26 +206,6 @@ def test_a_random_walk_of_the_bias_is_no_step(step, seed):
     assert not [each for each in found.findings if each.effect == 'bias_step']
 
 
-@pytest.mark.parametrize('size', [0.2, 0.05])  # 17 and 4 times the noise of the gyro
-def test_odometry_that_was_interpolated_at_the_samples_of_the_gyro_is_not_exact(size):
-    log = turning_log(3, lambda time, _: 0.003)
-    walk = np.cumsum(np.random.default_rng(3).standard_normal(len(log))) / np.sqrt(RATE)
-    heading = np.cumsum(log.output - 0.003) / RATE / (1.0 + SCALE) + size * DEGREE * walk
-    log, _ = keep_own_instants(replace(
-        log, reference_heading=np.interp(log.time, log.time[::4], heading[::4])))
-    assert is_reference_limiting(log, classify_reference(log))
-
-
-def test_a_table_that_holds_its_rates_is_exact():
-    generator = np.random.default_rng(4)
-    time = np.arange(0.0, 240.0, 1.0 / RATE)
-    rate = np.repeat(generator.uniform(-1.0, 1.0, 48), 125)
-    output = (1.0 + SCALE) * rate + 0.003 + 2e-4 * np.sqrt(RATE) * generator.standard_normal(
-        len(time))
-    log = Log(output=output, time=time, reference_heading=np.cumsum(rate) / RATE)
-    assert not is_reference_limiting(log, classify_reference(log))
-
-
 HIDDEN = {
     'heading_sensitivity': lambda time, rate, heading, temperature: 0.01 * np.sin(heading + 0.5),
     'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0)}
@@ -294,20 +258,6 @@ def test_a_course_has_no_error_of_a_shaft():
                             0.3 * rate * np.sin(heading)))
     assert 'shaft' in found.cannot_show['reference_once_per_rev']
     assert 'reference_once_per_rev' not in {each.effect for each in found.findings}
-
-
-def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
-    generator, time = np.random.default_rng(9), np.arange(0.0, 120.0, 1.0 / RATE)
-    rate = 1.2 + 0.3 * np.sin(0.21 * time)
-    heading = np.cumsum(rate) / RATE
-    for size, named in ((0.3, True), (1.2, False)):
-        log = Log(time=time, output=rate + 1e-3 * generator.standard_normal(len(time)),
-                  reference_heading=heading - size * np.cos(heading)
-                  + 1e-3 * generator.standard_normal(len(time)))
-        _, found = search_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
-                                 lambda share, words: None)
-        assert named == ('reference_once_per_rev' in {
-            each.cause_term.cause for each in found if each.is_established}), size
 
 
 @pytest.mark.parametrize('seed', seeds(2))
@@ -440,26 +390,6 @@ def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
     assert not fit.causes and not any(each.is_established for each in found)
 
 
-def test_intervals_hold_nothing_where_few_turning_points_of_a_swing_show_it():
-    # at an even rate each way, scale, cubic and once a revolution differ at the turns alone
-    generator, time = np.random.default_rng(12), np.arange(0.0, 220.0, 0.01)
-    sigmas = []
-    for _ in range(3):
-        period = generator.choice([8.0, 10.0, 12.0])
-        knots = period * np.array([0.0, 0.04, 0.46, 0.54, 0.96, 1.0])
-        size = 69.0 * DEGREE / (0.46 * period) * np.array([0.0, 1.0, 1.0, -1.0, -1.0, 0.0])
-        rate = np.interp(time % period, knots, size)
-        heading = np.cumsum(rate) * 0.01 - 0.005 * rate + generator.uniform(-np.pi, np.pi)
-        log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
-                  reference_heading=np.floor(heading / (0.4 * DEGREE)) * 0.4 * DEGREE)
-        for name in ('cubic_nonlinearity', 'reference_once_per_rev'):
-            found = fit_spans(lay_out_spans(log, 'encoder'), [CauseTerm(name)])
-            sigmas += [1.96 * found.values[place] / found.half_width(place)
-                       for place in range(3, len(found.values))]
-            sigmas.append(1.96 * (found.values[0] - 0.004) / found.half_width(0))
-    assert np.sqrt(np.mean(np.square(sigmas))) < 1.3, np.round(sigmas, 1)
-
-
 @pytest.mark.parametrize('seed', [1, evidence(2)])
 def test_a_coarse_encoder_shows_the_noise_of_the_gyro_and_no_delay(seed):
     # the error of a code that stands while the shaft rests was taken for a random walk
@@ -533,14 +463,6 @@ def test_rests_determine_the_bias_beside_odometry_that_drifts_in_motion(seed, dr
 def test_what_the_gyro_does_in_motion_is_no_drift_of_the_reference(hidden):
     drifts = [find_drift(odometry(seed, 0.0, **hidden)[0]) for seed in range(10)]
     assert sum(each is not None for each in drifts) <= 1
-
-
-def test_a_second_step_at_the_time_of_the_first_explains_nothing():
-    spans = lay_out_spans(drive(3), 'course')
-    fit = fit_spans(spans, [CauseTerm('bias_step', (spans.time[40],))])
-    data = whiten_regression(fit, fit.causes)
-    gains, sizes = _step_gains(fit, data, spans.time[[40, 80]])
-    assert gains[0] == sizes[0] == 0.0 < gains[1]
 
 
 @pytest.mark.parametrize('spans', [lay_out_spans(drive(3), 'course'),

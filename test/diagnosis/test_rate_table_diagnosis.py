@@ -20,11 +20,7 @@ from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.diagnosis import rate_table as diagnosis
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import (
-    CATALOGUE,
-    rate_temperature_polynomial,
-    STATIC_EFFECTS,
-)
+from gyro_calibration.model.effects import rate_temperature_polynomial, STATIC_EFFECTS
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
@@ -141,13 +137,6 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
     assert members(found) == {'bias_temperature'}
 
 
-def test_a_model_of_a_mended_table_says_what_its_output_was_multiplied_by(without_gain):
-    table = Table().measure(gyro('scale_factor_asymmetry', 0.02), np.random.default_rng(8))
-    found = diagnose_table(replace(table, output=-table.output), None)
-    assert (found.model.origin['output_multiplied_by'] == [-1.0]
-            and any('was multiplied by -1' in remark for remark in found.remarks))
-
-
 # models that are put to the test
 
 def test_a_value_that_the_model_has_wrong_is_put_right(without_gain):
@@ -169,20 +158,6 @@ def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
     assert [term.effect.name for term in found.model.terms] == [*NUISANCES, 'cubic_nonlinearity']
 
 
-def test_effects_are_named_on_top_of_a_polynomial(without_gain):
-    generator = np.random.default_rng(10)
-    polynomial = fit_effects(WANDERING.measure(GyroModel(LINEAR), generator),
-                             [rate_temperature_polynomial(3, 2)]).model
-    truth = GyroModel((*LINEAR, Term(STATIC_EFFECTS['scale_factor_temperature'],
-                                     (polynomial.reference_temperature, 5e-4))))
-    found = diagnosed(WANDERING, truth, generator, polynomial)
-    assert (names(found) == ['scale_factor_temperature']
-            and found.model.terms[0] == polynomial.terms[0])
-    low, high = found.findings[0].parameters['scale_factor_temperature'].interval
-    assert (low < 5e-4 < high and len(found.model.covariance) == sum(
-        len(term.fitted_indices) for term in found.model.terms))
-
-
 def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_before(without_gain):
     model = replace(GyroModel(LINEAR), temperature_range=(20.0, 30.0),
                     self_calibration=SelfCalibration(0.01), origin={'date': '2025'})
@@ -191,13 +166,6 @@ def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_be
     assert found.temperature_range == (20.0,
                                        pytest.approx(47.0)) and found.self_calibration is None
     assert found.origin['before'] == [{'date': '2025'}]
-
-
-def test_what_dwells_cannot_test_of_a_model_is_left_and_reported(without_gain):
-    model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
-    found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(11), model)
-    assert (any('time_offset' in remark for remark in found.remarks)
-            and model.terms[-1] in found.model.terms)
 
 
 # what has no name, and what is no effect

@@ -10,17 +10,10 @@
 
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
-from gyro_calibration.diagnosis.pipeline import _noise_findings
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.residuals import (
-    BandEnergies,
-    drop_tone_bands,
-    NoiseParameters,
-    residual_curves,
-)
+from gyro_calibration.diagnosis.residuals import BandEnergies, drop_tone_bands, residual_curves
 from gyro_calibration.logs.log import Log
-from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -74,15 +67,3 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     assert len(used.energy) == (60 if tone == 1.0 else 59)
     assert np.exp(0.5 * used.fit()[0][0]) == pytest.approx(2.0, rel=0.03)
     assert tone == 1.0 or np.exp(0.5 * bands.fit()[0][0]) > 2.2
-
-
-FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},
-                          {'angle_random_walk': 1e-9})
-
-
-@pytest.mark.parametrize('bounds, found', [
-    ({}, 1), ({'angle_random_walk': (0.9e-3, 1.06e-3)}, 0),
-    ({'angle_random_walk': (0.9e-3, 1.04e-3)}, 1)], ids=['none', 'wide', 'narrow'])
-def test_noise_within_the_bounds_of_a_model_is_no_finding(bounds, found):
-    model = GyroModel(noise=Noise(1e-3), noise_bounds=bounds)
-    assert len(list(_noise_findings(FIGURES, model, 0.01, ()))) == found

@@ -32,8 +32,6 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
     evidence_for,
-    find_strongest,
-    find_suspected,
     held_out_sigmas,
     MIN_PREDICTION_SIGMAS,
     refine_jointly,
@@ -105,17 +103,6 @@ def test_what_one_stretch_shows_does_not_predict_the_others():
     named = refine_jointly(search, named)
     assert (evidence_for(search, named, 0) > 10.0
             and held_out_sigmas(search, named)[0] < MIN_PREDICTION_SIGMAS)
-
-
-def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
-    search = start_search([laid(resting(5e-7 * TIME))])
-    answers = []
-    for level in np.geomspace(2e-2, 2e-5, 13):
-        at_level = replace(search, rate=level, step_cache={})
-        answers.append('named' if find_strongest(at_level, ())[0]
-                       else 'suspected' if find_suspected(at_level, ()) else 'nothing')
-    assert list(dict.fromkeys(answers)) == ['named', 'suspected', 'nothing']
-    assert answers.count('suspected') * np.log(1e3) / 12.0 == pytest.approx(np.log(5.0), abs=0.58)
 
 
 # shapes

@@ -14,10 +14,7 @@ import contextlib
 from functools import cache
 import math
 
-from gyro_calibration.calibration.self_calibration import (
-    calibrate_bias,
-    self_calibrate,
-)
+from gyro_calibration.calibration.self_calibration import calibrate_bias, self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.compensation import quadratic_form

@@ -19,11 +19,7 @@ samples, over many drives.
 import math
 
 from faulty_heading import one
-from gyro_calibration.heading.integration import (
-    gap_variances,
-    integrate,
-    Intervals,
-)
+from gyro_calibration.heading.integration import gap_variances, integrate, Intervals
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration

@@ -20,10 +20,7 @@ from datetime import datetime, timezone
 import math
 
 from gyro_calibration.heading.bias_table import BiasTable, Entry
-from gyro_calibration.heading.heading_estimator import (
-    Assumptions,
-    HeadingEstimator,
-)
+from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE

@@ -15,11 +15,7 @@ from pathlib import Path
 
 from chance import mean_bound
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.noise import (
-    ALLAN_FLOOR_RATIO,
-    Noise,
-    simulate_noise,
-)
+from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
