@@ -21,9 +21,7 @@ import os
 
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
-from gyro_calibration.heading.integration import filter_rates, Threshold, ThresholdFilter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, Channels, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
@@ -168,20 +166,3 @@ def test_a_state_that_is_not_finite_is_reported_and_built_anew_with_the_last_hea
     assert all(map(math.isfinite, shown)) and tracker.variance >= 0.0
     assert (abs(tracker.heading - heading - 0.3 * INTERVAL * 201) < 0.5
             and tracker.variance > variance + 1.0)
-
-
-@tries(80)
-@hypothesis.given(st.lists(st.tuples(st.floats(1e-3, 0.3), FINITE), min_size=1, max_size=60),
-                  st.sampled_from([0.0, 0.2]), st.sampled_from([0.0, 7.3e-4]))
-def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk):
-    settings = Threshold(0.3 * DEGREE, window, walk)
-    live, time = ThresholdFilter(settings), np.cumsum([step for step, _ in samples])
-    rate = np.array([0.1 * each if abs(each) < 3.0 else each for _, each in samples])
-    found = [live.apply(*sample) for sample in zip(time.tolist(), rate.tolist())]
-    for index, at in enumerate(time):
-        begin = min(int(np.searchsorted(time, at - window, side='right')), index)
-        fresh = ThresholdFilter(settings)
-        alone = [fresh.apply(*sample)
-                 for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
-        assert found[index] == alone[-1]
-    assert filter_rates(settings, time, rate).tolist() == found

@@ -51,19 +51,6 @@ def test_scale_bias_and_delay_are_found(late, every):
     assert deviations[0] < 0.01 and deviations[1] < 0.1 * DEGREE
 
 
-def test_the_delay_of_a_swing_is_found_beside_a_heading_that_wanders():
-    """A pendulum with a tilted axis: the bias of its gyro decays with the swing."""
-    generator = np.random.default_rng(0)
-    time = np.arange(18000) / 100.0
-    amplitude = np.exp(-time / 60.0)
-    rate = 150.0 * DEGREE * amplitude * np.sin(2.0 * np.pi * 0.6 * time)
-    heading = np.cumsum(rate / 100.0 + 0.07 * DEGREE * generator.standard_normal(len(time)))
-    found = calibrate_encoder(Log(time=time, reference_heading=heading,
-                                  output=1.01 * rate + 2.0 * DEGREE * amplitude ** 2))
-    assert found.fit.time_offset == pytest.approx(0.0, abs=0.1)
-    assert not any('limit' in remark for remark in found.remarks)
-
-
 def test_a_delay_at_the_limit_is_said():
     assert 'of one motion' in calibrate_encoder(drive(1, late=1.6)).remarks[0]
     assert 'of one motion' not in calibrate_encoder(drive(1, late=1.3)).remarks[0]

@@ -14,12 +14,7 @@ from dataclasses import replace
 import math
 
 from chance import fewest, most, rms_bounds
-from gyro_calibration.calibration.dwells import (
-    dwells_from_table,
-    extract_dwells,
-    find_dwells,
-    NothingSteady,
-)
+from gyro_calibration.calibration.dwells import dwells_from_table, extract_dwells, find_dwells
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -156,13 +151,6 @@ def test_the_means_scatter_as_they_claim_under_white_noise(reference, generator)
     assert fewest(len(found), 0.95) <= held <= most(len(found), 0.95)
 
 
-def test_the_means_claim_the_steps_of_a_coarse_encoder(generator):
-    found = np.concatenate(
-        [errors(find_dwells(run(generator, 1e-4, reference_heading=encoder(2.0, generator))))
-         for _ in range(12)])
-    assert np.mean(np.abs(found) < 1.96) > 0.93
-
-
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
 @pytest.mark.parametrize(('late', 'lag'), [(2, 0.1), (-5, 0.0), (5, 0.0), (0, 0.3)])
 def test_neither_ramps_nor_the_settling_of_the_gyro_get_into_the_means(
@@ -230,25 +218,6 @@ def test_a_dwell_that_warms_is_divided(generator):
     assert len(steady) == 1
     assert (5 <= len(warm) <= 7 and np.ptp(warm.temperature) > 4.0
             and 'divided' in ' '.join(warm.remarks))
-
-
-def test_a_rate_of_coarse_steps_or_of_no_values_gives_way_to_the_heading(generator):
-    coarse = encoder(2.0, generator)
-    for rate, heading, off in ((np.gradient(coarse, TIME), coarse, 0.02),
-                               (np.full(len(TIME), np.nan), HEADING, 1e-6)):
-        found = find_dwells(run(generator, reference_rate=rate, reference_heading=heading))
-        assert np.allclose(found.rate / DEGREE, RATES, atol=off)
-
-
-@pytest.mark.parametrize('quantity', ['reference_rate', 'reference_heading'])
-def test_rests_alone_of_a_motion_are_no_dwells_to_calibrate_by(quantity, generator):
-    moves = (TIME % 60.0) > 30.0
-    rate = np.where(moves, 45.0 * DEGREE * np.sin(TIME), 0.0)
-    reference = rate if quantity == 'reference_rate' else np.cumsum(rate) * 0.01
-    log = run(generator, rate=rate, **{quantity: reference})
-    assert np.abs(find_dwells(log).rate).max() < 0.1 * DEGREE
-    with pytest.raises(NothingSteady, match='steady at .* only, and turns at .* --method like'):
-        extract_dwells(log)
 
 
 @pytest.mark.parametrize('rate', [1.0, 0.3, None])

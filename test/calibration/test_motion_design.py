@@ -92,25 +92,6 @@ def test_a_planned_motion_can_be_driven_tells_the_scale_better_and_calibrates(na
     assert abs(fit.scale_factor_error - 0.03) < 4.0 * math.sqrt(fit.covariance[0, 0])
 
 
-SLUGGISH = {'hardly any acceleration': RobotLimits(60 * DEGREE, 1 * DEGREE),
-            'hardly any jerk': RobotLimits(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
-
-
-@pytest.mark.parametrize('name', SLUGGISH)
-def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
-    """In 4.5 s from rest: 1 deg/s² gives 4.5 deg/s, 5 deg/s³ gives 5 (4.5 / 2)² = 25.3 deg/s."""
-    ability, forecast = SLUGGISH[name], CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
-    fastest = {'hardly any acceleration': 4.5, 'hardly any jerk': 25.3125}[name] * DEGREE
-    simple = plain_motion(ability, 20.0)
-    motion = find_best_motion(ability, forecast, 20.0, np.random.default_rng(1), 5).motion
-    for each in (simple, motion):
-        assert (can_follow(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
-                and abs(each.heading[-1]) < 1e-9)
-    assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
-    assert (ability.max_turn_angle(9.0) == pytest.approx(4.5 * fastest)
-            and ability.max_turn_rate(4.5 * fastest) == pytest.approx(fastest))
-
-
 @pytest.mark.parametrize('size', [1.0, 0.03])
 def test_a_calibration_states_what_the_plan_promised(size):
     """Within 1.1, for a gyro of consumer grade and a fine one, with the rest after the run."""

@@ -110,17 +110,6 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
     assert abs(np.mean(errors)) < 0.01
 
 
-def test_a_value_that_nothing_shows_keeps_its_prior():
-    time, rate, turned, seen = headings(np.random.default_rng(4))
-    columns = np.column_stack([np.zeros(len(time) - 1), np.diff(time)])
-    found = fit_noise_grid(np.diff(turned - SCALE * seen), columns, heading_noise(time, rate),
-                           prior_mean=np.array([1.0, 0.0]),
-                           prior_deviation=np.array([0.02, math.inf]))
-    assert found.values[0] == pytest.approx(1.0) and found.deviations[0] == pytest.approx(0.02)
-    # five deviations of the mean of an angle random walk of 0.2 deg/√s over 240 s
-    assert found.values[1] == pytest.approx(BIAS, abs=5.0 * 0.2 * DEGREE / math.sqrt(240.0))
-
-
 def test_differences_of_autoregressive_errors_have_the_covariance_that_is_stated():
     generator = np.random.default_rng(5)
     correlation = np.where(np.arange(8) == 3, 0.0, generator.uniform(0.0, 0.9, 8))

@@ -15,7 +15,7 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
-from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers
+from gyro_calibration.calibration.scatter import find_inliers
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS,
@@ -51,13 +51,6 @@ def measured(terms=LINEAR, seed=1, **table):
 
 
 # estimates
-
-def test_a_sine_that_is_zero_at_the_rates_of_all_dwells_is_chance():
-    rate = np.tile(6.0 * DEGREE * np.arange(-10, 11), 2)
-    noise = 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
-    fit = fit_effects(dwells(rate, noise), [BIAS, SCALE_FACTOR_ERROR])
-    sine = Term(SINE_RESPONSE, (30.0, 1.0))
-    assert replace(fit, terms=(*fit.terms, sine)).p_value(SINE_RESPONSE) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -147,25 +140,6 @@ def test_what_is_left_out_is_what_a_fit_without_the_sweep_gives():
     np.testing.assert_allclose(fit.left_out_residual[~seen],
                                hidden.output - hidden.rate - without.error(channels_of(hidden)),
                                atol=1e-9)
-
-
-def test_what_is_left_out_of_one_of_few_sweeps_is_predicted_by_the_rest_of_the_sweep_too():
-    table = measured(CUBIC, sweeps=2, sweep_bias=0.2 * DEGREE)
-    fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR))
-    shared = fit.scatter.sweep_columns(table)
-    covariance = (np.diag(fit.scatter.deviation(table) ** 2)
-                  + shared @ shared.T * (table.sweep[:, None] == table.sweep))
-    columns = np.column_stack([np.ones(len(table)), table.rate])
-    error, part = table.output - table.rate, cross_validation_parts(table)
-    for hidden in (part == number for number in range(part.max() + 1)):
-        inverse = np.linalg.inv(covariance[np.ix_(~hidden, ~hidden)])
-        known = columns[~hidden]
-        values = np.linalg.solve(known.T @ inverse @ known, known.T @ inverse @ error[~hidden])
-        left = error - columns @ values
-        np.testing.assert_allclose(
-            fit.left_out_residual[hidden],
-            left[hidden] - covariance[np.ix_(hidden, ~hidden)] @ inverse @ left[~hidden],
-            atol=1e-9)
 
 
 def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():

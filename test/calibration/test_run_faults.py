@@ -304,15 +304,6 @@ def test_the_rest_after_a_run_draws_the_bias_of_a_run_that_is_off(off):
     assert np.mean(np.abs(errors) < 1.96) > 0.8
 
 
-def test_a_slip_at_speed_alone_is_in_the_interval_of_the_scale():
-    """At 45 deg/s all turns lose 1.5 %, and those at 30 deg/s nothing."""
-    rate = CALIBRATION_MOTION.rate_at(TIME)
-    slipped = output(0) - (1.0 + S) * 0.015 * np.where(np.abs(rate) > 0.6, rate, 0.0)
-    fit = self_calibrate(TIME, slipped, CALIBRATION_MOTION, noise=XV3500.noise)
-    deviation = math.sqrt(fit.covariance[0, 0])
-    assert deviation > 0.008 and abs(fit.scale_factor_error - S) < 1.96 * deviation
-
-
 def odometry(seed, deviation, drift):
     """Return the heading of wheels at 50 Hz with errors of scale and drift, and with slip."""
     generator = np.random.default_rng([seed, 2])

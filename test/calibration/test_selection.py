@@ -12,12 +12,7 @@
 
 from dataclasses import replace
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    dwells_from_table,
-    join_dwells,
-    select_dwells,
-)
+from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, select_dwells
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE,
     MIN_DISTINGUISHING_SIGMAS,
@@ -62,16 +57,6 @@ def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
     wrong = sum(names(select_effects(table.measure(GyroModel(LINEAR), generator)))
                 != {'bias', 'scale_factor_error', *SLOPES} for _ in range(runs))
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
-
-
-def test_a_cubic_is_found_beside_slopes_over_temperature_in_two_sweeps():
-    rate = np.append(np.linspace(-1.0, 1.0, 9), np.linspace(1.0, -1.0, 9))
-    warm = np.linspace(-7.0, 7.0, len(rate))
-    noise = 1e-4 * np.random.default_rng(3).standard_normal(len(rate))
-    error = 3e-3 * rate ** 3 - 2e-4 * warm - 3e-4 * warm * rate + noise
-    table = Dwells(rate, rate + error, 28.0 + warm, np.full(len(rate), np.nan),
-                   np.repeat([0, 1], 9), ('',) * len(rate))
-    assert 'cubic_nonlinearity' in names(select_effects(table, 'mems'))
 
 
 @pytest.mark.parametrize('runs', [2, pytest.param(8, marks=pytest.mark.evidence)])

@@ -128,27 +128,6 @@ def test_fits_are_unbiased_with_true_intervals_near_the_cramer_rao_bound(referen
     assert (ratios < 1.1 * rms_bounds(len(errors) - 1)[1]).all(), ratios
 
 
-def lagging(constant, every=10):
-    """Return the rate of a robot with a first-order lag, s, sampled every so many ms."""
-    fine = np.arange(20001) / 1000.0
-    decay, state, rates = math.exp(-0.001 / constant), 0.0, []
-    for wanted in CALIBRATION_MOTION.rate_at(fine):
-        state = decay * state + (1 - decay) * wanted
-        rates.append(state)
-    return np.array(rates[::every])
-
-
-def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
-    """Sample noise in rate and acceleration must not be taken for a delay or a lag."""
-    fine, true, sizes = np.arange(20001) / 1000.0, lagging(0.15, 1), []
-    for seed in range(20):
-        noise = simulate_noise(XV3500, len(fine), 0.001, np.random.default_rng([8, seed]))
-        fit = self_calibrate(fine, (1 + XV3500_S) * true + XV3500_B + noise, CALIBRATION_MOTION)
-        sizes.append((fit.scale_factor_error - XV3500_S) / math.sqrt(fit.covariance[0, 0]))
-    assert abs(np.mean(sizes)) < mean_bound(sizes), np.round(sizes, 1)
-    assert np.sqrt(np.mean(np.square(sizes))) < rms_bounds(20)[1], np.round(sizes, 1)
-
-
 @pytest.mark.parametrize('kind', ['lag', 'ramps softer than commanded', 'second order',
                                   'slip up to 1 % of each turn'])
 def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_interval(kind):

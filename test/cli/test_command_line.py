@@ -20,7 +20,6 @@ import shlex
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.main import find_verbs
@@ -29,7 +28,6 @@ from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 TURN = 2.0 * math.pi
 VERBS = list(find_verbs())
@@ -256,28 +254,6 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
     assert (folder / 'heading.png').read_bytes().startswith(b'\x89PNG')
     assert 'Hong and Park' in (folder / 'table.md').read_text()
     assert len(read_log(folder / 'log.csv')) > 4000
-
-
-@pytest.mark.parametrize('refusals', [0, 2, 3])
-def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(
-        ros_domain, capsys, monkeypatch, refusals):
-    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    from gyro_calibration.cli.demo_run import calibrate, CallRefused, MAX_ATTEMPTS
-    monkeypatch.setattr('gyro_calibration.cli.demo_run._wait', lambda *_: None)
-    answers = iter([CallRefused('calibrate: the gyro slipped')] * refusals + ['done'])
-
-    def call(*_):
-        answer = next(answers)
-        if isinstance(answer, CallRefused):
-            raise answer
-    with tqdm(total=60, disable=True) as bar:
-        if refusals < MAX_ATTEMPTS:
-            calibrate(SimpleNamespace(call_service=call), bar)
-        else:
-            with pytest.raises(CallRefused, match='slipped'):
-                calibrate(SimpleNamespace(call_service=call), bar)
-    assert capsys.readouterr().err.count('slipped; the run is repeated') == min(
-        refusals, MAX_ATTEMPTS - 1)
 
 
 def test_a_method_that_gives_no_standard_deviation_claims_none(run, compensate, log, tmp_path):

@@ -129,26 +129,6 @@ def test_a_hidden_fault_is_found_alone(name, multiple, any_generator):
     assert sum(list(found(log_of(each))) == [name] for each in hidden) >= fewest(6, 1.0 - STATED)
 
 
-@pytest.mark.parametrize('rough, rate', [('steps', STATED), ('jolts', 0.03),
-                                         ('heavy tails', 0.05)])
-def test_a_rough_motion_or_rough_noise_seldom_has_outliers(rough, rate, any_generator):
-    """Of 300 logs each, none of steps, 3 % of jolts and 5 % of heavy tails had."""
-    logs = [roughened(rough, any_generator) for _ in range(16)]
-    assert sum('outliers' in found(log) for log in logs) <= most(16, rate)
-
-
-def roughened(rough, generator):
-    log = swing(generator)
-    steps = np.repeat(np.cumsum(generator.random(600) < 0.1) % 2, 10) * 0.5
-    jolts = np.convolve((generator.random(6000) < 0.01) * generator.normal(0.0, 1.0, 6000),
-                        [0.3, 1.0, 0.4], 'same')
-    more = {'steps': steps, 'jolts': jolts,
-            'heavy tails': generator.laplace(0.0, SIGMA, 6000)}[rough]
-    # The reference is two samples late, so that it does not explain the motion at once.
-    seen = log.reference_rate if rough == 'heavy tails' else np.roll(log.reference_rate + more, 2)
-    return replace(log, output=log.output + more, reference_rate=seen)
-
-
 @pytest.mark.parametrize('place', [0, 1, 2, -2, -1])
 def test_an_outlier_at_an_end_of_the_log_is_found(place, generator):
     log = swing(generator)
@@ -267,18 +247,6 @@ def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
     assert (list(found(log)) == ['unit_error']
             and found(log)['unit_error'].ambiguous_with == ('scale_factor_error',))
     assert not found(log, GyroModel((Term(SCALE_FACTOR_ERROR, (0.024,)),)))
-
-
-@pytest.mark.parametrize('jitter', ['none', '1 ms', 'late'])
-def test_lost_samples_are_counted_through_jitter(jitter, generator):
-    log = swing(generator)
-    kept = generator.random(6000) > 0.002
-    kept[[0, -1]] = True
-    shift = {'none': 0.0, '1 ms': np.round(log.time + 4e-4, 3) - log.time,
-             'late': generator.exponential(3e-4, 6000)}[jitter]
-    thinned = Log(output=log.output[kept], time=(log.time + shift)[kept],
-                  reference_rate=log.reference_rate[kept])
-    assert value(found(thinned)['dropped_samples']) == np.count_nonzero(~kept)
 
 
 def test_a_calculated_motion_has_no_encoder():

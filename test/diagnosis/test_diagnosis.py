@@ -158,6 +158,8 @@ def test_a_wrong_reference_is_blamed_on_the_reference(name, reference):
     assert name not in {term.effect.name for term in found.model.terms}
 
 
+# a large effect brings no companions
+
 def test_a_strobe_of_another_frequency_is_named_beside_the_scale_of_the_gyro():
     def given(sessions):
         return {'reference_scale': {'size': 59.8 / 60.0 - 1.0}}
@@ -167,8 +169,6 @@ def test_a_strobe_of_another_frequency_is_named_beside_the_scale_of_the_gyro():
     assert ({finding.effect, *finding.ambiguous_with} >= {'scale_factor_error', 'reference_scale'}
             and finding.separate_by), told(log, found)
 
-
-# a large effect brings no companions
 
 LARGE = {'time_offset': lambda sessions: {'size': 0.02},
          'scale_factor_error': lambda sessions: {'size': 0.05}, 'saturation': lambda sessions: {

@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.words import headline, is_in_extended_model
-from gyro_calibration.logs.log import Log, write_log
+from gyro_calibration.logs.log import write_log
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
@@ -163,17 +163,6 @@ def test_a_model_that_is_right_is_left_as_it_is_to_the_letter():
             and 'the model is unchanged' in headline(found)[1])
 
 
-def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
-    log = drive()
-    kept = np.delete(np.arange(len(log)), [1000, 2000, 2001, 3000])
-    fewer = Log(
-        **{name: getattr(log, name)[kept]
-           for name in ('time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
-    found = diagnosed(fewer, MODEL)
-    assert (names(found) == ['dropped_samples'] and found.model is MODEL
-            and 'the model is unchanged' in headline(found)[1])
-
-
 # a self-calibration behind the model
 
 BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
@@ -191,12 +180,6 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
 
 
 # ranges
-
-def test_a_log_without_temperature_leaves_the_range_of_the_model():
-    log = replace(drive(term('warm_up', 60.0, 4e-3)), temperature=None)
-    found = diagnosed(log, MODEL)
-    assert names(found) == ['warm_up'] and found.model.temperature_range == MODEL.temperature_range
-    assert found.model.rate_range == (-1.5, 1.5)
 
 
 # units, limit and steps

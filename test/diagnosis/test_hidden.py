@@ -29,12 +29,7 @@ from gyro_calibration_bench.hidden import (
     record_separating,
     session,
 )
-from gyro_calibration_bench.hidden.effects import (
-    COUNTED_FAULTS,
-    effect_errors,
-    STEP_EFFECTS,
-    UNIT_FACTORS,
-)
+from gyro_calibration_bench.hidden.effects import COUNTED_FAULTS, effect_errors, STEP_EFFECTS
 from gyro_calibration_bench.hidden.log import ALL
 from gyro_calibration_bench.hidden.noise import (
     draw_figures,
@@ -160,20 +155,6 @@ def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
         [truth.added_rate]) == pytest.approx(3.0 * DETECTION_SIGMAS, rel=1e-3)
 
 
-def test_a_gyro_that_is_late_or_slow_sees_the_rate_of_before(generator):
-    late, = hide(['time_offset'], 2000.0, generator, noise='white', **COARSE)
-    truth = late.truth
-    seen = (truth.prediction - truth.bias) / (1.0 + truth.scale_factor_error)
-    assert seen == pytest.approx(
-        late.session.motion.rate(late.session.time - truth['time_offset'].size), abs=1e-9)
-    slow, = hide(['bandwidth'], 2000.0, generator, noise='white', figures=NoiseFigures(1e-4),
-                 **COARSE)
-    truth, tau = slow.truth, slow.truth['bandwidth'].size
-    seen = (truth.prediction - truth.bias) / (1.0 + truth.scale_factor_error)
-    lagged = np.gradient(seen, slow.session.interval) * tau + seen
-    assert np.std(lagged - truth.rate) < 0.2 * np.std(seen - truth.rate)
-
-
 def test_faults_of_samples_are_as_many_as_it_says(generator):
     outlying, = hide(['outliers'], 4.0, generator, noise='white', **COARSE)
     truth = outlying.truth
@@ -184,13 +165,6 @@ def test_faults_of_samples_are_as_many_as_it_says(generator):
     assert (repeated == ~repeating.truth.is_good[1:]).all() and repeated.sum() >= 3 * 4
     holed, = hide(['dropped_samples'], 4.0, generator, noise='white', **COARSE)
     assert 1 <= np.sum(np.diff(holed.columns['time_s']) > 1.5 * holed.session.interval) <= 12
-
-
-def test_a_wrong_unit_is_a_round_number_or_a_delay(generator):
-    log, = hide(['unit_error'], 1.0, generator, noise='white', **COARSE)
-    rate = log.session.motion.rate(log.session.time - log.truth['unit_error'].shapes['delay'])
-    factor = np.polyfit(rate, log.columns['gyro_rad_s'], 1)[0]
-    assert min(abs(factor / value - 1.0) for value in (1.0, *UNIT_FACTORS.values())) < 1e-3
 
 
 @pytest.mark.parametrize('name', ['reference_once_per_rev', 'reference_scale', 'reference_slip'])

@@ -15,15 +15,8 @@ from dataclasses import replace
 from chance import evidence, seeds
 from diagnosed import judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.heading_regression import (
-    CauseTerm,
-    find_drift,
-    fit_spans,
-    lay_out_spans,
-)
-from gyro_calibration.calibration.reference_noise import rate_noise_share
+from gyro_calibration.calibration.heading_regression import CauseTerm, find_drift, lay_out_spans
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
-from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
@@ -253,13 +246,6 @@ def turning_once(seed):
                + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
 
 
-def test_a_course_has_no_error_of_a_shaft():
-    found = diagnosed(drive(5, 120.0, lambda time, rate, heading, temperature:
-                            0.3 * rate * np.sin(heading)))
-    assert 'shaft' in found.cannot_show['reference_once_per_rev']
-    assert 'reference_once_per_rev' not in {each.effect for each in found.findings}
-
-
 @pytest.mark.parametrize('seed', seeds(2))
 def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
     found = diagnosed(turning_once(seed), kind='course')
@@ -355,17 +341,6 @@ def test_noise_is_no_effect_of_a_motion_in_which_effects_look_alike(seed):
     assert value(found.model, 'scale_factor_error') == pytest.approx(0.01, abs=0.004)
 
 
-@pytest.mark.parametrize('interval', [0.05, 0.1])
-def test_the_noise_of_a_reference_rate_is_seen_between_two_quick_reversals(interval):
-    def to_and_fro(time):
-        return np.interp(time % 10.0, [0.0, 0.1, 4.9, 5.1, 9.9, 10.0], [0, 1, 1, -1, -1, 0])
-
-    for seed in range(3):
-        log = swing(seed, to_and_fro, 1e-4, interval)
-        assert rate_noise_share(log) == pytest.approx(0.3, rel=0.4)
-        assert rate_noise_share(replace(log, reference_rate=to_and_fro(log.time))) < 1e-3
-
-
 def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
     # at a constant rate the rounding of a fine encoder is a saw, 28 times the noise of the gyro
     time, step = np.arange(0.0, 300.0, 0.02), 0.0055 * DEGREE
@@ -376,33 +351,6 @@ def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
                   reference_heading=np.floor(heading / step) * step)
         assert (classify_reference(log).kind == 'encoder'
                 and is_reference_limiting(log, classify_reference(log)) == even)
-
-
-def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
-    # as many swings show the same error of half a sample at each code, one of them that of noise
-    generator, time, step = np.random.default_rng(4), np.arange(0.0, 220.0, 0.01), 0.4 * DEGREE
-    rate = np.convolve(np.where(time % 12.0 < 6.0, 0.2, -0.2), np.hanning(60) / 29.5, 'same')
-    heading = np.cumsum(rate) * 0.01 - 0.005 * rate + 2.1 * DEGREE
-    log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
-              reference_heading=np.floor(heading / step) * step)
-    fit, found = search_causes(fit_spans(lay_out_spans(log, 'encoder')), 0.01,
-                               lambda share, words: None)
-    assert not fit.causes and not any(each.is_established for each in found)
-
-
-@pytest.mark.parametrize('seed', [1, evidence(2)])
-def test_a_coarse_encoder_shows_the_noise_of_the_gyro_and_no_delay(seed):
-    # the error of a code that stands while the shaft rests was taken for a random walk
-    hidden = hide_with_reference([], 0.0, np.random.default_rng(seed),
-                                 ImperfectReference('encoder', 0.5))
-    found = fit_spans(lay_out_spans(log_of(hidden), 'encoder'))
-    true = hidden.truth.expected
-    assert found.noise_size('angle_random_walk') < 3.0 * true['angle_random_walk']
-    log, scale = log_of(hidden), 1.0 + true['scale_factor_error']
-    for value, sought in ((found.values[0], scale - 1.0), (found.values[2], 0.0),
-                          (found.values[1], np.mean(log.output - scale * hidden.truth.rate))):
-        place = int(np.flatnonzero(found.values == value)[0])
-        assert abs(value - sought) < 2.0 * found.half_width(place), (place, value, sought)
 
 
 @pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])

@@ -21,7 +21,7 @@ from gyro_calibration.diagnosis import rate_table as diagnosis
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import rate_temperature_polynomial, STATIC_EFFECTS
-from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, SelfCalibration, Term
+from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 import pytest
@@ -139,16 +139,6 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
 
 # models that are put to the test
 
-def test_a_value_that_the_model_has_wrong_is_put_right(without_gain):
-    generator, truth = np.random.default_rng(8), gyro('sine_response', 0.3)
-    found = diagnosed(WANDERING, truth, generator, gyro('sine_response', 0.25))
-    assert names(found) == ['sine_response']
-    change = found.findings[0].parameters['k']
-    assert (change.interval[0] < 0.05 < change.interval[1]
-            and found.before.terms[-1].values == (0.25, 1.0))
-    assert (found.model.terms[-1].values[0] == pytest.approx(0.25 + change.estimate)
-            and len(found.model.terms) == 3)
-
 
 def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
     table = replace(Table(), fastest=300.0 * DEGREE)
@@ -156,16 +146,6 @@ def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
                       gyro('sine_response', 0.25))
     assert names(found) == ['cubic_nonlinearity']
     assert [term.effect.name for term in found.model.terms] == [*NUISANCES, 'cubic_nonlinearity']
-
-
-def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_before(without_gain):
-    model = replace(GyroModel(LINEAR), temperature_range=(20.0, 30.0),
-                    self_calibration=SelfCalibration(0.01), origin={'date': '2025'})
-    found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(21),
-                      model).model
-    assert found.temperature_range == (20.0,
-                                       pytest.approx(47.0)) and found.self_calibration is None
-    assert found.origin['before'] == [{'date': '2025'}]
 
 
 # what has no name, and what is no effect

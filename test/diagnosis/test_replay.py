@@ -17,9 +17,6 @@ from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE, Log
-from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.motion import constant_rate_motion, simulate
-from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 
@@ -57,14 +54,6 @@ def gaping(smoothed):
 
 def laid_out(log):
     return replay(log, np.ones(len(log.time), dtype=bool), np.random.default_rng(0))
-
-
-def test_stamps_in_bursts_lose_no_sample():
-    time = 0.01 * np.arange(20_000)
-    late = 0.04 * (np.arange(len(time)) // 4) + 1e-3 * (np.arange(len(time)) % 4)
-    noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
-    each = laid_out(Log(time=late, output=noise))
-    assert each.grid_index[-1] == len(time) - 1 and each.interval == pytest.approx(0.01, rel=1e-3)
 
 
 def test_a_delay_is_named_as_one_beside_a_noisy_and_gaping_reference(gaping):
@@ -131,15 +120,6 @@ def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
     assert np.abs(each.reference - 0.5 * np.sin(2.0 * TIME))[each.valid].max() < 1e-5
     # four beside each end, and where the fourth difference sees the bend of the gap
     assert 8 <= np.count_nonzero(~each.valid & ~lost) < 24
-
-
-def test_the_corners_of_a_motion_known_by_its_heading_pass_for_no_dead_zone():
-    motion = constant_rate_motion([(10, 0), (10, 38), (10, 0), (10, -58), (10, 0), (20, 29),
-                                   (10, 0)] * 3, 2.0)
-    noise = Noise(1.5e-4, 1e-5)
-    log = simulate(GyroModel(noise=noise), motion, 20.0, np.random.default_rng(8))
-    log = replace(log, reference_rate=None)
-    assert not diagnose([log], np.random.default_rng(0), GyroModel(noise=noise)).findings
 
 
 @pytest.mark.parametrize('step, noise', [(1.0, 0.2), (0.5, 0.1)])

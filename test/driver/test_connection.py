@@ -102,24 +102,6 @@ def test_auto_asks_for_what_the_protocol_needs():
         'csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
 
 
-def test_stamps_go_on_when_another_gyro_is_recognized():
-    """The other sends 20 times faster than it is said to, and seems to have begun long before."""
-    world, settings = World(40.0), Settings(columns=('gyro_dps',), sample_rate=10.0)
-    world.gyro('kvh_dsp3000', end=20.0)
-    world.gyro('csv', settings=settings, begin=20.0, rate=200.0)
-    reading = Reading(world, settings=settings)
-    assert reading.connection.protocol is find_protocol('csv') and min(reading.steps) > 0.0
-
-
-@pytest.mark.parametrize('protocol, state', [('auto', 'listening'), ('csv', 'failed')])
-def test_listening_and_waiting_end_on_request(protocol, state):
-    stop, world = threading.Event(), World(60.0)
-    world.plugged = protocol == 'auto'
-    connection = Connection('/dev/gyro', protocol, on_change=lambda _: stop.set(), clock=world,
-                            make_port=world.port)
-    assert list(connection.chunks(stop)) == [] and connection.state.name == state
-
-
 # Finding and waiting
 
 

@@ -10,7 +10,6 @@
 
 """The emulated gyro, read through a real pseudo-terminal."""
 
-from dataclasses import replace
 import itertools
 import math
 import os
@@ -73,14 +72,6 @@ def test_samples_come_at_their_times(speed):
     assert arrivals[-1] - arrivals[0] < 20.0
 
 
-def test_samples_are_pulled_one_by_one():
-    pulled = []
-    source = (pulled.append(sample) or sample for sample in samples(rate=10.0))
-    with Emulator(find_protocol('csv'), source, wait_for_reader=True) as emulator:
-        received = read_all(emulator.path, 'csv', enough=3)
-        assert len(pulled) <= len(received) + 1
-
-
 def test_bytes_that_are_not_read_are_lost_in_real_time(wait_until):
     with Emulator(find_protocol('csv'), samples(rate=1000.0)) as emulator:
         wait_until(lambda: emulator.lost_bytes > 1000)
@@ -127,16 +118,6 @@ def test_what_an_emulator_cannot_do_is_refused_before_the_start(given, words):
 def test_a_sample_without_a_time_is_refused():
     with pytest.raises(ValueError, match='set Sample.time'):
         emulate(Emulator(find_protocol('csv'), [Sample(0.5)]))
-
-
-def test_samples_are_numbered():
-    sent = []
-    protocol = replace(
-        find_protocol('csv'),
-        writer=lambda settings: lambda _, sample: sent.append(sample.sequence) or b'')
-    with Emulator(protocol, samples(100, 1e4)) as gyro:
-        gyro._thread.join()
-    assert sent == list(range(100))
 
 
 def test_eleven_thousand_samples_a_second_are_sent_in_time():

@@ -324,22 +324,6 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
             and change.size == pytest.approx(3.0, abs=0.5))
 
 
-def test_units_that_drift_apart_have_slopes_of_their_own():
-    """Over age, with references whose errors on each drive are many times larger."""
-    generator = np.random.default_rng(10)
-    unit, drive = np.indices((8, 6)).reshape(2, -1)
-    age, slopes = np.linspace(-1.5, 1.5, 6)[drive], np.linspace(-2.0, 4.0, 8)
-    values = (unit + slopes[unit] * age + 10.0 * generator.standard_normal(6)[drive]
-              + 0.1 * generator.standard_normal(48))
-    pooled = PooledValue(Observations(values, np.full(48, 0.1), unit, drive, age[:, None], 1))
-    assert pooled.components['slopes_0'].low < np.std(slopes) < pooled.components['slopes_0'].high
-    apart = pooled.estimate(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1)
-    assert apart.value - apart.value.mean() == pytest.approx(slopes - 1.0, abs=0.2)
-    whole = pooled.estimate(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)), part=1)
-    # the mean slope contains that of the references, the differences between units do not
-    assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
-
-
 def records(ramp=0.0):
     """Return records of five units on four drives, in which a ramp repeats or only wanders."""
     generator = np.random.default_rng(9)

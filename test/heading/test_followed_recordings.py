@@ -14,7 +14,7 @@ import contextlib
 from functools import cache
 import math
 
-from gyro_calibration.calibration.self_calibration import calibrate_bias, self_calibrate
+from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.compensation import quadratic_form
@@ -126,16 +126,3 @@ def test_a_node_that_is_calibrated_by_odometry_on_20_s_follows_the_encoder_for_f
     assert answers and answers[0][0], answers
     error, pure = np.array(found) - found[0] - heading, integrate(time, output) - heading
     assert rms(error) < rms(pure) / 3.0, (rms(error), rms(pure), answers)
-
-
-@pytest.mark.parametrize('name, change', [('slow', 0.3), ('fast', 0.1)])
-def test_one_axis_that_tilts_has_another_bias_about_the_vertical_than_at_rest(data, name, change):
-    log = read_log(data / 'mems_motion_capture' / f'{name}.csv.gz')
-    known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
-    resting, moving = (known & (log.time > begin) & (log.time < end)
-                       for begin, end in ((10.0, 30.0), (45.0, 150.0)))
-    bias, deviation = calibrate_bias(log.time[resting], log.output[resting])
-    in_motion = np.mean(log.output[moving] - log.reference_rate[moving])
-    print(f'{name}: at rest {bias / DEGREE:.3f} +- {deviation / DEGREE:.4f} deg/s, in motion '
-          f'{in_motion / DEGREE:.3f} deg/s')
-    assert bias - in_motion > max(change * DEGREE, 30.0 * deviation)

@@ -144,19 +144,6 @@ def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
             and found.intervals.longest_gap == pytest.approx(0.9, abs=0.02))
 
 
-@pytest.mark.parametrize('false_alarms', [0.0, 0.1])
-@pytest.mark.parametrize('gap', [0.5, 0.99, 1.01, 30.0, 86400.0])
-def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap, false_alarms):
-    tracker = HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms))
-    lost, losses = round(gap / INTERVAL), 3
-    for index in range(400 * (losses + 1)):
-        message = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
-        assert bool(message) == (gap > 1.0 and index % 400 == 0 < index)
-    assert (tracker.intervals.lost_samples == losses * lost
-            and tracker.intervals.longest_gap == pytest.approx(gap + INTERVAL))
-    assert tracker.intervals.usual_interval == pytest.approx(INTERVAL)
-
-
 @pytest.mark.parametrize('option', [(), ('--rest',)])
 def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, compensate):
     model = GyroModel(noise=WHITE,

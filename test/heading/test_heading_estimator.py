@@ -243,16 +243,6 @@ def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(ter
     assert abs(gyro.error - before) < 2.0 * DEGREE
 
 
-def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is_known():
-    known = []
-    for seconds in (1.0, 300.0, 3600.0):
-        gyro = Gyro(begun()).go(1.0).go(20.0, temperature=None)
-        gyro.live.use_calibration(MODEL, gyro.now + gyro.time)
-        gyro.live.add(gyro.time + seconds, 0.0, NOW)
-        known.append(gyro.live.bias_variance)
-    assert known[0] < 1.1 * (0.01 * DEGREE) ** 2 and 9.0 * known[0] < known[1] < known[2]
-
-
 @pytest.mark.parametrize('known', [False, True], ids=['unknown coefficient', 'known coefficient'])
 def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
     entries = [Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0)

@@ -74,14 +74,6 @@ def test_a_log_in_blocks_or_samples_is_filtered_and_integrated_as_in_one_piece(s
     assert deviation == pytest.approx(whole[2], rel=1e-12)
 
 
-def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
-    time = np.arange(500) * INTERVAL
-    rate = 5.0 * DEGREE * np.sin(2 * np.pi * 10.0 * time)  # two whole periods in the window
-    assert (filtered_singly(Threshold(), time, rate)[20:] == 0.0).all()
-    seen = filtered_singly(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
-    assert np.array_equal(seen[20:], rate[20:])
-
-
 S, B = 0.02, 0.002
 UNCERTAIN = ((1e-4, -2e-6), (-2e-6, 1e-6))
 
@@ -102,26 +94,6 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
     ratios = np.mean(np.square(ends), axis=0) / deviation[[1500, 6000]] ** 2
     # To first order in s, 2 % here.
     assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)
-
-
-def test_over_a_long_gap_neither_blocks_nor_tracker_integrate():
-    model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
-    time, rate = (values[:3000] for values in noisy_robot())
-    time = time + 86400.0 * (np.arange(3000) >= 1000)
-    sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
-    covariance = uncertainty_covariance(model)
-    tracker = HeadingTracker(XV3500, covariance,
-                             Settings(false_alarms=0.0, threshold=Threshold(0.0)))
-    for sample in zip(time.tolist(), rate.tolist(), sensitivity.T):
-        tracker.add(*sample)
-    integrator = BlockIntegrator(Threshold(0.0), XV3500, covariance)
-    parts = [integrator.add(time[rows], rate[rows], sensitivity[:, rows])
-             for rows in (slice(0, 1000), slice(1000, 1700), slice(1700, 3000))]
-    _, heading, deviation = map(np.concatenate, zip(*parts))
-    turned = integrate(time[:1000], rate[:1000])[-1] + integrate(time[1000:], rate[1000:])[-1]
-    assert heading[-1] == pytest.approx(turned) == pytest.approx(tracker.heading)
-    assert deviation[999] < 0.1 and deviation[1000] > math.tau
-    assert deviation[-1] == pytest.approx(math.sqrt(tracker.variance), rel=1e-3)
 
 
 @pytest.mark.parametrize('settings', [Threshold(), Threshold(0.0)], ids=['threshold', 'pure'])

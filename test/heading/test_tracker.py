@@ -238,23 +238,6 @@ def test_the_deviation_includes_what_the_threshold_filter_deletes():
         assert 0.5 < abs(error[-1]) / stated[-1] < 2.0
 
 
-def test_the_slowest_turn_that_is_noticed_is_noticed():
-    tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
-                            np.random.default_rng(6))
-    for at, value in zip(time, rate):
-        tracker.add(at, value, np.array([-value, -1.0]))
-    slowest = tracker.slowest_detectable_rate
-    assert 0.02 * DEGREE < slowest < 0.1 * DEGREE
-    generator, noticed = np.random.default_rng(7), 0
-    for _ in range(12):
-        motion = motion_from_rates(np.array([0.0, 60.0, 60.1, 200.0]),
-                                   np.array([0.0, 0.0, slowest, slowest]))
-        time, _, _, rate = gyro(motion, generator)
-        noticed += not follow(time, rate).resting[time > 70.0].all()
-    assert noticed >= 9, noticed
-
-
 def test_false_alarms_are_as_rare_as_stated():
     """At a stated rate of 20 in an hour, over an hour of three gyros: a Poisson count."""
     alarms = 0
@@ -296,17 +279,6 @@ def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(chan
         assert not tracker.add(INTERVAL * index, bias + drawn, np.array([-1.0]), False)
     assert tracker.is_resting and tracker.bias[0] == pytest.approx(0.0, abs=1e-4)
     assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
-
-
-@pytest.mark.parametrize('interval', [0.45, 0.5], ids=['lost samples', '2 Hz'])
-def test_a_rest_is_found_where_one_interval_is_as_long_as_the_window(interval):
-    generator = np.random.default_rng(9)
-    time = (0.5 * np.arange(200.0) if interval == 0.5
-            else np.cumsum(np.where(np.arange(3000) % 100, INTERVAL, interval)))
-    rate = (XV3500.angle_random_walk * generator.standard_normal(len(time))
-            / math.sqrt(np.median(np.diff(time))))
-    resting = follow(time, rate).resting
-    assert resting.mean() > 0.9 and resting[-1]
 
 
 def test_hindsight_does_not_reach_over_a_gap():

@@ -194,18 +194,6 @@ def test_names_types_and_qualities_are_those_of_the_documents(hold):
     assert {'calibrated', 'running'} <= {pair.key for pair in status.values}
 
 
-def test_samples_that_come_while_the_node_is_not_let_run_are_all_used(by_udp, start):
-    node, gyro = start()
-    os.killpg(node.process.pid, signal.SIGSTOP)
-    for _ in range(100):  # as many fit into the buffer of a socket
-        gyro.send(0.5)
-        time.sleep(PACE)
-    os.killpg(node.process.pid, signal.SIGCONT)
-    gyro.wait_until(lambda: len(gyro.imu) == 100, what='all samples')
-    yaw = gyro.imu[-1].orientation
-    assert 2.0 * math.atan2(yaw.z, yaw.w) == pytest.approx(0.5 * 1.0, abs=0.01)
-
-
 def test_parameters_are_checked_described_and_taken_on_at_once(hold):
     held = hold(stationary__threshold=0)
     names = held.node.get_parameters_by_prefix('')

@@ -502,23 +502,6 @@ def test_stamps_that_leap_by_less_than_a_gap_are_in_the_variance(tmp_path):
     assert 0.5 < off < 3.0 * math.sqrt(last.heading_variance), off
 
 
-def test_a_gap_as_long_as_a_step_of_the_clock_is_none(tmp_path):
-    """The samples are stamped by another host, whose clock was not set."""
-    rig = rested(tmp_path)
-    stamp, clock, begin = rig.stamp, rig.clock, len(rig.outputs) - 1
-    rig.stamp = lambda reading: stamp(reading) - round(1e9 * clock.set_by)
-    clock.set_by = 5.0
-    rig.go(1.0)
-    rig.robot.unplugged = True
-    rig.robot.command(0.7)
-    rig.go(5.0)
-    rig.robot.unplugged = False
-    rig.robot.command(0.0)
-    rig.go(5.0)
-    error, deviation = rig.error(begin)
-    assert abs(error) > 3.0 and abs(error) < 3.0 * deviation, (error, deviation)
-
-
 # The monitor of noise and bias
 
 
@@ -562,15 +545,6 @@ def test_a_time_offset_moves_the_published_stamps(tmp_path):
     rig = Rig(tmp_path, model=model({'time_offset': {'time_offset': 0.02}}))
     found = rig.feed(np.full(3, 0.5))
     assert [rig.fed - each.stamp for each in found] == [40_000_000, 30_000_000, 20_000_000]
-
-
-def test_over_a_jump_back_of_the_stamps_the_past_of_an_effect_goes_on(tmp_path):
-    lag = {'thermal_lag': {'thermal_lag': 1e-3, 'time_constant': 40.0}}
-    rig = Rig(tmp_path, model=model(lag), stationary_threshold=0.0)
-    ahead = rig.feed(np.full(20, 0.5), temperature=np.repeat([20.0, 30.0], 10))[-1].rate - 0.5
-    rig.skip(-5.0, steady=0.0)
-    after = rig.feed(np.full(2, 0.5), temperature=30.0)[-1].rate - 0.5
-    assert ahead == pytest.approx(0.01, rel=0.01) and after == pytest.approx(ahead, rel=0.01)
 
 
 # What is reported
@@ -626,21 +600,6 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
     level, message, _ = reported(rig)
     assert (level == WARN and 'stamps on imu/data_raw advanced by' in message) == warns, message
     assert (rig.error(first)[1] > math.tau) == warns
-
-
-def test_samples_that_were_held_up_do_not_leave_the_clock(tmp_path, reported):
-    rig, waiting = rested(tmp_path), []
-    for _ in range(400):
-        rig.clock.now += INTERVAL
-        reading = rig.robot.step()
-        waiting.append((rig.stamp(reading), reading.output, reading.heading))
-    rig.guards()
-    for each in waiting:
-        rig.sample(*each)
-    for _ in range(4):
-        rig.go(1.0)
-        level, message, _ = reported(rig)
-    assert level == OK, message
 
 
 def test_a_count_is_a_warning_only_while_it_grows(tmp_path, reported):
