@@ -96,7 +96,7 @@ os.environ.update({
 })
 
 
-_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch'
+_TIMED = 'test_connection', 'test_fuzz', 'test_launch'
 
 # Of those that only compute, what takes longest comes first: the last files, which one of several
 # processes may have to itself, are then short ones.

@@ -141,16 +141,6 @@ def test_numbers_of_the_contradictions_follow_by_hand(source, words, wanted):
         assert found[name] == pytest.approx(value, rel=None if error else 1e-6, abs=error), name
 
 
-def test_eq_10_as_printed_puts_several_powers_into_one_column():
-    columns = {}
-    for i in range(1, 5):
-        for j in range(1, 4):
-            columns.setdefault(i + (j - 1) * 3, []).append((3 - i + 1, 2 - j + 1))
-    found = numbers('ojeda', 'same for several pairs')
-    assert found['printed'] == len(columns) == 10 and columns[4] == [(3, 1), (0, 2)]
-    assert (found['right'], found['cubic'], found['cubic_right']) == (12, 13, 16)
-
-
 # Hong and Park
 
 def by_hand(motion, shift=0):

@@ -16,18 +16,12 @@ import hashlib
 import json
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, extract_dwells, select_dwells
-from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects
-from gyro_calibration.calibration.scatter import rms
+from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.rate_table import compute_turn_errors
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, write_log
 from gyro_calibration.model.compensation import compensate
-from gyro_calibration.model.effects import (
-    BIAS,
-    rate_temperature_polynomial,
-    SCALE_FACTOR_ERROR,
-    SINE_RESPONSE,
-)
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import motion_from_rates, simulate
 from gyro_calibration.model.noise import Noise
@@ -126,15 +120,6 @@ def sweeps(seed=0, deviation=1e-5, odd=None):
     errors = 0.2 + 0.01 * rates + np.where(number == odd, 0.02 * rates, 0.0)
     return table(rates, errors + np.random.default_rng(seed).normal(0.0, deviation, len(rates)),
                  sweep=number)
-
-
-def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_tenth(data):
-    found = extract_dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
-    fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
-    kept = fit.scatter.inliers
-    errors = compute_turn_errors(select_dwells(found, kept), fit.left_out_rate[kept])
-    assert np.abs(errors.static).max() > 0.02 * TURN > np.abs(errors.modelled).max()
-    assert rms(errors.static) > 10.0 * rms(errors.modelled)
 
 
 # the program

@@ -22,7 +22,6 @@ from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_oracle import GYROS, score
 import numpy as np
-from operations import operations
 import pytest
 from rig import BEGIN, Rig
 from scipy.signal import lfilter
@@ -139,20 +138,6 @@ def test_compensate_and_the_node_give_the_same_heading_while_the_gyro_warms_up(
         error = np.abs(found['heading_rad'] - true)
         assert error[-1] < 3.0 * found['heading_std_rad'][-1], words
         assert error.max() < 10.0 * DEGREE, (words, '80 deg where the bias is that of the begin')
-
-
-def test_a_log_at_once_takes_a_third_of_the_operations_of_single_samples():
-    model = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
-    time, _, output, _ = drive(50.0, 4)
-    corrected = np.asarray(CALIBRATED.correct(output))
-    sensitivity = np.ascontiguousarray(rate_sensitivity(model, output, corrected, 25.0).T)
-    still = rate_sensitivity(model, 0.0, 0.0, 25.0)
-
-    def follower():
-        return HeadingTracker(NOISE, uncertainty_covariance(model), Settings(), 0.0)
-    singly = operations(lambda: by_samples(follower(), time, corrected, sensitivity, still, None))
-    at_once = operations(lambda: follower().follow(time, corrected, sensitivity, None, still))
-    assert at_once < singly / 3.0
 
 
 @pytest.mark.parametrize('duration', [0.03, 0.2, 1.5, 3.0])

@@ -96,6 +96,15 @@ def test_blocks_of_a_log_say_what_the_whole_says(cuts):
     assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
+def test_a_lag_goes_on_in_blocks_that_do_not_use_it():
+    history, (temperature, *_) = ChannelHistory(), surroundings(UNEVEN)
+    history.update(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
+    history.update(UNEVEN[10:2000], temperature[10:2000])
+    last = history.update(UNEVEN[2000:], temperature[2000:]).lagged('temperature', 20.0)
+    assert last == pytest.approx(
+        ChannelHistory().update(UNEVEN, temperature).lagged('temperature', 20.0)[2000:], rel=1e-12)
+
+
 def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
     history = ChannelHistory(default_temperature=33.0)
     early = history.update(0.0)
