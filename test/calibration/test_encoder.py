@@ -16,8 +16,7 @@ What was put in is found, with true intervals, on simulated logs and on measured
 
 from dataclasses import replace
 
-from chance import fewest, rms_bounds
-import efficiency
+from chance import fewest
 from encoder_intervals import run
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
@@ -165,19 +164,6 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
     assert (within >= fewest(runs, 0.95)).all(), within
     assert (found[:, 1].mean(axis=0)
             < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
-
-
-@pytest.mark.parametrize('step, noise, runs', [
-    (0.088, 0.02, 15), pytest.param(0.088, 0.02, 40, marks=pytest.mark.evidence),
-    pytest.param(5.0, 0.5, 40, marks=pytest.mark.evidence)])
-def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(
-        step, noise, runs):
-    """By a ratio of 1.1, as benchmarks/efficiency.py does for more cases and runs."""
-    found = np.array([efficiency.errors(step * DEGREE, noise * DEGREE, seed)[:2]
-                      for seed in range(runs)])
-    ratios = (found ** 2).mean(axis=0) / efficiency.bound(step * DEGREE, noise * DEGREE, False)
-    assert (ratios[0] < 1.1 * rms_bounds(runs)[1] ** 2).all(), ratios
-    assert (ratios[1] > 3.0).all(), ratios
 
 
 def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():

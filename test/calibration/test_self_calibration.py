@@ -16,7 +16,6 @@ The methods reproduce the paper's numbers, and the fit finds the truth with its 
 """
 
 import contextlib
-import math
 
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.calibration.self_calibration import (
@@ -26,8 +25,7 @@ from gyro_calibration.calibration.self_calibration import (
     fit_rate,
     self_calibrate,
 )
-from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
+from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION,
     motion_from_headings,
@@ -201,25 +199,3 @@ def test_a_bias_is_taken_only_of_a_gyro_at_rest(true, reason):
     output = np.zeros(len(TIME)) if true is None else run(0, true)
     with pytest.raises(DataRefused, match=reason):
         calibrate_bias(TIME[:len(output)], output, noise=XV3500)
-
-
-def heading_error(log, start, calibrated):
-    """Return the rms heading error, deg, over 300 s from `start`, calibrated on 20 s or not."""
-    used = (log.time >= start) & (log.time < start + 300.0)
-    time, output = log.time[used] - log.time[used][0], -log.output[used]  # mounted upside down
-    heading, first, fit = log.reference_heading[used], time < 20.0, None
-    if calibrated:
-        fit = self_calibrate(time[first], output[first],
-                             motion_from_headings(time[first], heading[first]))
-        output = (output - fit.bias) / (1.0 + fit.scale_factor_error)
-    error = integrate(time, output) - (heading - heading[0])
-    return math.sqrt(np.mean(error ** 2)) / DEGREE
-
-
-def test_20_s_by_an_encoder_take_two_thirds_off_the_error_of_a_measured_gyro(data):
-    log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
-    starts = (0, 100, 300, 500, 700, 1000, 1200)
-    table = {start: (heading_error(log, start, True), heading_error(log, start, False))
-             for start in starts}
-    ratios = [calibrated / pure for calibrated, pure in table.values()]
-    assert ratios[0] < 1 / 3 and max(ratios) < 0.6 and np.median(ratios) < 1 / 3, table

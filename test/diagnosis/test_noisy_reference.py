@@ -21,7 +21,6 @@ from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
-from gyro_calibration.logs.recording import interpolate_with_gaps
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
@@ -235,27 +234,6 @@ def test_a_step_of_the_bias_beside_a_course_is_established_and_in_no_model(ends)
     assert steps[0].where[1] == pytest.approx(ends[1] if len(ends) == 2 else 240.0, abs=5.0)
 
 
-def turning_once(seed):
-    """Return a log of one turn, of which a course that slips shows 10 % too much."""
-    generator, time = np.random.default_rng(seed), np.arange(0.0, 240.0, 1.0 / RATE)
-    turn = 0.6 * np.sin(np.pi * (time - 200.0) / 6.0) ** 2 * ((time > 200.0) & (time < 206.0))
-    fixes = np.arange(0.0, 240.0, 0.2)
-    course = (1.1 * np.interp(fixes, time, np.cumsum(turn) / RATE)
-              + 0.3 * DEGREE * generator.standard_normal(len(fixes)))
-    return Log(time=time, reference_heading=np.interp(time, fixes, course), output=turn
-               + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
-
-
-@pytest.mark.parametrize('seed', seeds(2))
-def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
-    found = diagnosed(turning_once(seed), kind='course')
-    assert 'Fewer than three stretches' in ' '.join(found.remarks)
-    follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
-              'reference_once_per_rev'}
-    assert not follow & {each.effect for each in found.findings}, terminal_lines(found)
-    assert all('three stretches' in found.cannot_show[name] for name in follow)
-
-
 def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_reported():
     log = drive(7)
     right = diagnosed(log).model
@@ -351,22 +329,6 @@ def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
                   reference_heading=np.floor(heading / step) * step)
         assert (classify_reference(log).kind == 'encoder'
                 and is_reference_limiting(log, classify_reference(log)) == even)
-
-
-@pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])
-def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
-    # 20 Hz, interpolated at 100 Hz as of a bag, with a gyro that is late and has a scale error
-    generator, time = np.random.default_rng(5), np.arange(0.0, 60.0, 0.01)
-    rate = 0.8 * np.sin(0.9 * time) * np.sin(0.23 * time)
-    at = np.arange(begins, 60.0 - ends, 0.05)
-    heading = np.interp(at, time, np.cumsum(rate) * 0.01)
-    log = Log(output=1.02 * np.interp(time - 0.02, time, rate) + BIAS_TRUE
-              + 1e-3 * generator.standard_normal(len(time)), time=time,
-              reference_heading=interpolate_with_gaps(
-                  time, at, heading + 3e-4 * generator.standard_normal(len(at))))
-    assert np.isnan(log.reference_heading[[0, -1]]).all()
-    reference = classify_reference(log)
-    assert reference.kind == 'motion_capture' and 'lost' not in reference.evidence
 
 
 def odometry(seed, drift, asymmetry=0.0, warming=0.0):
