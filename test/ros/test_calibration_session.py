@@ -413,6 +413,17 @@ def test_a_run_without_samples_ends_after_5_s(tmp_path, kind):
     assert rig.clock.now - begin == pytest.approx(SAMPLE_TIMEOUT, abs=0.6)
 
 
+def test_a_jump_of_the_stamps_ends_a_run_and_the_reason_names_it(tmp_path):
+    rig = Rig(tmp_path)
+    rig.feed(np.zeros(300))
+    rig.begin(REST)
+    rig.feed(np.zeros(300))
+    rig.skip(3.0)
+    rig.feed([0.0])
+    success, message = rig.session.conclude()
+    assert not success and 'no samples for 3.0' in message and 'run again' in message
+
+
 def test_an_error_in_the_fit_changes_nothing_and_the_next_run_works(tmp_path, monkeypatch):
     rig = rested(tmp_path, calibration_drive=True)
     with monkeypatch.context() as patched:
