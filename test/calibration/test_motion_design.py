@@ -14,8 +14,6 @@ from functools import cache
 import json
 import math
 
-from chance import rms_bounds
-from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.motion_design import (
     CalibrationForecast,
     can_follow,
@@ -40,7 +38,6 @@ from gyro_calibration.model.motion import (
 )
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
-from plan import followed
 import pytest
 import yaml
 
@@ -108,26 +105,6 @@ def test_a_calibration_states_what_the_plan_promised(size):
     promised = CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0).predict(CALIBRATION_MOTION)
     ratio = np.median(deviations, axis=0) / (promised.scale_deviation, promised.bias_deviation)
     assert (np.abs(np.log(ratio)) < math.log(1.1)).all(), ratio
-
-
-FOLLOWED = {'as planned': ('a cable', 0.0, 0.0),
-            'late by 0.05 s, lag of 0.1 s': ('limited jerk', 0.05, 0.1)}
-
-
-@pytest.mark.parametrize('name, late, lag', FOLLOWED.values(), ids=FOLLOWED)
-def test_fits_scatter_as_predicted(name, late, lag):
-    """200 runs are in the benchmark."""
-    motion, errors = planned(name).motion, []
-    rate = followed(motion, TIME, late, lag)
-    for seed in range(20):
-        fit = fit_likelihood(
-            TIME, rate + simulate_noise(WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])),
-            motion, 0.2)
-        errors.append((fit.scale_factor_error, fit.bias))
-    expected = CalibrationForecast(WHITE, 20.0, ROBOT_MOTION, 160.0, 0.0).predict(motion)
-    ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
-    low, high = rms_bounds(19)
-    assert ((low < ratios) & (ratios < high)).all(), ratios
 
 
 IMPOSSIBLE = {

@@ -155,18 +155,6 @@ def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
         [truth.added_rate]) == pytest.approx(3.0 * DETECTION_SIGMAS, rel=1e-3)
 
 
-def test_faults_of_samples_are_as_many_as_it_says(generator):
-    outlying, = hide(['outliers'], 4.0, generator, noise='white', **COARSE)
-    truth = outlying.truth
-    far = np.abs(outlying.columns['gyro_rad_s'] - truth.prediction) > 6.0 * np.std(truth.noise)
-    assert far.sum() == truth['outliers'].size == 12.0 and (far == ~truth.is_good).all()
-    repeating, = hide(['stuck_samples'], 4.0, generator, noise='white', **COARSE)
-    repeated = np.diff(repeating.columns['gyro_rad_s']) == 0.0
-    assert (repeated == ~repeating.truth.is_good[1:]).all() and repeated.sum() >= 3 * 4
-    holed, = hide(['dropped_samples'], 4.0, generator, noise='white', **COARSE)
-    assert 1 <= np.sum(np.diff(holed.columns['time_s']) > 1.5 * holed.session.interval) <= 12
-
-
 @pytest.mark.parametrize('name', ['reference_once_per_rev', 'reference_scale', 'reference_slip'])
 def test_a_wrong_reference_leaves_the_gyro_alone_and_errs_in_rate_as_in_heading(generator, name):
     each = session(generator, 300.0, 100.0)

@@ -18,7 +18,6 @@ samples, over many drives.
 
 import math
 
-from faulty_heading import one
 from gyro_calibration.heading.integration import gap_variances, integrate, Intervals
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Log
@@ -159,12 +158,3 @@ def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, compensa
         assert (f'{(~comes).sum()} samples are lost' in text) == lost
         deviations.append(float(text.partition('+-')[2].split()[0]))
     assert deviations[1] > 1.2 * deviations[0]
-
-
-def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is():
-    """A short run of `benchmarks/faulty_heading.py`, which tells by how much of 30 minutes."""
-    faults = 'clean', '1 % lost, bursts', '1 % lost, usual interval for each'
-    drives = [one(('RD2100', INTERVAL, 120.0, seed, faults)) for seed in range(2)]
-    clean, stamped, bridged = (math.sqrt(np.mean([drive[fault][0] ** 2 for drive in drives]))
-                               for fault in faults)
-    assert stamped < 1.3 * clean < 0.1 * bridged
