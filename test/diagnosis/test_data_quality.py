@@ -183,14 +183,6 @@ def test_samples_that_quantization_repeats_are_no_repeated_samples(step, generat
     assert list(found(coarse(swing(generator), step * SIGMA))) == ['quantization']
 
 
-def test_samples_that_a_coarse_gyro_repeats_in_a_turn_are_found(generator):
-    log = coarse(swing(generator), 3.0 * SIGMA)
-    start = int(np.argmax(np.abs(np.diff(log.reference_rate[:5900], prepend=0.0))))
-    log.output[start:start + 30] = log.output[start]
-    stuck, = (each for each in inspect_record(log).findings if each.effect == 'stuck_samples')
-    assert stuck.p_value < 1e-4
-
-
 @pytest.mark.parametrize('ways', [1, 2])
 @pytest.mark.parametrize('within', [1.0, 3.0, 10.0, 50.0])
 def test_a_dead_band_is_no_fault_of_the_record(within, ways, any_generator):

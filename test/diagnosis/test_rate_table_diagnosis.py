@@ -116,17 +116,6 @@ def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(withou
     assert members(found) == {'sine_response'}
 
 
-def test_asymmetry_and_a_parabola_are_a_set_where_it_is_small(without_gain):
-    generator = np.random.default_rng(5)
-    large = diagnosed(Table(), gyro('scale_factor_asymmetry', 0.02), generator)
-    assert names(large) == ['scale_factor_asymmetry'] and not large.findings[0].ambiguous_with
-    small = diagnosed(Table(),
-                      gyro('scale_factor_asymmetry', 1.5 * large.findings[0].minimum_detectable),
-                      generator)
-    assert (members(small.findings[0]) == {'scale_factor_asymmetry', 'quadratic_nonlinearity'}
-            and small.findings[0].separate_by)
-
-
 def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_again(without_gain):
     generator, truth = np.random.default_rng(6), gyro('bias_temperature', 1e-4)
     up = Table().measure(truth, generator)

@@ -134,14 +134,6 @@ def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
     assert 'check that the gyro responds to turns' in check.noise_alarm
 
 
-@pytest.mark.filterwarnings('error')
-def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_examined():
-    """As where a busy computer gave a gyro the stamps of one second."""
-    time = np.append(np.linspace(0.0, 0.9, 490), np.linspace(1.5, STRETCH_DURATION, 10))
-    output = 7e-4 * np.random.default_rng(21).standard_normal(len(time))
-    assert examine_stretch(time, output, output, MEMS, 1e-3) is None
-
-
 def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
     generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
     covariance, alarms, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
