@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The restricted likelihood over a grid of noise sizes: its intervals, and gaps as long spans."""
+"""The restricted likelihood over a grid of noise sizes: by the textbook, and its sizes."""
 
 import math
 

@@ -179,9 +179,6 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
     assert value(found.model, 'bias') == pytest.approx(2e-3 + 1.01 * 1e-3, abs=2e-4)
 
 
-# ranges
-
-
 # units, limit and steps
 
 @pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)],

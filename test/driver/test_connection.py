@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A gyro on a port that is found, recognized, lost, and found again, by an injected clock."""
+"""A gyro on a port: found, recognized, lost and found again by an injected clock; and emulated."""
 
 import contextlib
 import itertools
