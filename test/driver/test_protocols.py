@@ -458,6 +458,17 @@ def test_a_lost_frame_never_joins_halves_of_two_values(count):
             {2 * pair, 2 * pair + 1}.isdisjoint(lost) for pair in range(8))
 
 
+def test_halves_with_garbage_between_are_not_joined():
+    """Eight lost frames bring the right number back, but the low byte is of a later value."""
+    halves = fizoptika(1, 2, 0x40), fizoptika(2, 3, 0x01)
+    assert values(halves[0], b'\xdd\x00', halves[1]) == [(None, {}), (None, {})]
+    decoder = FIZOPTIKA.decoder(ONE_COUNT)
+    first, = decoder.feed(halves[0])
+    decoder.reset()
+    second, = decoder.feed(halves[1])
+    assert first.health == second.health == {}
+
+
 # KVH 1750: the frame of interface control document 56-0298, section 5.2.1
 
 
