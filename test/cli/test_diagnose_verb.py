@@ -155,5 +155,3 @@ def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, r
     assert code != 0 and not text and one_sentence(errors)
     assert sorted(tmp_path.rglob('*')) == before
     assert taken != 'found' or (tmp_path / taken).read_text() == 'mine'
-
-

@@ -32,6 +32,7 @@ from gyro_calibration.heading.bias_table import (
     BiasTable,
     Entry,
     Jump,
+    MAX_ENTRIES,
     model_digest,
     read_bias_table,
     write_bias_table,
@@ -147,6 +148,17 @@ def test_what_is_off_and_does_not_agree_is_no_jump():
     # the two of before no longer count
     assert 'not used' in table.add(before, 0.5 * DEGREE, WHITE, 760.0)
     assert abs(table.predict(before, 800.0)[0]) < 0.01 * DEGREE
+
+
+def test_many_jumps_and_runs_leave_a_table_that_works():
+    table, generator = BiasTable(MODEL), np.random.default_rng(4)
+    for run in range(MAX_ENTRIES + 10):
+        for number in range(4):
+            table.add(20.0 + run % 7, 1.0 * DEGREE * run, WHITE, DAY * run + 60.0 * number)
+        table.begin_run()
+    assert len(table.entries) == MAX_ENTRIES and 0 < len(table.jumps) <= MAX_ENTRIES
+    assert np.isfinite(
+        table.predict(generator.uniform(20.0, 27.0), DAY * (MAX_ENTRIES + 10))).all()
 
 
 @pytest.mark.parametrize(

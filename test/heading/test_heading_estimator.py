@@ -261,6 +261,13 @@ def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
                                  300.0)) == known)
 
 
+def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
+    gyro = Gyro(begun()).go(12.0)
+    assert not gyro.live.table.entries
+    gyro.live.update_table(gyro.now + gyro.time, ending=True)
+    assert len(gyro.live.table.entries) == 1
+
+
 def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():
     table = BiasTable(MODEL)
     gyro = Gyro(begun(table=table)).go(40.0, wheels=False)

@@ -238,6 +238,23 @@ def test_the_deviation_includes_what_the_threshold_filter_deletes():
         assert 0.5 < abs(error[-1]) / stated[-1] < 2.0
 
 
+def test_the_slowest_turn_that_is_noticed_is_noticed():
+    tracker = HeadingTracker(XV3500, KNOWN, Settings())
+    time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+                            np.random.default_rng(6))
+    for at, value in zip(time, rate):
+        tracker.add(at, value, np.array([-value, -1.0]))
+    slowest = tracker.slowest_detectable_rate
+    assert 0.02 * DEGREE < slowest < 0.1 * DEGREE
+    generator, noticed = np.random.default_rng(7), 0
+    for _ in range(12):
+        motion = motion_from_rates(np.array([0.0, 60.0, 60.1, 200.0]),
+                                   np.array([0.0, 0.0, slowest, slowest]))
+        time, _, _, rate = gyro(motion, generator)
+        noticed += not follow(time, rate).resting[time > 70.0].all()
+    assert noticed >= 9, noticed
+
+
 def test_false_alarms_are_as_rare_as_stated():
     """At a stated rate of 20 in an hour, over an hour of three gyros: a Poisson count."""
     alarms = 0
