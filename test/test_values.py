@@ -23,7 +23,7 @@ from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.model.compensation import compensate
-from gyro_calibration.model.effects import CATALOGUE, Channels, rate_temperature_polynomial
+from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
@@ -93,24 +93,6 @@ def test_every_output_gives_a_finite_rate(model, samples):
     for one, degc in samples if not model.needs_history else ():
         single = compensate(model, one, degc)
         assert math.isfinite(single.rate) and math.isfinite(single.model_rate)
-
-
-@tries(150)
-@hypothesis.given(models(0.1, around=False),
-                  st.lists(st.tuples(FINITE, st.floats(-20.0, 60.0)), min_size=1, max_size=5))
-def test_a_sample_alone_is_compensated_as_in_a_log_and_what_is_not_marked_is_inverted(
-        model, samples):
-    output, temperature = np.array(samples).T
-    many = compensate(model, output, temperature)
-    for index, (one, degc) in enumerate(samples):
-        single = compensate(model, one, degc)
-        assert single.rate == pytest.approx(many.rate[index], rel=1e-9, abs=1e-9)
-        assert bool(single.beyond_range) == bool(many.beyond_range[index])
-        if not single.beyond_range:
-            modelled = Channels(single.model_rate, one, single.temperature)
-            error = sum(
-                term.error(modelled) for term in model.terms if not term.effect.not_compensated)
-            assert single.model_rate + error == pytest.approx(one, rel=1e-8, abs=1e-8)
 
 
 # streams

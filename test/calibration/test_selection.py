@@ -72,13 +72,6 @@ def test_effects_of_clear_size_are_found(terms, technology, runs):
     assert right >= binom.ppf(RARE, runs, 1 - FALSE_ALARM_RATE)
 
 
-def test_a_curve_over_temperature_is_found_where_its_slope_alone_explains_little():
-    terms = (*SINE, Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 5e-6)))
-    table = replace(WANDERING, temperatures=(0.0, 60.0))
-    assert {'bias_temperature', 'bias_temperature_quadratic'} <= names(
-        select_effects(measured(table, terms), 'open_loop_fog'))
-
-
 @pytest.mark.parametrize('technology', TECHNOLOGY_EFFECTS)
 @pytest.mark.parametrize('wide', [True, False])
 def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
@@ -133,11 +126,6 @@ def test_what_cannot_be_seen_says_what_would_show_it():
     cold = replace(measured(Table(), LINEAR), temperature=None)
     reasons = {choice.effect: choice.reason for choice in select_effects(cold).choices}
     assert 'record temperature_degc' in reasons['bias_temperature']
-
-
-def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
-    """Dwells that scatter by 10 deg/s do not determine a slope of 0.07 deg/s/K."""
-    assert names(select_effects(measured(Table(dwell=10.0 * DEGREE), LINEAR))).isdisjoint(SLOPES)
 
 
 @pytest.mark.parametrize('technology', [None, *TECHNOLOGY_EFFECTS])

@@ -385,11 +385,3 @@ def test_columns_of_steps_are_those_of_the_effect_but_beside_the_step(spans):
     assert off.max() < 1e-3 * np.abs(exact).max()
     assert (off > 1e-9).sum(axis=0).max() <= 3
     assert not exact[:, -1].any() and not off[:, -1].any()
-
-
-@pytest.mark.parametrize('delay', [-4.0, 0.0, 4.0])
-def test_spans_before_and_after_the_log_of_the_gyro_are_not_compared(delay):
-    spans = replace(lay_out_spans(drive(4), 'course'), delay=delay)
-    covered = spans.is_measured[:len(spans.time) - 1]
-    assert covered[10:-10].all()
-    assert covered[0] == (delay >= 0.0) and covered[-1] == (delay <= 0.0)

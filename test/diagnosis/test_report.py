@@ -332,21 +332,6 @@ def test_what_a_reference_with_errors_does_not_establish_is_not_said_to_be_noise
         f'No difference is established; suspected: {suspected.effect.replace("_", " ")}.')
 
 
-def test_a_diagnosis_of_another_kind_leaves_out_what_it_did_not_measure():
-    text = Page(render_report(replace(adequate(), method='the dwells of a table were fitted',
-                                      noise=Noise(), simulated=Noise()))).text
-    assert ('The dwells of a table were fitted.' in text and 'replayed' not in text
-            and 'angle random walk' not in text.split('The model')[0])
-
-
-def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
-    whole = extended()
-    text = render_report(replace(whole, model=whole.before, gain=None, findings=(),
-                                 unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
-    assert '>after [' in render_report(whole) and '>after [' not in text
-    assert 'before the extension, and up to' not in text
-
-
 @pytest.mark.parametrize('value, interval, unit, words', [
     (0.0201, (0.0198, 0.0204), 's', '20.10 (19.80 to 20.40) ms'),
     (-0.0123, (-0.0130, -0.0116), '1', '−1.230 (−1.300 to −1.160) %'),
