@@ -77,6 +77,13 @@ def test_a_gyro_that_does_not_follow_is_refused(follows):
         calibrate_encoder(drive(4, follows=follows))
 
 
+def test_another_drives_gyro_is_refused():
+    log, other = drive(5), drive(6)
+    with pytest.raises(DataRefused, match='does not follow'):
+        calibrate_encoder(
+            Log(time=log.time, output=other.output, reference_heading=log.reference_heading))
+
+
 @pytest.mark.parametrize('name', ['wid_03', 'wid_07', 'rc_car_j_unit3'])
 def test_recorded_drives_are_answered(data, name):
     fit = calibrate_encoder(read_log(data / 'wheeled_drives' / f'{name}.csv.gz')).fit

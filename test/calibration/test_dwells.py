@@ -14,7 +14,12 @@ from dataclasses import replace
 import math
 
 from chance import fewest, most, rms_bounds
-from gyro_calibration.calibration.dwells import dwells_from_table, extract_dwells, find_dwells
+from gyro_calibration.calibration.dwells import (
+    dwells_from_table,
+    extract_dwells,
+    find_dwells,
+    join_dwells,
+)
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -119,6 +124,17 @@ def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
 
 
 # Logs in time
+
+def test_joined_logs_keep_their_sweeps_and_places_apart():
+    parts = [extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
+             for name in ('a.csv', 'b.csv')]
+    whole = join_dwells(parts)
+    assert list(whole.sweep) == [0, 1, 2, 3, 4, 5]
+    assert whole.location[0] == 'a.csv: row 1' and whole.location[3] == 'b.csv: row 1'
+    assert len(whole.temperature) == len(whole) == 6
+    whole = join_dwells([*parts, replace(parts[1], temperature=None)])
+    assert whole.temperature is None and '1 of 3 logs hold no temperature' in whole.remarks[-1]
+
 
 def references(generator):
     return {'rate': {'reference_rate': RATE}, 'heading': {'reference_heading': HEADING},

@@ -166,6 +166,15 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
             < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
+def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():
+    """By 0.25 % for 50 ms on ramps of 0.3 s; by more where the motion is not smooth."""
+    late = log_of(SWING, 100.0, late=0.05)
+    by_rate, by_likelihood = (calibrate_encoder(late, method) for method in ('rate', 'likelihood'))
+    assert by_rate.fit.scale_factor_error - S > 0.002 > 50.0 * abs(
+        by_likelihood.fit.scale_factor_error - S)
+    assert 'no time offset' in by_rate.remarks[1]
+
+
 #: Orientation of the gyro; the scale of the encoder, and so s, is known to 0.2 % only.
 MEASURED = {'yaw_slow': (-1.0, 0.006), 'yaw_fast': (-1.0, 0.006), 'pitch_slow': (1.0, -0.0149)}
 

@@ -110,6 +110,11 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
     assert abs(np.mean(errors)) < 0.01
 
 
+def test_too_few_observations_are_refused():
+    with pytest.raises(ValueError, match='2 observations do not determine 2 values'):
+        fit_noise_grid(np.zeros(2), np.eye(2), [BandedNoise('a', np.ones(2), None, (1.0, 1.0))])
+
+
 def test_differences_of_autoregressive_errors_have_the_covariance_that_is_stated():
     generator = np.random.default_rng(5)
     correlation = np.where(np.arange(8) == 3, 0.0, generator.uniform(0.0, 0.9, 8))

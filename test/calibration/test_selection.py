@@ -128,6 +128,12 @@ def test_what_cannot_be_seen_says_what_would_show_it():
     assert 'record temperature_degc' in reasons['bias_temperature']
 
 
+def test_rests_show_a_bias_alone():
+    table = measured(Table(), LINEAR)
+    steady = replace(table, rate=np.zeros(len(table)), output=table.output - table.rate)
+    assert names(select_effects(steady)) == {'bias', 'bias_temperature'}
+
+
 @pytest.mark.parametrize('technology', [None, *TECHNOLOGY_EFFECTS])
 def test_on_the_recorded_table_the_default_predicts_rates_beyond_those_it_saw(data, technology):
     dwells = rate_table.table(data)

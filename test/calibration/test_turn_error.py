@@ -124,6 +124,16 @@ def sweeps(seed=0, deviation=1e-5, odd=None):
 
 # the program
 
+def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
+    found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
+                  [0, 0, 1, 1, 2])
+    rate = np.where(found.sweep == 0, np.nan, found.rate + 0.1 * DEGREE)
+    errors = compute_turn_errors(found, rate)
+    assert (errors.static / DEGREE == pytest.approx([0.2 * 18.0, 0.3 * 18.0])
+            and errors.modelled == pytest.approx(0.0))
+    assert '1 turns are left out' in errors.remarks[1]
+
+
 @pytest.fixture
 def run(run):
     return partial(run, 'turn')
@@ -214,3 +224,18 @@ def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
     (tmp_path / 'outlying.csv').write_text('\n'.join(lines))
     assert ('1 outlying dwells are left out: row 4'
             in run(tmp_path / 'outlying.csv', '--model', model)[1])
+
+
+def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_path):
+    """By means of dwells alone, a supply that depends on the direction acts as an asymmetry."""
+    (tmp_path / 'model.yaml').write_text(
+        'effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
+    time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
+    motion = motion_from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
+    log = simulate(GyroModel(), motion, 50.0, np.random.default_rng(2))
+    supply = np.where(np.abs(log.time - 20.0) < 11.0, 6.0, 5.0)
+    write_log(tmp_path / 'log.csv',
+              replace(log, output=log.output + 0.01 * (supply - 5.0), supply=supply))
+    answer = json.loads(run(tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json')[1])
+    assert (answer['static']['largest_rad_per_turn'] > 0.1
+            and answer['modelled']['largest_rad_per_turn'] < 1e-9)
