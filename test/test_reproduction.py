@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The sources reproduced: each number equals an independent computation, and verdicts can fail."""
+"""The sources reproduced: numbers of contradictions follow by hand, and verdicts can fail."""
 
 from dataclasses import replace
 from functools import cache
@@ -17,7 +17,7 @@ import math
 from pathlib import Path
 
 from gyro_calibration.cli.main import main
-from gyro_calibration_reproduction import bot_thoughts, hong_park, SOURCES
+from gyro_calibration_reproduction import bot_thoughts, SOURCES
 from gyro_calibration_reproduction.finding import Comparison, render_page
 import numpy as np
 import pytest
@@ -123,7 +123,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys,
         answers[0][source]['comparisons'][0])
 
 
-# Ojeda, Chung and Borenstein
+# numbers by hand
 
 @pytest.mark.parametrize('source, words, wanted', [
     ('ojeda', 'unit of an angle', {'printed': 10, 'right': 1}),
@@ -140,30 +140,6 @@ def test_numbers_of_the_contradictions_follow_by_hand(source, words, wanted):
         value, error = value if isinstance(value, tuple) else (value, None)
         assert found[name] == pytest.approx(value, rel=None if error else 1e-6, abs=error), name
 
-
-# Hong and Park
-
-def by_hand(motion, shift=0):
-    """Return the errors of s and b, %, by eq. 4 to 7, written out."""
-    count = round(motion.duration * 20) + 1
-    time = np.arange(count) / 20
-    measured = 0.9 * motion.rate_at(time) + 0.1
-    rows = [(sum(measured[shift:shift + n]) / 20, n / 20) for n in range(1, count - shift)]
-    scale, offset = np.linalg.lstsq(np.array(rows), motion.heading_at(time[1:count - shift]),
-                                    rcond=None)[0]
-    return 100 * ((1 / scale - 1) / -0.1 - 1), 100 * (-offset / scale / 0.1 - 1)
-
-
-def test_the_rectangle_rule_has_the_errors_of_figure_6():
-    found, motion = numbers('hong_park', 'Figures 6 and 7'), hong_park.published_motion()
-    assert by_hand(motion) == pytest.approx((found['s'], found['b']), rel=1e-6)
-    assert by_hand(motion, 1) == pytest.approx((found['late_s'], found['late_b']), rel=1e-6)
-    assert found['trapezoid'] < 1e-6 and found['late_s'] > 0 > found['s']
-    assert by_hand(hong_park.one_turn(3.0, 4.25)) == pytest.approx((-4.70, -20.61), abs=0.005), (
-        'a motion in round numbers is near')
-
-
-# Bot Thoughts
 
 def test_the_slopes_come_out_of_the_means():
     first, second = (2.5654 + 2854.5) / -200, (-3857.9 + 2854.5) / 70

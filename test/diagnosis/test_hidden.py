@@ -25,7 +25,6 @@ from gyro_calibration_bench.hidden import (
     KINDS,
     LOOK_ALIKES,
     NoiseFigures,
-    record,
     record_separating,
     session,
 )
@@ -153,21 +152,6 @@ def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
     assert log.columns['gyro_rad_s'] == pytest.approx(output, abs=1e-12)
     assert InformationMetric([each], truth.gyro.figures).norm(
         [truth.added_rate]) == pytest.approx(3.0 * DETECTION_SIGMAS, rel=1e-3)
-
-
-@pytest.mark.parametrize('name', ['reference_once_per_rev', 'reference_scale', 'reference_slip'])
-def test_a_wrong_reference_leaves_the_gyro_alone_and_errs_in_rate_as_in_heading(generator, name):
-    each = session(generator, 300.0, 100.0)
-    gyro = draw_gyro([name], 50.0, generator, [each], NoiseFigures(1e-4))
-    of_rate = record(gyro, each, generator)
-    of_heading = record(gyro, each, generator, reference='heading')
-    assert of_rate.truth.added_rate == pytest.approx(
-        of_rate.truth.bias + gyro.scale_factor_error * each.rate, abs=1e-12)
-    wrong_rate = of_rate.columns['reference_rate_rad_s'] - each.rate
-    wrong_heading = of_heading.columns['reference_heading_rad'] - each.heading
-    change = np.cumsum(0.5 * (wrong_rate[1:] + wrong_rate[:-1])) * each.interval
-    tolerance = 0.01 * np.ptp(wrong_heading)
-    assert wrong_heading[1:] - wrong_heading[0] == pytest.approx(change, abs=tolerance)
 
 
 def left_over(hidden_name, other, log, sessions, twins):
