@@ -154,6 +154,34 @@ def _wait_until():
     return wait_until
 
 
+def operations(work):
+    """
+    Return how many lines of Python are run and how many functions are called by a function.
+
+    They are counted and not timed, so that a busy machine changes nothing. Loops over samples are
+    seen however they are written; what a function of C does is one.
+
+    """
+    count, before = 0, (sys.gettrace(), sys.getprofile())
+
+    def line(frame, event, _):
+        nonlocal count
+        count += 1
+        return line
+
+    def call(frame, event, _):
+        nonlocal count
+        count += event == 'c_call'
+    sys.settrace(line)
+    sys.setprofile(call)
+    try:
+        work()
+    finally:
+        sys.settrace(before[0])
+        sys.setprofile(before[1])
+    return count
+
+
 @pytest.fixture
 def data():
     folder = Path(os.environ.get('GYRO_CALIBRATION_DATA', '/nonexistent'))

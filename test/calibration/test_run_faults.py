@@ -21,6 +21,7 @@ import math
 import re
 
 from chance import fewest, most
+from conftest import operations
 from fooled import LEVELS, tried, WAYS
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY, ScaleBiasFit
 from gyro_calibration.calibration.run_faults import split_run
@@ -47,7 +48,6 @@ from gyro_calibration.model.motion import (
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
-from operations import operations
 import pytest
 
 GOOD = [name for name, (_, _, word) in WAYS.items() if not word]

@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 
+from conftest import operations
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
 from gyro_calibration.logs.log import Log, read_log
@@ -21,7 +22,6 @@ from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import simulate_gyro_output
 import numpy as np
-from operations import operations
 import pytest
 
 VALUES = {'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),

@@ -10,10 +10,10 @@
 
 """Channels with memory: against exact responses, and equal for a stream, a log, and its blocks."""
 
+from conftest import operations
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.channels import ChannelHistory, channels_from_log
 import numpy as np
-from operations import operations
 import pytest
 
 UNEVEN = np.cumsum(np.random.default_rng(0).exponential(0.3, 3000))
