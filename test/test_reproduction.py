@@ -13,11 +13,10 @@
 from dataclasses import replace
 from functools import cache
 import json
-import math
 from pathlib import Path
 
 from gyro_calibration.cli.main import main
-from gyro_calibration_reproduction import bot_thoughts, SOURCES
+from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, render_page
 import numpy as np
 import pytest
@@ -139,16 +138,3 @@ def test_numbers_of_the_contradictions_follow_by_hand(source, words, wanted):
     for name, value in wanted.items():
         value, error = value if isinstance(value, tuple) else (value, None)
         assert found[name] == pytest.approx(value, rel=None if error else 1e-6, abs=error), name
-
-
-def test_the_slopes_come_out_of_the_means():
-    first, second = (2.5654 + 2854.5) / -200, (-3857.9 + 2854.5) / 70
-    assert bot_thoughts.segment_slopes() == pytest.approx((first, second))
-    slope, rest = np.polyfit([0, 200, 270], [2.5654, -2854.5, -3857.9], 1)
-    assert ours('bot_thoughts', 'SF, line through three points').ours == pytest.approx(slope)
-    assert ours('bot_thoughts', 'N, line through three points').ours == pytest.approx(rest / slope)
-    left = np.array([2.5654, -2854.5, -3857.9]) - rest - slope * np.array([0, 200, 270])
-    deviation = math.sqrt(left @ left / np.square(np.array([0, 200, 270]) - 470 / 3).sum())
-    found = numbers('bot_thoughts', 'An error of the strobe')
-    assert (found['interval'] == pytest.approx(12.706 * deviation, rel=1e-4)
-            and found['off'] == pytest.approx(abs(left[1] / slope)))

@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.words import headline, is_in_extended_model
-from gyro_calibration.logs.log import write_log
+from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
@@ -180,6 +180,23 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
 
 
 # units, limit and steps
+
+def at_rest(swing):
+    """Return a log of a gyro that does not turn, or hardly does beside its noise."""
+    rate = swing * np.sin(0.3 * TIME)
+    output = 1e-3 + rate + 7e-4 * np.random.default_rng(4).standard_normal(len(TIME))
+    return Log(time=TIME, output=output, temperature=TEMPERATURE,
+               reference_rate=rate if swing else None, moving=np.sign(swing) + 0.0 * TIME)
+
+
+@pytest.mark.parametrize('swing', [0.0, 2e-4], ids=['at rest', 'hardly in motion'])
+def test_a_log_without_motion_says_nothing_of_rates(swing):
+    found = diagnosed(at_rest(swing))
+    assert found.model.rate_range == (-np.inf, np.inf)
+    assert (value(found.model, 'scale_factor_error') == 0.0
+            and value(found.model, 'bias') == pytest.approx(1e-3, abs=1e-4))
+    assert any('is not added to the model' in remark for remark in found.remarks) == (swing > 0.0)
+
 
 @pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)],
                          ids=['no model', 'a model'])

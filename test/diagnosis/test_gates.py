@@ -137,3 +137,19 @@ def test_turns_between_long_rests_that_the_gyro_does_not_make_are_another_motion
               reference_heading=np.cumsum(turns[1]) * 0.01)
     gate = check_gates(log)[-1]
     assert gate.name == 'motion' and gate.passed is False, gate
+
+
+def small_turns(seed):
+    """Return a log of turns of some degrees, and the generator of its noise."""
+    generator = np.random.default_rng(seed)
+    turns = np.interp(TIME, np.arange(121.0), 0.1 * generator.standard_normal(121))
+    return Log(TIME, turns + 1e-3 * generator.standard_normal(len(TIME)),
+               reference_heading=np.cumsum(turns) * 0.01), generator
+
+
+@pytest.mark.parametrize('seed', seeds(3))
+def test_a_reference_of_the_same_small_turns_with_larger_errors_passes(seed):
+    log, generator = small_turns(seed)
+    errors = np.interp(TIME, np.arange(121.0), 5.0 * DEGREE * generator.standard_normal(121))
+    assert not [gate for gate in check_gates(
+        replace(log, reference_heading=log.reference_heading + errors)) if gate.passed is False]

@@ -17,7 +17,6 @@ from pathlib import Path
 from chance import evidence, seeded
 import gyro_calibration_bench.hidden
 from gyro_calibration_bench.hidden import (
-    DETECTION_SIGMAS,
     draw_gyro,
     FORMS,
     hide,
@@ -138,20 +137,6 @@ def test_every_effect_can_be_hidden(generator, name):
     residual = (log.columns['gyro_rad_s'] - truth.prediction)[truth.is_good]
     unit, step = abs(truth.gyro.size_of('unit_error') or 1.0), truth.gyro.size_of('quantization')
     assert np.std(residual) <= 1.5 * unit * np.std(truth.noise) + step
-
-
-@pytest.mark.parametrize('name', [name for name in ON_THE_SUM if ALL[name].is_linear
-                                  and name not in ('bias', 'scale_factor_error')])
-def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
-    log, = hide([name], 3.0, generator, noise='white', **COARSE)
-    cause, truth, each = log.truth[name], log.truth, log.session
-    plain = truth.bias + truth.scale_factor_error * each.rate
-    assert truth.added_rate - plain == pytest.approx(
-        effect_errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
-    output = truth.rate + truth.added_rate + truth.noise
-    assert log.columns['gyro_rad_s'] == pytest.approx(output, abs=1e-12)
-    assert InformationMetric([each], truth.gyro.figures).norm(
-        [truth.added_rate]) == pytest.approx(3.0 * DETECTION_SIGMAS, rel=1e-3)
 
 
 def left_over(hidden_name, other, log, sessions, twins):

@@ -15,8 +15,14 @@ from dataclasses import replace
 from chance import evidence, seeds
 from diagnosed import judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.heading_regression import CauseTerm, find_drift, lay_out_spans
+from gyro_calibration.calibration.heading_regression import (
+    CauseTerm,
+    find_drift,
+    fit_spans,
+    lay_out_spans,
+)
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
+from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
@@ -232,6 +238,41 @@ def test_a_step_of_the_bias_beside_a_course_is_established_and_in_no_model(ends)
             assert low < true < high and high - low < (2e-3 if name == 'bias_step' else 10.0)
     assert ('part of the log' in steps[0].cause) == (len(ends) == 2)
     assert steps[0].where[1] == pytest.approx(ends[1] if len(ends) == 2 else 240.0, abs=5.0)
+
+
+def turning_once(seed):
+    """Return a log of one turn, of which a course that slips shows 10 % too much."""
+    generator, time = np.random.default_rng(seed), np.arange(0.0, 240.0, 1.0 / RATE)
+    turn = 0.6 * np.sin(np.pi * (time - 200.0) / 6.0) ** 2 * ((time > 200.0) & (time < 206.0))
+    fixes = np.arange(0.0, 240.0, 0.2)
+    course = (1.1 * np.interp(fixes, time, np.cumsum(turn) / RATE)
+              + 0.3 * DEGREE * generator.standard_normal(len(fixes)))
+    return Log(time=time, reference_heading=np.interp(time, fixes, course), output=turn
+               + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
+
+
+def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
+    generator, time = np.random.default_rng(9), np.arange(0.0, 120.0, 1.0 / RATE)
+    rate = 1.2 + 0.3 * np.sin(0.21 * time)
+    heading = np.cumsum(rate) / RATE
+    for size, named in ((0.3, True), (1.2, False)):
+        log = Log(time=time, output=rate + 1e-3 * generator.standard_normal(len(time)),
+                  reference_heading=heading - size * np.cos(heading)
+                  + 1e-3 * generator.standard_normal(len(time)))
+        _, found = search_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
+                                 lambda share, words: None)
+        assert named == ('reference_once_per_rev' in {
+            each.cause_term.cause for each in found if each.is_established}), size
+
+
+@pytest.mark.parametrize('seed', seeds(2))
+def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
+    found = diagnosed(turning_once(seed), kind='course')
+    assert 'Fewer than three stretches' in ' '.join(found.remarks)
+    follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
+              'reference_once_per_rev'}
+    assert not follow & {each.effect for each in found.findings}, terminal_lines(found)
+    assert all('three stretches' in found.cannot_show[name] for name in follow)
 
 
 def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_reported():

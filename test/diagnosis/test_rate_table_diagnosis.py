@@ -20,7 +20,7 @@ from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.diagnosis import rate_table as diagnosis
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import rate_temperature_polynomial, STATIC_EFFECTS
+from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial, STATIC_EFFECTS
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
@@ -138,6 +138,13 @@ def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
 
 
 # what has no name, and what is no effect
+
+def test_what_dwells_cannot_test_of_a_model_is_left_and_reported(without_gain):
+    model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
+    found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(11), model)
+    assert (any('time_offset' in remark for remark in found.remarks)
+            and model.terms[-1] in found.model.terms)
+
 
 @pytest.mark.parametrize('waves', [6.0, 40.0])
 def test_what_is_not_in_the_catalogue_gets_no_name(waves):
