@@ -41,7 +41,6 @@ import pytest
 
 FOLDER = Path(gyro_calibration_bench.hidden.__file__).parent
 COARSE = {'duration': 300.0, 'sample_rate': 20.0}
-ON_THE_SUM = [name for name, form in ALL.items() if form.stage == 'sum']
 
 
 @pytest.fixture(params=['', evidence('another seed')])
