@@ -24,10 +24,13 @@ from diagnosed import diagnosis_of, held, judge_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Log
 from gyro_calibration.model.channels import channels_from_log
-from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
+from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import format_model, read_model
 from gyro_calibration.model.motion import simulate_gyro_output
+from gyro_calibration.model.noise import Noise
 from gyro_calibration_bench.hidden import (
     draw_gyro,
     FORMS,
@@ -42,6 +45,7 @@ from gyro_calibration_bench.hidden import (
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 
 SHORT = {'duration': 600.0, 'sample_rate': 25.0}
 #: References in turn.
@@ -301,3 +305,78 @@ def test_noise_is_found_against_a_model_only():
             <= set(MODEL_FINDINGS))
     log, = hidden_in(['angle_random_walk'], 20.0, 1, 'white', REFERENCES[0])
     assert names_of(diagnosis_of([log], np.random.default_rng(0), with_model=False)) == []
+
+
+# Noise that a filter or rounding shaped passes for no cause, and hides none
+
+
+#: Numerator and denominator.
+FILTERS = {'exponential smoothing': ([0.5], [1.0, -0.5]), 'mean of two': ([0.5, 0.5], [1.0]),
+           'low pass': butter(2, 0.3)}
+ANGLE_RANDOM_WALK = 1e-4
+
+
+def behind(shape, names=(), multiple=0.0, seed=0):
+    """Return what is hidden, and its log with noise that went through a filter."""
+    hidden, = hide(names, multiple, np.random.default_rng(seed), noise='white', **SHORT)
+    noise = hidden.truth.noise
+    log = log_of(hidden)
+    return hidden, replace(log, output=log.output - noise + lfilter(*FILTERS[shape], noise))
+
+
+#: The other filters are tried as evidence: a log takes some seconds.
+TRIED = 'exponential smoothing'
+
+
+def tried(shape, *others):
+    return pytest.param(shape, *others, marks=[] if shape == TRIED else pytest.mark.evidence)
+
+
+@pytest.mark.parametrize('shape', map(tried, FILTERS))
+def test_noise_behind_a_filter_is_no_cause(shape):
+    hidden, log = behind(shape)
+    found = diagnose([log], np.random.default_rng(0), model_of(hidden))
+    assert found.verdict == 'adequate', told(hidden, found)
+
+
+def test_the_angle_random_walk_behind_a_filter_is_that_of_low_frequencies():
+    hidden, log = behind('exponential smoothing')
+    found = diagnose([log], np.random.default_rng(0))
+    assert found.noise.angle_random_walk == pytest.approx(
+        hidden.truth.expected['angle_random_walk'], rel=0.05)
+
+
+@pytest.mark.parametrize('shape, name',
+                         map(tried, FILTERS, ['time_offset', 'interference_tone', 'time_offset']))
+def test_what_is_hidden_in_noise_behind_a_filter_is_found(shape, name):
+    hidden, log = behind(shape, [name], 8.0, 1)
+    found = diagnose([log], np.random.default_rng(0))
+    (finding,) = found.findings
+    assert name in (finding.effect, *finding.ambiguous_with), told(hidden, found)
+    assert not found.unexplained, told(hidden, found)
+
+
+# rounding
+
+def rounded(step, known):
+    """Return a log with steps of so many standard deviations, and what is found in it."""
+    generator = np.random.default_rng(3)
+    time = np.arange(20_000) / 50.0
+    white = ANGLE_RANDOM_WALK / np.sqrt(0.02)
+    rate = 0.8 * np.sin(0.3 * time) * np.sin(0.041 * time)
+    output = (np.round((rate + white * generator.standard_normal(len(time))) / (step * white))
+              * step * white)
+    model = GyroModel((Term(QUANTIZATION, (step * white,)),) if known else (),
+                      noise=Noise(ANGLE_RANDOM_WALK))
+    return diagnose([Log(time=time, output=output, reference_rate=rate)], generator, model)
+
+
+@pytest.mark.parametrize('step', [0.6, 1.5, 3.0])
+def test_the_steps_that_a_model_has_are_no_angle_random_walk(step):
+    found = rounded(step, True)
+    assert not found.findings
+    assert found.noise.angle_random_walk == pytest.approx(ANGLE_RANDOM_WALK, rel=0.03)
+
+
+def test_steps_that_a_model_does_not_have_are_one_finding():
+    assert [each.effect for each in rounded(1.5, False).findings] == ['quantization']
