@@ -48,12 +48,11 @@ PACKAGE = Path(__file__).parents[1] / 'gyro_calibration'
 GIGABYTE = 1 << 30
 #: What reads the bytes of a target, in the package.
 FILES = {'decoder': ('driver/protocols/protocol.py',),
-         'listening': ('driver/protocols/__init__.py',),
          'sample clock': ('driver/timestamps.py',),
          'log': ('logs/log.py',), 'compressed log': ('logs/log.py',),
          'model': ('model/model_file.py', 'model/settings_file.py'),
          'bias table': ('heading/bias_table.py', 'model/settings_file.py'),
-         'motion profile': ('model/motion.py',), 'motion limits': ('model/settings_file.py',),
+         'motion profile': ('model/motion.py',),
          'recording': ('logs/recording.py', 'logs/ros_bag.py', 'logs/cdr.py'),
          'parameters': ('ros/compensation_node.py', 'ros/driver_node.py'),
          'arguments': ('cli/verb.py',)}

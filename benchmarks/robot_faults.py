@@ -13,7 +13,7 @@ What misleads a robot that is calibrated: faults on the real stack, one row each
 
     python benchmarks/robot_faults.py [--only WORD]
 
-A compensation node in a process of its own drives a small robot (``test/robot.py``: 150 ms
+A compensation node in a process of its own drives a small robot (``test/rig.py``: 150 ms
 latency, 0.2 s lag, 100 Hz) through `calibrate`. In mid-run, at 40 deg/s or more, the fault
 happens. A row states the turn of the robot since, the time until the last command to turn was
 followed by a zero, the error of the heading and its stated standard deviation, the worst
@@ -43,7 +43,7 @@ import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from robot import now, Robot, RosRobot  # noqa: E402
+from rig import now, Robot, RosRobot  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 

@@ -10,7 +10,9 @@
 
 """Fixtures for tests with ROS 2 processes: local, apart from each other, always ended."""
 
+from collections import defaultdict
 import contextlib
+import copy
 import fcntl
 from functools import cache
 from importlib import metadata
@@ -94,7 +96,7 @@ os.environ.update({
 })
 
 
-_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch'
+_TIMED = 'test_connection', 'test_fuzz', 'test_launch'
 
 # Of those that only compute, what takes longest comes first: the last files, which one of several
 # processes may have to itself, are then short ones.
@@ -150,6 +152,34 @@ def wait_until(predicate, timeout=30.0, what=None):
 @pytest.fixture(name='wait_until')
 def _wait_until():
     return wait_until
+
+
+def operations(work):
+    """
+    Return how many lines of Python are run and how many functions are called by a function.
+
+    They are counted and not timed, so that a busy machine changes nothing. Loops over samples are
+    seen however they are written; what a function of C does is one.
+
+    """
+    count, before = 0, (sys.gettrace(), sys.getprofile())
+
+    def line(frame, event, _):
+        nonlocal count
+        count += 1
+        return line
+
+    def call(frame, event, _):
+        nonlocal count
+        count += event == 'c_call'
+    sys.settrace(line)
+    sys.setprofile(call)
+    try:
+        work()
+    finally:
+        sys.settrace(before[0])
+        sys.setprofile(before[1])
+    return count
 
 
 @pytest.fixture
@@ -360,15 +390,68 @@ def start_node(ros_domain, request):
     assert not problems, '\n'.join(problems)
 
 
+class HeldNode:
+    """
+    A node in the process of a test, which nobody spins: the test calls what an executor would.
+
+    Messages go in and out without DDS, in milliseconds; each topic seems to have two subscribers.
+    ``sent`` has a list of messages for each topic.
+
+    """
+
+    def __init__(self, node_class, monkeypatch, parameters, remappings):
+        import rclpy
+        from rclpy.publisher import Publisher
+        from rclpy.signals import SignalHandlerOptions
+        self.sent = defaultdict(list)
+        monkeypatch.setattr(Publisher, 'publish', lambda *sent: self._keep(*sent))
+        monkeypatch.setattr(Publisher, 'get_subscription_count', lambda _: 2)
+        words = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+        words += [word for old, new in remappings.items() for word in ('-r', f'{old}:={new}')]
+        rclpy.init(args=['node', '--ros-args', *words] if words else [],
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self._end = rclpy.shutdown
+        try:
+            self.node = node_class()
+        except BaseException:
+            self._end()
+            raise
+
+    def _keep(self, publisher, message):
+        self.sent[publisher.topic_name].append(copy.deepcopy(message))
+
+    def send(self, topic, message):
+        heard = {each.topic_name: each.callback for each in self.node.subscriptions}
+        heard[topic](message)
+
+    def tick(self, times=1):
+        for _ in range(times):
+            for timer in list(self.node.timers):
+                timer.callback()
+
+    def call(self, name, kind):
+        offered = {self.node.resolve_service_name(each.srv_name): each.callback
+                   for each in self.node.services}
+        return offered[name](kind.Request(), kind.Response())
+
+    def put(self, name, value):
+        from rclpy.parameter import Parameter
+        return self.node.set_parameters([Parameter(name, value=value)])[0]
+
+    def close(self):
+        self.node.destroy_node()
+        self._end()
+
+
 @pytest.fixture
 def hold_node(ros_domain, monkeypatch):
     """
-    Return a function that makes a node here, which nobody spins; the one before ends.
+    Return a function that makes a `HeldNode` here; the one before ends.
 
-    ``hold_node(DriverNode, {'port': '/dev/x'}, {'__ns': '/robot'})`` gives a `held_node.HeldNode`.
+    ``hold_node(DriverNode, {'port': '/dev/x'}, {'__ns': '/robot'})``, by class, parameters and
+    remappings.
 
     """
-    from held_node import HeldNode
     with contextlib.ExitStack() as stack:
         def hold(node_class, parameters=None, remappings=None):
             stack.close()

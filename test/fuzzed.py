@@ -11,9 +11,9 @@
 """
 Targets for fuzzing: each takes any bytes, and raises where a claim about its reader is broken.
 
-The documented errors (LogError, ModelError, MotionError, InputError, ValueError of a parameter)
-are the right answer to wrong bytes; any other exception is a fault, and so is a message of
-several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
+The documented errors (LogError, ModelError, MotionError, ValueError of a parameter) are the right
+answer to wrong bytes; any other exception is a fault, and so is a message of several lines.
+`benchmarks/fuzz.py` runs them, guided by coverage.
 
 """
 
@@ -36,22 +36,12 @@ import zlib
 
 from fake_port import SETTINGS
 from gyro_calibration.cli.main import find_verbs, make_parser
-from gyro_calibration.cli.plan import read_limits, write_motion
-from gyro_calibration.driver.protocols import (
-    Protocol,
-    PROTOCOLS,
-    recognize_protocol,
-    Sample,
-    Settings,
-)
+from gyro_calibration.cli.plan import write_motion
+from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import LineSplitter
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.files import InputError, MAX_MAGNITUDE
-from gyro_calibration.heading.bias_table import (
-    BiasTable,
-    read_bias_table,
-    write_bias_table,
-)
+from gyro_calibration.files import MAX_MAGNITUDE
+from gyro_calibration.heading.bias_table import BiasTable, read_bias_table, write_bias_table
 from gyro_calibration.logs.cdr import IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.logs.log import (
     Log,
@@ -198,17 +188,6 @@ def _decoder_seeds(wire: _Wire) -> list[bytes]:
 
 #: Every protocol, also those to come.
 WIRES = {name: _wire(protocol) for name, protocol in PROTOCOLS.items()}
-
-
-def check_listening(data: bytes) -> bool:
-    found = recognize_protocol(data)
-    assert 0.0 <= found.explained_share <= 1.0 and found.summary
-    _check_message(found.summary)
-    return found.protocol is not None
-
-
-def _listening_seeds() -> list[bytes]:
-    return [seed for wire in WIRES.values() for seed in _decoder_seeds(wire)[:2]]
 
 
 def check_clock(data: bytes) -> int:
@@ -381,19 +360,6 @@ def _profile_seeds() -> list[bytes]:
     return [path.read_bytes(), b'\xef\xbb\xbftime_s,heading_deg\r\n0,0\r\n1,90\r\n2,0\r\n']
 
 
-def check_limits(data: bytes) -> bool:
-    ability = _read(lambda path: read_limits(str(path)), InputError, _file(data, '.yaml'))
-    if ability is None:
-        return False
-    assert all(not math.isnan(value) for value in vars(ability).values())
-    return True
-
-
-def _limits_seeds() -> list[bytes]:
-    return [(Path(__file__).parents[1] / 'config' / 'limits.yaml').read_bytes(),
-            b'maximum_rate_dps: 90\nmaximum_acceleration_dps2: 180\n']
-
-
 def check_recording(suffix: str, data: bytes) -> bool:
     path = _file(data, suffix)
     with np.errstate(all='ignore'):
@@ -526,7 +492,6 @@ TARGETS: dict[str, Target] = {
        Target(partial(check_decoder, wire), partial(_decoder_seeds, wire), 256,
               (wire.frames[0][:4], *(frame[:64] for frame in wire.frames[:2])), 2.0)
        for name, wire in WIRES.items()},
-    'listening': Target(check_listening, _listening_seeds, 1024),
     'sample clock': Target(check_clock, _clock_seeds, 512),
     'log': Target(check_log, _log_seeds, 1024, _CSV),
     'compressed log': Target(partial(check_log, suffix='.csv.gz'),
@@ -534,7 +499,6 @@ TARGETS: dict[str, Target] = {
     'model': Target(check_model, _model_seeds, 2048, (*_YAML, *_MODEL)),
     'bias table': Target(check_bias_table, _bias_table_seeds, 2048, (*_YAML, *_TABLE)),
     'motion profile': Target(check_profile, _profile_seeds, 1024, _CSV),
-    'motion limits': Target(check_limits, _limits_seeds, 1024, _YAML),
     'recording .mcap': Target(partial(check_recording, '.mcap'), _mcap_seeds, 4096),
     'recording .db3': Target(partial(check_recording, '.db3'), _database_seeds, 8192),
     'arguments': Target(check_arguments, _argument_seeds, 256,

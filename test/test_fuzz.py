@@ -29,8 +29,7 @@ import pytest
 hypothesis = pytest.importorskip('hypothesis', reason='hypothesis is not installed')
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
 #: Target -> how many inputs hypothesis tries; YAML takes ten times as long as the rest.
-EXAMPLES = {'model': 40, 'bias table': 20, 'motion limits': 40, 'arguments': 40,
-            'recording .db3': 40}
+EXAMPLES = {'model': 40, 'bias table': 20, 'arguments': 40, 'recording .db3': 40}
 
 #: What the fuzzers found: target, input.
 FOUND = {

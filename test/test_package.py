@@ -116,15 +116,6 @@ def test_what_ros_reviewers_run_finds_nothing(monkeypatch, name, arguments):
 
 
 @needs_colcon
-def test_colcon_sees_a_ros_package(source, tmp_path):
-    verbs = run(COLCON, '--log-base', tmp_path, '--help', folder=source)
-    if 'list' not in verbs:
-        pytest.skip('colcon is installed without its verb list (colcon-package-information)')
-    assert run(COLCON, '--log-base', tmp_path, 'list', folder=source).split() == [
-        'gyro_calibration', '.', '(ros.ament_python)']
-
-
-@needs_colcon
 @pytest.mark.parametrize('options', [
     pytest.param((), id='copied'),
     pytest.param(('--symlink-install',), id='symlinked', marks=pytest.mark.evidence)])

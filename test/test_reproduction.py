@@ -8,19 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The sources reproduced: each number equals an independent computation, and verdicts can fail."""
+"""The sources reproduced: numbers of contradictions follow by hand, and verdicts can fail."""
 
 from dataclasses import replace
 from functools import cache
 import json
-import math
 from pathlib import Path
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.motion import CALIBRATION_MOTION
-from gyro_calibration_reproduction import bot_thoughts, hong_park, SOURCES
-from gyro_calibration_reproduction import ojeda_chung_borenstein as ojeda
+from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, render_page
 import numpy as np
 import pytest
@@ -126,7 +122,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys,
         answers[0][source]['comparisons'][0])
 
 
-# Ojeda, Chung and Borenstein
+# numbers by hand
 
 @pytest.mark.parametrize('source, words, wanted', [
     ('ojeda', 'unit of an angle', {'printed': 10, 'right': 1}),
@@ -142,95 +138,3 @@ def test_numbers_of_the_contradictions_follow_by_hand(source, words, wanted):
     for name, value in wanted.items():
         value, error = value if isinstance(value, tuple) else (value, None)
         assert found[name] == pytest.approx(value, rel=None if error else 1e-6, abs=error), name
-
-
-def test_eq_10_as_printed_puts_several_powers_into_one_column():
-    columns = {}
-    for i in range(1, 5):
-        for j in range(1, 4):
-            columns.setdefault(i + (j - 1) * 3, []).append((3 - i + 1, 2 - j + 1))
-    found = numbers('ojeda', 'same for several pairs')
-    assert found['printed'] == len(columns) == 10 and columns[4] == [(3, 1), (0, 2)]
-    assert (found['right'], found['cubic'], found['cubic_right']) == (12, 13, 16)
-
-
-def test_the_error_before_is_that_of_scale_and_sine():
-    gyro, speeds = ojeda.rd2100(), np.arange(5, 101, 5) * DEGREE
-    rates, temperatures = (axis.ravel() for axis in np.meshgrid(
-        np.concatenate([-speeds, speeds]), np.arange(25.0, 46.0, 2.0)))
-    scale = 1 + 0.02 / 115 * (temperatures - 25)
-    error = np.sin(0.1 * rates) / 0.1 + (scale - 1) * rates - rates
-    np.testing.assert_allclose(gyro.output(rates, temperatures)
-                               - gyro.output(0.0 * rates, temperatures) - rates, error, atol=1e-12)
-    assert ours('ojeda', 'rms error of the rate, static bias only').ours == pytest.approx(
-        np.sqrt(np.mean(error ** 2)) / DEGREE, rel=0.01)
-    turn = np.abs(error / rates).max() * 100
-    assert (ours('ojeda', 'largest error of a full turn, static bias only').ours
-            == pytest.approx(turn, rel=0.05))
-
-
-# Hong and Park
-
-def by_hand(motion, shift=0):
-    """Return the errors of s and b, %, by eq. 4 to 7, written out."""
-    count = round(motion.duration * 20) + 1
-    time = np.arange(count) / 20
-    measured = 0.9 * motion.rate_at(time) + 0.1
-    rows = [(sum(measured[shift:shift + n]) / 20, n / 20) for n in range(1, count - shift)]
-    scale, offset = np.linalg.lstsq(np.array(rows), motion.heading_at(time[1:count - shift]),
-                                    rcond=None)[0]
-    return 100 * ((1 / scale - 1) / -0.1 - 1), 100 * (-offset / scale / 0.1 - 1)
-
-
-def test_the_rectangle_rule_has_the_errors_of_figure_6():
-    found, motion = numbers('hong_park', 'Figures 6 and 7'), hong_park.published_motion()
-    assert by_hand(motion) == pytest.approx((found['s'], found['b']), rel=1e-6)
-    assert by_hand(motion, 1) == pytest.approx((found['late_s'], found['late_b']), rel=1e-6)
-    assert found['trapezoid'] < 1e-6 and found['late_s'] > 0 > found['s']
-    assert by_hand(hong_park.one_turn(3.0, 4.25)) == pytest.approx((-4.70, -20.61), abs=0.005), (
-        'a motion in round numbers is near')
-
-
-@pytest.mark.evidence
-def test_calibration_and_filter_take_off_the_heading_error_what_the_page_on_results_says():
-    text = (Path(__file__).parents[1] / 'docs/explanation/scope.md').read_text()
-    for row, name in (
-            ('self-calibration', 'self-calibration by likelihood'),
-            ('threshold filter, single samples, as published', 'threshold filter, single samples'),
-            ('threshold filter, mean of 0.2 s', 'threshold filter, mean of 0.2 s'),
-            ('both, single samples, as published', 'likelihood and filter, single samples'),
-            ('both, mean of 0.2 s', 'likelihood and filter, mean of 0.2 s')):
-        found = ours('hong_park', f'off pure integration, {name}', MANY)
-        assert f'| {row} | {found.ours:.0f} % |' in text
-
-
-@pytest.mark.parametrize('runs, error',
-                         [(FEW, 0.4), pytest.param(MANY, 0.15, marks=pytest.mark.evidence)])
-def test_eq_7_is_as_far_from_the_bound_as_its_covariance_says(runs, error):
-    """Of a standard deviation, four standard errors of few runs, three of many."""
-    time = np.arange(2001) / 100
-    rate = CALIBRATION_MOTION.rate_at(time)
-    columns, bound = (np.column_stack([CALIBRATION_MOTION.heading_at(time), time]),
-                      np.column_stack([rate, np.ones(2001)]))
-    # a sum of white noise at the times t and u has the covariance min(t, u)
-    estimator = np.linalg.inv(columns.T @ columns) @ columns.T
-    covariance = estimator @ np.minimum.outer(time, time) @ estimator.T
-    ratio = np.sqrt(np.diag(covariance) / np.diag(np.linalg.inv(bound.T @ bound) * 100))
-    found = numbers('hong_park', 'Cramer-Rao', runs)
-    assert (found['s'], found['b']) == pytest.approx(tuple(ratio), rel=error)
-    assert max(found['likely_s'], found['likely_b']) < 1.0 + error
-
-
-# Bot Thoughts
-
-def test_the_slopes_come_out_of_the_means():
-    first, second = (2.5654 + 2854.5) / -200, (-3857.9 + 2854.5) / 70
-    assert bot_thoughts.segment_slopes() == pytest.approx((first, second))
-    slope, rest = np.polyfit([0, 200, 270], [2.5654, -2854.5, -3857.9], 1)
-    assert ours('bot_thoughts', 'SF, line through three points').ours == pytest.approx(slope)
-    assert ours('bot_thoughts', 'N, line through three points').ours == pytest.approx(rest / slope)
-    left = np.array([2.5654, -2854.5, -3857.9]) - rest - slope * np.array([0, 200, 270])
-    deviation = math.sqrt(left @ left / np.square(np.array([0, 200, 270]) - 470 / 3).sum())
-    found = numbers('bot_thoughts', 'An error of the strobe')
-    assert (found['interval'] == pytest.approx(12.706 * deviation, rel=1e-4)
-            and found['off'] == pytest.approx(abs(left[1] / slope)))

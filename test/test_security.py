@@ -185,18 +185,6 @@ def test_the_policy_allows_a_recording_exactly_what_it_takes(ros, wait_until):
         rclpy.shutdown(context=context)
 
 
-@pytest.mark.parametrize('enclave', ['operator', 'technician'])
-def test_a_client_may_what_every_node_has_and_what_it_is_for(enclave, ros, wait_until):
-    offered = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'service'}
-    published = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'publisher'}
-    mine = allowed(enclave)
-    assert {name for kind, name in mine if kind == 'client'} <= offered
-    assert {name for kind, name in mine if kind == 'subscriber'} <= published | {'/clock'}
-    plain = {(kind, name.replace(enclave, 'test_client'))
-             for kind, name in mine if kind in ('publisher', 'service')}
-    wait_until(lambda: really(ros.node, 'test_client', '/') == plain, what=f'{plain}')
-
-
 def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
     assert not [name
                 for kind, name in allowed('operator') if kind == 'client' and 'parameter' in name]

@@ -21,14 +21,11 @@ import os
 
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
-from gyro_calibration.heading.integration import filter_rates, Threshold, ThresholdFilter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import compensate
-from gyro_calibration.model.effects import CATALOGUE, Channels, rate_temperature_polynomial
+from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import HealthMonitor
 import numpy as np
 import pytest
 
@@ -98,24 +95,6 @@ def test_every_output_gives_a_finite_rate(model, samples):
         assert math.isfinite(single.rate) and math.isfinite(single.model_rate)
 
 
-@tries(150)
-@hypothesis.given(models(0.1, around=False),
-                  st.lists(st.tuples(FINITE, st.floats(-20.0, 60.0)), min_size=1, max_size=5))
-def test_a_sample_alone_is_compensated_as_in_a_log_and_what_is_not_marked_is_inverted(
-        model, samples):
-    output, temperature = np.array(samples).T
-    many = compensate(model, output, temperature)
-    for index, (one, degc) in enumerate(samples):
-        single = compensate(model, one, degc)
-        assert single.rate == pytest.approx(many.rate[index], rel=1e-9, abs=1e-9)
-        assert bool(single.beyond_range) == bool(many.beyond_range[index])
-        if not single.beyond_range:
-            modelled = Channels(single.model_rate, one, single.temperature)
-            error = sum(
-                term.error(modelled) for term in model.terms if not term.effect.not_compensated)
-            assert single.model_rate + error == pytest.approx(one, rel=1e-8, abs=1e-8)
-
-
 # streams
 
 def rest_for_a_minute(add, begin):
@@ -169,37 +148,3 @@ def test_a_state_that_is_not_finite_is_reported_and_built_anew_with_the_last_hea
     assert all(map(math.isfinite, shown)) and tracker.variance >= 0.0
     assert (abs(tracker.heading - heading - 0.3 * INTERVAL * 201) < 0.5
             and tracker.variance > variance + 1.0)
-
-
-@tries(80)
-@hypothesis.given(st.lists(st.tuples(st.floats(1e-3, 0.3), FINITE), min_size=1, max_size=60),
-                  st.sampled_from([0.0, 0.2]), st.sampled_from([0.0, 7.3e-4]))
-def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk):
-    settings = Threshold(0.3 * DEGREE, window, walk)
-    live, time = ThresholdFilter(settings), np.cumsum([step for step, _ in samples])
-    rate = np.array([0.1 * each if abs(each) < 3.0 else each for _, each in samples])
-    found = [live.apply(*sample) for sample in zip(time.tolist(), rate.tolist())]
-    for index, at in enumerate(time):
-        begin = min(int(np.searchsorted(time, at - window, side='right')), index)
-        fresh = ThresholdFilter(settings)
-        alone = [fresh.apply(*sample)
-                 for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
-        assert found[index] == alone[-1]
-    assert filter_rates(settings, time, rate).tolist() == found
-
-
-@tries(40)
-@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, FINITE),
-                           max_size=300))
-def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
-    check, time = HealthMonitor(NOISE, 1e-3), 0.0
-    for step, output, rate in samples:
-        time = time + step if math.isfinite(time + step) else step
-        if check.add(time, output, rate):
-            check.examine_stretch(1e-8, 0.0)
-    check.restart()
-    complete = []
-    rest_for_a_minute(lambda at, rate: complete.append(check.examine_stretch(1e-8, 0.0))
-                      if check.add(at, rate, rate) else None, 0.0)
-    assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio)
-                                      and rest.is_noise_normal for rest in complete)

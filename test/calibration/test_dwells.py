@@ -19,7 +19,6 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells,
     find_dwells,
     join_dwells,
-    NothingSteady,
 )
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import constant_rate_motion
@@ -124,6 +123,8 @@ def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
         extract_dwells(log)
 
 
+# Logs in time
+
 def test_joined_logs_keep_their_sweeps_and_places_apart():
     parts = [extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
              for name in ('a.csv', 'b.csv')]
@@ -134,8 +135,6 @@ def test_joined_logs_keep_their_sweeps_and_places_apart():
     whole = join_dwells([*parts, replace(parts[1], temperature=None)])
     assert whole.temperature is None and '1 of 3 logs hold no temperature' in whole.remarks[-1]
 
-
-# Logs in time
 
 def references(generator):
     return {'rate': {'reference_rate': RATE}, 'heading': {'reference_heading': HEADING},
@@ -166,23 +165,6 @@ def test_the_means_scatter_as_they_claim_under_white_noise(reference, generator)
     assert low < np.sqrt(np.mean(found ** 2)) < high
     held = np.sum(np.abs(found) < 1.96)
     assert fewest(len(found), 0.95) <= held <= most(len(found), 0.95)
-
-
-def test_the_means_claim_the_steps_of_a_coarse_encoder(generator):
-    found = np.concatenate(
-        [errors(find_dwells(run(generator, 1e-4, reference_heading=encoder(2.0, generator))))
-         for _ in range(12)])
-    assert np.mean(np.abs(found) < 1.96) > 0.93
-
-
-def test_the_claim_counts_what_is_correlated_within_a_batch(generator):
-    log = run(generator, 0.0)
-    scatter = []
-    for _ in range(12):
-        noise = simulate_noise(Noise(0.01 * DEGREE), len(TIME), 0.01, generator)
-        scatter.append(errors(
-            find_dwells(replace(log, output=log.output + lfilter([0.1], [1.0, -0.9], noise)))))
-    assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(1.05, abs=0.15)
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
@@ -243,14 +225,6 @@ def test_outliers_repeated_and_lost_samples_are_reported_and_left_out(reference,
     assert 'samples missing within the dwells: 7, after 299.99 s' in said
 
 
-@pytest.mark.parametrize('step', [1e-9, 0.05, 0.3])
-def test_a_good_log_has_no_remarks_and_coarse_steps_of_the_output_are_not_repeats(step, generator):
-    log = run(generator)
-    log = replace(log, output=np.round(log.output / (step * DEGREE)) * step * DEGREE)
-    found = find_dwells(log)
-    assert all('after each ramp' in remark for remark in found.remarks)
-
-
 def test_a_dwell_that_warms_is_divided(generator):
     still = np.zeros(len(TIME))
     warm = find_dwells(run(generator, rate=still, reference_rate=still,
@@ -260,38 +234,6 @@ def test_a_dwell_that_warms_is_divided(generator):
     assert len(steady) == 1
     assert (5 <= len(warm) <= 7 and np.ptp(warm.temperature) > 4.0
             and 'divided' in ' '.join(warm.remarks))
-
-
-def test_a_rate_of_coarse_steps_or_of_no_values_gives_way_to_the_heading(generator):
-    coarse = encoder(2.0, generator)
-    for rate, heading, off in ((np.gradient(coarse, TIME), coarse, 0.02),
-                               (np.full(len(TIME), np.nan), HEADING, 1e-6)):
-        found = find_dwells(run(generator, reference_rate=rate, reference_heading=heading))
-        assert np.allclose(found.rate / DEGREE, RATES, atol=off)
-
-
-@pytest.mark.parametrize('quantity', ['reference_rate', 'reference_heading'])
-def test_rests_alone_of_a_motion_are_no_dwells_to_calibrate_by(quantity, generator):
-    moves = (TIME % 60.0) > 30.0
-    rate = np.where(moves, 45.0 * DEGREE * np.sin(TIME), 0.0)
-    reference = rate if quantity == 'reference_rate' else np.cumsum(rate) * 0.01
-    log = run(generator, rate=rate, **{quantity: reference})
-    assert np.abs(find_dwells(log).rate).max() < 0.1 * DEGREE
-    with pytest.raises(NothingSteady, match='steady at .* only, and turns at .* --method like'):
-        extract_dwells(log)
-
-
-def test_a_simulation_without_noise_claims_nothing(generator):
-    found = find_dwells(run(generator, 0.0))
-    assert np.allclose(found.output, SCALE * found.rate + BIAS, atol=1e-12)
-    assert (np.isnan(found.deviation) | (found.deviation < 1e-12)).all()
-
-
-def test_stamps_that_come_in_bursts_do_not_hide_dwells(generator):
-    bursts = np.floor(TIME / 0.08) * 0.08 + 1e-4 * (np.arange(len(TIME)) % 8)
-    found = find_dwells(replace(run(generator),
-                                time=np.maximum.accumulate(bursts) + 1e-8 * np.arange(len(TIME))))
-    assert len(found) == len(RATES) and 'missing' not in ' '.join(found.remarks)
 
 
 @pytest.mark.parametrize('rate', [1.0, 0.3, None])

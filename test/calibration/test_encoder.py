@@ -16,8 +16,7 @@ What was put in is found, with true intervals, on simulated logs and on measured
 
 from dataclasses import replace
 
-from chance import fewest, rms_bounds
-import efficiency
+from chance import fewest
 from encoder_intervals import run
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
@@ -55,27 +54,6 @@ def log_of(motion, duration, noise=None, generator=None, step=0.088 * DEGREE, la
 
 SWING = swing(120.0)
 CLEAN = log_of(SWING, 100.0)
-
-
-def test_bounds_of_the_angle_random_walk_hold_it_and_are_written_beside_a_fine_reference_alone():
-    noise, held = Noise(angle_random_walk=5e-4), 0
-    for seed in range(12):
-        log = log_of(SWING, 100.0, noise, np.random.default_rng([seed, 61]), step=1e-5)
-        low, high = calibrate_encoder(log).model.noise_bounds['angle_random_walk']
-        held += low <= noise.angle_random_walk <= high < 1.5 * low
-    assert held >= fewest(12, 0.95)
-    assert not calibrate_encoder(CLEAN).model.noise_bounds, 'its steps hide white noise'
-
-
-def test_a_wobble_that_repeats_itself_is_no_angle_random_walk():
-    """A wobble of 0.5 deg with a period of 2.5 s."""
-    true = 5e-4
-    log = log_of(SWING, 200.0, Noise(angle_random_walk=true), np.random.default_rng(62), step=1e-5)
-    wobble = 0.5 * DEGREE * 0.8 * np.pi * np.cos(0.8 * np.pi * log.time)
-    model = calibrate_encoder(replace(log, output=log.output + wobble)).model
-    assert 0.7 * true < model.noise.angle_random_walk < 2.0 * true
-    low, high = model.noise_bounds['angle_random_walk']
-    assert low < true < high
 
 
 def test_the_model_holds_what_was_found():
@@ -188,19 +166,6 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
             < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
-@pytest.mark.parametrize('step, noise, runs', [
-    (0.088, 0.02, 15), pytest.param(0.088, 0.02, 40, marks=pytest.mark.evidence),
-    pytest.param(5.0, 0.5, 40, marks=pytest.mark.evidence)])
-def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(
-        step, noise, runs):
-    """By a ratio of 1.1, as benchmarks/efficiency.py does for more cases and runs."""
-    found = np.array([efficiency.errors(step * DEGREE, noise * DEGREE, seed)[:2]
-                      for seed in range(runs)])
-    ratios = (found ** 2).mean(axis=0) / efficiency.bound(step * DEGREE, noise * DEGREE, False)
-    assert (ratios[0] < 1.1 * rms_bounds(runs)[1] ** 2).all(), ratios
-    assert (ratios[1] > 3.0).all(), ratios
-
-
 def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():
     """By 0.25 % for 50 ms on ramps of 0.3 s; by more where the motion is not smooth."""
     late = log_of(SWING, 100.0, late=0.05)
@@ -229,28 +194,6 @@ def test_measured_gyros_are_12_ms_late_and_that_is_not_taken_for_scale(data, nam
     assert found.fit.scale_factor_error == pytest.approx(MEASURED[name][1], abs=0.001)
 
 
-def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
-    """
-    Ten pieces of 2.5 minutes.
-
-    The scatter of b is between a third and twice of what is stated; that of s is less, as pieces
-    have the errors of the encoder in common.
-    """
-    fits = [calibrate_encoder(measured(data, 'pitch_slow', start, start + 150.0)).fit
-            for start in np.arange(0.0, 1490.0, 150.0)]
-    scatter = np.std([(fit.scale_factor_error, fit.bias) for fit in fits], axis=0, ddof=1)
-    stated = np.sqrt(np.mean([np.diag(fit.covariance) for fit in fits], axis=0))
-    assert (scatter < 2.0 * stated).all() and scatter[1] > stated[1] / 3.0, (scatter, stated)
-
-
-def test_the_scale_of_one_gyro_is_the_same_in_a_slow_and_a_fast_swing(data):
-    """Measured: 0.597 and 0.686 %, 2.5 standard deviations apart."""
-    slow, fast = (calibrate_encoder(measured(data, name)).fit for name in ('yaw_slow', 'yaw_fast'))
-    deviation = np.sqrt(slow.covariance[0, 0] + fast.covariance[0, 0])
-    assert abs(fast.scale_factor_error - slow.scale_factor_error) < 3.0 * deviation
-    assert deviation < 0.001
-
-
 def shaken(bias, generator):
     """
     Return 20 s of a fast swing whose heading is off by 3 deg again and again.
@@ -277,17 +220,3 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
             errors.append(bias)
             refused += 1
     assert refused >= 10 and np.sqrt(np.mean(np.square(errors))) < 0.1 * DEGREE
-
-
-def test_noise_of_the_gyro_in_a_swing_of_one_frequency_is_no_lag():
-    """Delay, lag and scale factor error have the same shape there, and a prior alone limits it."""
-    time, errors = np.arange(9000) / 100.0, []
-    rate = 60.0 * np.sin(2.0 * np.pi * 0.8 * time)
-    heading = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]))) / 100.0
-    for seed in range(4):
-        generator = np.random.default_rng([8, seed])
-        log = Log(time=time, output=(1.02 * rate + 0.1 * generator.standard_normal(9000)) * DEGREE,
-                  reference_heading=(heading + 0.002 * generator.standard_normal(9000)) * DEGREE)
-        fit = calibrate_encoder(log, 'likelihood').fit
-        errors.append((fit.scale_factor_error - 0.02) / np.sqrt(fit.covariance[0, 0]))
-    assert np.sqrt(np.mean(np.square(errors))) < 3.0

@@ -10,13 +10,10 @@
 
 """The planned motion: feasible, accepted, better than a plain one, and as good as predicted."""
 
-from dataclasses import replace
 from functools import cache
 import json
 import math
 
-from chance import rms_bounds
-from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, fit_likelihood
 from gyro_calibration.calibration.motion_design import (
     CalibrationForecast,
     can_follow,
@@ -41,7 +38,6 @@ from gyro_calibration.model.motion import (
 )
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
-from plan import followed
 import pytest
 import yaml
 
@@ -93,41 +89,6 @@ def test_a_planned_motion_can_be_driven_tells_the_scale_better_and_calibrates(na
     assert abs(fit.scale_factor_error - 0.03) < 4.0 * math.sqrt(fit.covariance[0, 0])
 
 
-SLUGGISH = {'hardly any acceleration': RobotLimits(60 * DEGREE, 1 * DEGREE),
-            'hardly any jerk': RobotLimits(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
-
-
-@pytest.mark.parametrize('name', SLUGGISH)
-def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
-    """In 4.5 s from rest: 1 deg/s² gives 4.5 deg/s, 5 deg/s³ gives 5 (4.5 / 2)² = 25.3 deg/s."""
-    ability, forecast = SLUGGISH[name], CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
-    fastest = {'hardly any acceleration': 4.5, 'hardly any jerk': 25.3125}[name] * DEGREE
-    simple = plain_motion(ability, 20.0)
-    motion = find_best_motion(ability, forecast, 20.0, np.random.default_rng(1), 5).motion
-    for each in (simple, motion):
-        assert (can_follow(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
-                and abs(each.heading[-1]) < 1e-9)
-    assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
-    assert (ability.max_turn_angle(9.0) == pytest.approx(4.5 * fastest)
-            and ability.max_turn_rate(4.5 * fastest) == pytest.approx(fastest))
-
-
-def test_the_bias_is_as_well_known_as_white_noise_allows_whatever_the_motion():
-    """
-    N / sqrt(T), and what the two senses of turning may differ by.
-
-    The fit weighs means over blocks, which costs half a percent at the ends.
-
-    """
-    forecast = CalibrationForecast(WHITE, 20.0, ROBOT_MOTION, 160.0, 0.0)
-    expected = WHITE.angle_random_walk / math.sqrt(20.0)
-    for motion in (CALIBRATION_MOTION, *(planned(name).motion for name in ABILITIES),
-                   plain_motion(ABILITIES['free'], 20.0)):
-        senses = ASYMMETRY_DEVIATION * np.abs(motion.rate_at(TIME)).mean()
-        assert (0.999 * expected < forecast.predict(motion).bias_deviation
-                < 1.01 * math.hypot(expected, senses))
-
-
 @pytest.mark.parametrize('size', [1.0, 0.03])
 def test_a_calibration_states_what_the_plan_promised(size):
     """Within 1.1, for a gyro of consumer grade and a fine one, with the rest after the run."""
@@ -144,42 +105,6 @@ def test_a_calibration_states_what_the_plan_promised(size):
     promised = CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0).predict(CALIBRATION_MOTION)
     ratio = np.median(deviations, axis=0) / (promised.scale_deviation, promised.bias_deviation)
     assert (np.abs(np.log(ratio)) < math.log(1.1)).all(), ratio
-
-
-def test_flicker_and_random_walk_part_the_bias_from_that_of_the_drive_as_simulated():
-    """Compare means of 20 s and the next 160 s."""
-    for noise in (Noise(1e-9, 1e-4), Noise(1e-9, 0.0, 1e-5)):
-        generator, differences = np.random.default_rng(0), []
-        for _ in range(1500):
-            bias = simulate_noise(noise, 3600, 0.1, generator)[1800:]
-            differences.append(bias[:200].mean() - bias[200:].mean())
-        # with white noise the fit takes the mean over the run
-        white, both = (CalibrationForecast(replace(each, angle_random_walk=1e-3), 20.0,
-                                           ROBOT_MOTION, 160.0,
-                                           0.0).predict(CALIBRATION_MOTION).bias_deviation
-                       for each in (Noise(), noise))
-        low, high = rms_bounds(1499)
-        assert low < np.std(differences, ddof=1) / math.sqrt(both ** 2 - white ** 2) < high
-
-
-FOLLOWED = {'as planned': ('a cable', 0.0, 0.0),
-            'late by 0.05 s, lag of 0.1 s': ('limited jerk', 0.05, 0.1)}
-
-
-@pytest.mark.parametrize('name, late, lag', FOLLOWED.values(), ids=FOLLOWED)
-def test_fits_scatter_as_predicted(name, late, lag):
-    """200 runs are in the benchmark."""
-    motion, errors = planned(name).motion, []
-    rate = followed(motion, TIME, late, lag)
-    for seed in range(20):
-        fit = fit_likelihood(
-            TIME, rate + simulate_noise(WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])),
-            motion, 0.2)
-        errors.append((fit.scale_factor_error, fit.bias))
-    expected = CalibrationForecast(WHITE, 20.0, ROBOT_MOTION, 160.0, 0.0).predict(motion)
-    ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
-    low, high = rms_bounds(19)
-    assert ((low < ratios) & (ratios < high)).all(), ratios
 
 
 IMPOSSIBLE = {

@@ -15,12 +15,7 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
-from gyro_calibration.calibration.scatter import (
-    cross_validation_parts,
-    estimate_scatter,
-    find_inliers,
-    Scatter,
-)
+from gyro_calibration.calibration.scatter import find_inliers
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS,
@@ -29,7 +24,6 @@ from gyro_calibration.model.effects import (
     rate_temperature_polynomial,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
-    SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
     STATIC_EFFECTS,
 )
@@ -37,8 +31,7 @@ from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 import pytest
 from recovery import CUBIC, gyros, LINEAR, POLYNOMIAL, run, SINE, Table
-from scipy.stats import binom, chi2, linregress
-from scipy.stats import t as student
+from scipy.stats import binom, chi2
 
 #: Probability that a test of an estimator fails by chance.
 RARE = 1e-4
@@ -51,22 +44,11 @@ def dwells(rate, error, temperature=None, deviation=None, sweep=None):
                   tuple(f'row {row + 1}' for row in range(len(rate))))
 
 
-def alike(table, size=1.0):
-    return Scatter(size, 0.0, 0.0, 0.0, np.ones(len(table), bool))
-
-
 def measured(terms=LINEAR, seed=1, **table):
     return Table(**table).measure(GyroModel(terms), np.random.default_rng(seed))
 
 
 # estimates
-
-def test_a_sine_that_is_zero_at_the_rates_of_all_dwells_is_chance():
-    rate = np.tile(6.0 * DEGREE * np.arange(-10, 11), 2)
-    noise = 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
-    fit = fit_effects(dwells(rate, noise), [BIAS, SCALE_FACTOR_ERROR])
-    sine = Term(SINE_RESPONSE, (30.0, 1.0))
-    assert replace(fit, terms=(*fit.terms, sine)).p_value(SINE_RESPONSE) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -86,26 +68,6 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs)
         assert chi2.ppf(RARE, runs) / runs < np.mean(errors ** 2) < chi2.ppf(1 - RARE, runs) / runs
 
 
-@pytest.mark.parametrize('count', [4, 6, 12])
-def test_intervals_of_a_slope_over_few_sweeps_are_those_of_student(count):
-    slopes = BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE
-    generator = np.random.default_rng(4)
-    for _ in range(3):
-        warm = np.linspace(-20.0, 20.0, count)
-        biases, scales = (size * generator.standard_normal(count) for size in (1e-3, 1e-3))
-        rate = np.tile(np.linspace(-2.0, 2.0, 11), count)
-        sweep = np.repeat(np.arange(count), 11)
-        table = dwells(rate, biases[sweep] + scales[sweep] * rate
-                       + 1e-5 * generator.standard_normal(len(rate)), 25.0 + warm[sweep],
-                       sweep=sweep)
-        fit = fit_effects(table, [BIAS, SCALE_FACTOR_ERROR, *slopes])
-        for slope, of_sweeps in zip(slopes, (biases, scales)):
-            # the regression of the sweeps, which the dwells give nearly without noise
-            regression = linregress(warm, of_sweeps)
-            half_width = student.ppf(0.975, count - 2) * regression.stderr
-            assert 1.96 * fit.effect_deviation(slope) == pytest.approx(half_width, rel=0.05)
-
-
 @pytest.mark.parametrize('name', [*gyros()])
 def test_a_gyro_with_one_effect_is_compensated_to_its_true_rate(name):
     truth = GyroModel(gyros()[name])
@@ -119,22 +81,6 @@ def test_the_shape_of_a_sine_is_found_wherever_it_is(k):
     table = measured((*LINEAR, Term(SINE_RESPONSE, (k, 1.0))), dwell=1e-5 * DEGREE)
     fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE))
     assert fit.terms[2].values[0] == pytest.approx(k, rel=1e-3)
-
-
-def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_scatter_alike():
-    table = measured(CUBIC, sweeps=3)
-    table = replace(table, sweep=np.zeros(len(table), int))
-    fit = fit_effects(table, [term.effect for term in CUBIC], alike(table))
-    columns = np.column_stack(
-        [column for term in fit.terms for column in term.columns(channels_of(table))])
-    error, freedom = table.output - table.rate, len(table) - len(CUBIC)
-    values, (misfit,), *_ = np.linalg.lstsq(columns, error, rcond=None)
-    widened = student.ppf(0.975, freedom) / 1.96
-    np.testing.assert_allclose([term.values[-1] for term in fit.terms], values, rtol=1e-9)
-    covariance = np.linalg.inv(columns.T @ columns) * misfit / freedom * widened ** 2
-    sizes = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(fit.model.covariance / np.outer(sizes, sizes),
-                               covariance / np.outer(sizes, sizes), atol=1e-5)
 
 
 # few dwells
@@ -152,12 +98,6 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
 
 
 # scatter
-
-def test_the_scatter_of_sweeps_is_found():
-    wander = 0.05 * DEGREE
-    found = estimate_scatter(measured(SINE, sweeps=24, sweep_bias=wander)).sweep_bias / wander
-    # One value is fitted to the biases of the sweeps, three to their change with temperature.
-    assert math.sqrt(chi2.ppf(RARE, 20) / 20) < found < math.sqrt(chi2.ppf(1 - RARE, 20) / 20)
 
 
 @pytest.mark.parametrize('rates', [[0.0, 0.2], np.zeros(30), np.linspace(-0.3, 0.3, 41)])
@@ -180,34 +120,6 @@ def test_what_is_left_out_is_what_a_fit_without_the_sweep_gives():
                                atol=1e-9)
 
 
-def test_what_is_left_out_of_one_of_few_sweeps_is_predicted_by_the_rest_of_the_sweep_too():
-    table = measured(CUBIC, sweeps=2, sweep_bias=0.2 * DEGREE)
-    fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR))
-    shared = fit.scatter.sweep_columns(table)
-    covariance = (np.diag(fit.scatter.deviation(table) ** 2)
-                  + shared @ shared.T * (table.sweep[:, None] == table.sweep))
-    columns = np.column_stack([np.ones(len(table)), table.rate])
-    error, part = table.output - table.rate, cross_validation_parts(table)
-    for hidden in (part == number for number in range(part.max() + 1)):
-        inverse = np.linalg.inv(covariance[np.ix_(~hidden, ~hidden)])
-        known = columns[~hidden]
-        values = np.linalg.solve(known.T @ inverse @ known, known.T @ inverse @ error[~hidden])
-        left = error - columns @ values
-        np.testing.assert_allclose(
-            fit.left_out_residual[hidden],
-            left[hidden] - covariance[np.ix_(hidden, ~hidden)] @ inverse @ left[~hidden],
-            atol=1e-9)
-
-
-def test_what_one_sweep_alone_shows_cannot_be_left_out():
-    table = measured(LINEAR, sweeps=4)
-    rate = np.where(table.sweep == 0, table.rate, 0.0)
-    fit = fit_effects(replace(table, rate=rate, output=table.output - 1.01 * (table.rate - rate)),
-                      (BIAS, SCALE_FACTOR_ERROR))
-    assert (np.isinf(fit.left_out_residual[table.sweep == 0]).all()
-            and np.isfinite(fit.left_out_residual[table.sweep > 0]).all())
-
-
 def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():
     generator = np.random.default_rng(5)
     rate, sweep = np.tile(np.linspace(-2.0, 2.0, 11), 8), np.repeat(np.arange(8), 11)
@@ -215,20 +127,6 @@ def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():
     assert find_inliers(dwells(rate, error, sweep=sweep)).all()
     error[36] += 5e-3
     assert np.flatnonzero(~find_inliers(dwells(rate, error, sweep=sweep))).tolist() == [36]
-
-
-def test_an_outlying_dwell_is_not_fitted():
-    table = measured(SINE)
-    off = replace(table,
-                  output=table.output + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
-    effects, others = [term.effect for term in SINE], np.arange(len(table)) != 30
-    fit = fit_effects(off, effects)
-    clean = fit_effects(select_dwells(table, others), effects,
-                        replace(fit.scatter, inliers=np.ones(167, bool)))
-    assert np.flatnonzero(~fit.scatter.inliers).tolist() == [30]
-    np.testing.assert_allclose(fit.residual[fit.scatter.inliers], clean.residual, atol=1e-6)
-    assert (fit.residual[30] == pytest.approx(0.5 * DEGREE, abs=6 * 0.03 * DEGREE)
-            and np.isnan(fit.left_out_residual[30]))
 
 
 # refusals

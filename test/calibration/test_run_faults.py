@@ -15,19 +15,15 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 
 """
 
-from dataclasses import replace
 from functools import cache
 import json
 import math
 import re
 
 from chance import fewest, most
+from conftest import operations
 from fooled import LEVELS, tried, WAYS
-from gyro_calibration.calibration.likelihood import (
-    fit_likelihood,
-    MIN_FIT_PROBABILITY,
-    ScaleBiasFit,
-)
+from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY, ScaleBiasFit
 from gyro_calibration.calibration.run_faults import split_run
 from gyro_calibration.calibration.self_calibration import (
     check_end,
@@ -52,7 +48,6 @@ from gyro_calibration.model.motion import (
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
-from operations import operations
 import pytest
 
 GOOD = [name for name, (_, _, word) in WAYS.items() if not word]
@@ -295,21 +290,6 @@ def test_a_steady_turn_in_a_log_without_a_rest_is_refused_or_in_the_interval(deg
             assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
 
 
-def test_a_steady_turn_is_seen_in_a_short_rest_of_a_robot_that_has_settled():
-    built_in, settled = PROFILES.values()
-    with pytest.raises(DataRefused, match='the robot turned throughout the run'):
-        ended(0, 1.0 * DEGREE, 0.4, settled)
-    fit = ended(0, 1.0 * DEGREE, 0.4, built_in)
-    assert abs(fit.bias - B) < 1.96 * math.sqrt(fit.covariance[1, 1])
-
-
-def test_a_short_rest_leaves_the_bias_known_and_nothing_is_checked_without_one():
-    short = ended(0, 0.0, 0.4)
-    assert abs(short.bias - B) < 1.96 * math.sqrt(short.covariance[1, 1]) < 0.3 * DEGREE
-    for motion in (CALIBRATION_MOTION, replace(CALIBRATION_MOTION, name='reference')):
-        assert check_end(TIME, output(0), calibrated(0), motion) is calibrated(0)
-
-
 @pytest.mark.parametrize('off', [0.0, 3.0, -10.0])
 def test_the_rest_after_a_run_draws_the_bias_of_a_run_that_is_off(off):
     """The run states 0.01 deg/s, its error is a multiple; the rest has a fifth of it."""
@@ -322,23 +302,6 @@ def test_the_rest_after_a_run_draws_the_bias_of_a_run_that_is_off(off):
         errors.append(rest.bias / math.sqrt(rest.covariance[1, 1]))
         assert rest.covariance[1, 1] < 0.3 * run and rest.covariance[0, 0] == pytest.approx(1e-6)
     assert np.mean(np.abs(errors) < 1.96) > 0.8
-
-
-def test_the_rest_of_a_robot_that_swings_out_begins_when_it_rests():
-    time = np.arange(2600) / 100.0
-    swing = 0.02 * np.exp(-2.0 * (time - 21.0)) * (time > 20.5)
-    rate = calibrated(0).bias + 1e-5 * np.random.default_rng(3).standard_normal(2600) + swing
-    rest = find_rest_after(time, rate, calibrated(0), CALIBRATION_MOTION)
-    assert 22.5 < time[rest][0] <= 23.01
-
-
-def test_a_slip_at_speed_alone_is_in_the_interval_of_the_scale():
-    """At 45 deg/s all turns lose 1.5 %, and those at 30 deg/s nothing."""
-    rate = CALIBRATION_MOTION.rate_at(TIME)
-    slipped = output(0) - (1.0 + S) * 0.015 * np.where(np.abs(rate) > 0.6, rate, 0.0)
-    fit = self_calibrate(TIME, slipped, CALIBRATION_MOTION, noise=XV3500.noise)
-    deviation = math.sqrt(fit.covariance[0, 0])
-    assert deviation > 0.008 and abs(fit.scale_factor_error - S) < 1.96 * deviation
 
 
 def odometry(seed, deviation, drift):
@@ -370,20 +333,6 @@ def test_odometry_calibrates_and_its_own_scale_and_drift_are_in_the_deviations(r
                         fit.time_offset_deviation])
     assert runs - len(sizes) <= most(runs, 0.02)
     assert ((np.array(sizes) < 1.96).sum(axis=0) >= fewest(len(sizes), 0.93)).all(), sizes
-
-
-@pytest.mark.parametrize('runs', [10, pytest.param(25, marks=pytest.mark.evidence)])
-def test_the_start_heading_is_found_with_its_deviation(runs):
-    """A reference of 20 Hz whose readings are 0.5 deg off, the first one too."""
-    sizes, readings = [], np.arange(401) / 20.0
-    for seed in range(runs):
-        errors = 0.5 * DEGREE * np.random.default_rng([seed, 4]).standard_normal(401)
-        fit = fit_likelihood(
-            TIME, output(seed),
-            motion_from_headings(readings, CALIBRATION_MOTION.heading_at(readings) + errors))
-        sizes.append(abs(fit.start_heading + errors[0]) / fit.start_heading_deviation)
-        assert fit.start_heading_deviation < 0.25 * DEGREE
-    assert np.sum(np.array(sizes) < 1.96) >= fewest(runs, 0.93), np.sort(sizes)
 
 
 def turned(number, seed=0, s=S, before=3.0, after=3.0, speed=45.0):

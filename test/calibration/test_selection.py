@@ -12,19 +12,14 @@
 
 from dataclasses import replace
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    dwells_from_table,
-    join_dwells,
-    select_dwells,
-)
+from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, select_dwells
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE,
     MIN_DISTINGUISHING_SIGMAS,
     select_effects,
     TECHNOLOGY_EFFECTS,
 )
-from gyro_calibration.logs.log import DEGREE, Log, read_log
+from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -64,24 +59,6 @@ def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
 
 
-def test_biases_of_three_sweeps_are_no_curve_over_temperature():
-    table = Table(sweeps=3, sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True)
-    generator = np.random.default_rng(2)
-    wrong = sum('bias_temperature_quadratic' in names(select_effects(
-        table.measure(GyroModel(LINEAR), generator))) for _ in range(10))
-    assert wrong <= binom.ppf(1 - RARE, 10, FALSE_ALARM_RATE)
-
-
-def test_a_cubic_is_found_beside_slopes_over_temperature_in_two_sweeps():
-    rate = np.append(np.linspace(-1.0, 1.0, 9), np.linspace(1.0, -1.0, 9))
-    warm = np.linspace(-7.0, 7.0, len(rate))
-    noise = 1e-4 * np.random.default_rng(3).standard_normal(len(rate))
-    error = 3e-3 * rate ** 3 - 2e-4 * warm - 3e-4 * warm * rate + noise
-    table = Dwells(rate, rate + error, 28.0 + warm, np.full(len(rate), np.nan),
-                   np.repeat([0, 1], 9), ('',) * len(rate))
-    assert 'cubic_nonlinearity' in names(select_effects(table, 'mems'))
-
-
 @pytest.mark.parametrize('runs', [2, pytest.param(8, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('terms, technology', [(CUBIC, 'mems'), (SINE, 'open_loop_fog')])
 def test_effects_of_clear_size_are_found(terms, technology, runs):
@@ -93,13 +70,6 @@ def test_effects_of_clear_size_are_found(terms, technology, runs):
              for _ in range(runs)]
     right = sum(each == {term.effect.name for term in terms} | set(SLOPES) for each in found)
     assert right >= binom.ppf(RARE, runs, 1 - FALSE_ALARM_RATE)
-
-
-def test_a_curve_over_temperature_is_found_where_its_slope_alone_explains_little():
-    terms = (*SINE, Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 5e-6)))
-    table = replace(WANDERING, temperatures=(0.0, 60.0))
-    assert {'bias_temperature', 'bias_temperature_quadratic'} <= names(
-        select_effects(measured(table, terms), 'open_loop_fog'))
 
 
 @pytest.mark.parametrize('technology', TECHNOLOGY_EFFECTS)
@@ -132,16 +102,6 @@ def test_the_rate_that_is_proposed_distinguishes_confounders(runs):
     assert np.mean(sigmas) > MIN_DISTINGUISHING_SIGMAS - 3.7 / np.sqrt(runs), sigmas
 
 
-def test_a_sine_with_its_zeros_at_the_rates_of_the_dwells_is_no_response():
-    rate = 6.0 * DEGREE * np.tile(np.arange(-10.0, 11.0), 6)
-    sweeps = {'sweep': tuple(np.repeat(list('abcdef'), 21))}
-    for seed in range(4):
-        error = 1.2e-5 * np.random.default_rng(seed).standard_normal(len(rate))
-        table = dwells_from_table(Log(output=rate * (1.0 + 2e-5 * rate ** 2) + error,
-                                      reference_rate=rate, others=sweeps))
-        assert select_effects(table, 'open_loop_fog').calibration.min_non_monotonic_rate is None
-
-
 @pytest.mark.parametrize('technology', [None, 'open_loop_fog'])
 def test_a_sine_that_passes_through_evenly_spaced_rates_is_not_taken_for_a_cubic(technology):
     """Rates of multiples of 20 deg/s do not distinguish k from 18 s - k, of the other sign."""
@@ -172,11 +132,6 @@ def test_rests_show_a_bias_alone():
     table = measured(Table(), LINEAR)
     steady = replace(table, rate=np.zeros(len(table)), output=table.output - table.rate)
     assert names(select_effects(steady)) == {'bias', 'bias_temperature'}
-
-
-def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
-    """Dwells that scatter by 10 deg/s do not determine a slope of 0.07 deg/s/K."""
-    assert names(select_effects(measured(Table(dwell=10.0 * DEGREE), LINEAR))).isdisjoint(SLOPES)
 
 
 @pytest.mark.parametrize('technology', [None, *TECHNOLOGY_EFFECTS])

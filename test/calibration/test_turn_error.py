@@ -16,18 +16,12 @@ import hashlib
 import json
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, extract_dwells, select_dwells
-from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects
-from gyro_calibration.calibration.scatter import rms
+from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.rate_table import compute_turn_errors
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, write_log
 from gyro_calibration.model.compensation import compensate
-from gyro_calibration.model.effects import (
-    BIAS,
-    rate_temperature_polynomial,
-    SCALE_FACTOR_ERROR,
-    SINE_RESPONSE,
-)
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import motion_from_rates, simulate
 from gyro_calibration.model.noise import Noise
@@ -128,6 +122,8 @@ def sweeps(seed=0, deviation=1e-5, odd=None):
                  sweep=number)
 
 
+# the program
+
 def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
     found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
                   [0, 0, 1, 1, 2])
@@ -137,17 +133,6 @@ def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_res
             and errors.modelled == pytest.approx(0.0))
     assert '1 turns are left out' in errors.remarks[1]
 
-
-def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_tenth(data):
-    found = extract_dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
-    fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
-    kept = fit.scatter.inliers
-    errors = compute_turn_errors(select_dwells(found, kept), fit.left_out_rate[kept])
-    assert np.abs(errors.static).max() > 0.02 * TURN > np.abs(errors.modelled).max()
-    assert rms(errors.static) > 10.0 * rms(errors.modelled)
-
-
-# the program
 
 @pytest.fixture
 def run(run):
@@ -197,11 +182,6 @@ def test_a_model_that_was_fitted_to_the_log_is_distinguished_from_others(
                   if 'the model is' in each)
     assert (('; ' in remark) == bool(said) and remark.count('errors of a fit') == bool(said)
             and f'; {said}' in remark + '; ')
-
-
-def test_a_model_of_a_self_calibration_alone_is_not_one_without_effects(run, log, model):
-    model.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.008, bias: 0.0}')
-    assert 'model.yaml: self-calibration' in run(log, '--model', model)[1]
 
 
 def test_the_table_gives_degrees_and_per_cent_and_what_is_beyond_the_range_of_the_model(

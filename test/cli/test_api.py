@@ -80,22 +80,6 @@ def test_no_other_name_is_public():
     assert (Path(gyro_calibration.__file__).parent / 'py.typed').exists()
 
 
-def test_lists_make_a_log_and_files_keep_it(tmp_path):
-    log = Log([0.0, 0.5, 1.0], [0.0, 0.1, 0.2], reference_heading=[0.0, 0.05, 0.1])
-    write_log(tmp_path / 'log.csv', log)
-    again = read_log(tmp_path / 'log.csv')
-    assert again.output.tolist() == [0.0, 0.1, 0.2] and again.reference_heading[-1] == 0.1
-    assert read_log({'t': [0.0, 500.0], 'wz': [0, 180]},
-                    {'time': 't:ms', 'gyro': 'wz:deg/s'}).output[1] == pytest.approx(np.pi)
-
-
-def test_a_model_of_a_mapping_is_that_of_its_file(tmp_path):
-    write_model(tmp_path / 'model.yaml', GYRO)
-    assert read_model(tmp_path / 'model.yaml').terms == GYRO.terms
-    with pytest.raises(ValueError, match='effects'):
-        read_model({'noise': {}})
-
-
 def test_a_run_gives_what_the_command_line_gives(run_model, run, tmp_path):
     write_log(tmp_path / 'run.csv', run_and_rest())
     write_model(tmp_path / 'noise.yaml', NOISE)

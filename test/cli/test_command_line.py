@@ -12,6 +12,7 @@
 
 import hashlib
 import io
+import itertools
 import json
 import math
 import os
@@ -20,16 +21,17 @@ import shlex
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.main import find_verbs
 from gyro_calibration.driver.protocols import find_protocol
-from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
+from gyro_calibration.logs.log import DEGREE, Log, read_log, read_log_blocks, write_log
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import ROBOT_MOTION
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 TURN = 2.0 * math.pi
 VERBS = list(find_verbs())
@@ -68,30 +70,49 @@ def test_a_verb_follows_the_technology_or_says_why_not(run, verb):
         assert code == 2 and ('give one of the two' if follows else 'reads it from') in error
 
 
-@pytest.mark.parametrize('words, said', [
-    *((words, f'perhaps {near} is meant') for words, near in (
-        ('compnsate log.csv', 'compensate'), ('allan log.csv --unwarp', '--unwrap'),
-        ('fit log.csv --technology mem', 'mems'), ('fit log.csv --effects bais', 'bias'),
-        ('allan log.csv --columns tim=t', 'time'),
-        ('allan log.csv --columns gyro=w:deg/sec', 'deg/s'),
-        ('allan log.csv --columns gyro=gyro_dsp', 'gyro_dps'),
-        ('compensate log.csv --model model.yaml --out out.csv', 'bias'),
-        ('simulate --model noise.yaml --motion robt --out out.csv', 'robot'),
-        ('emulate --protocol kvh_dsp300 --model noise.yaml', 'kvh_dsp3000'),
-        ('plan --limits limits.yaml', 'maximum_rate_dps'))),
-    ('diagnose log.csv --seed x', "'x' is no number"),
-    ('allan log.csv --rate 0', 'give a number above 0'),
-    ('diagnose log.csv --out log.csv', 'log.csv: is a file, but must be a folder'),
-    ('fleet log.csv --out log.csv', 'log.csv: is a file, but must be a folder')])
-def test_a_wrong_name_or_value_is_answered_in_one_line_with_what_is_right(
+#: A command line, and what its answer says; an unset variable of the shell is an empty argument.
+WRONG = {
+    **{words: f'perhaps {near} is meant' for words, near in {
+        'compnsate log.csv': 'compensate', 'allan log.csv --unwarp': '--unwrap',
+        'fit log.csv --technology mem': 'mems', 'fit log.csv --effects bais': 'bias',
+        'allan log.csv --columns tim=t': 'time', 'allan log.csv --columns gyro=w:deg/sec': 'deg/s',
+        'allan log.csv --columns gyro=gyro_dsp': 'gyro_dps',
+        'compensate log.csv --model bais.yaml --out x.csv': 'bias',
+        'simulate --model model.yaml --motion robt --out x.csv': 'robot',
+        'emulate --protocol kvh_dsp300 --model model.yaml': 'kvh_dsp3000',
+        'plan --limits limits.yaml': 'maximum_rate_dps'}.items()},
+    'diagnose log.csv --seed x': "'x' is no number", 'allan log.csv --rate 0': 'a number above 0',
+    'diagnose log.csv --out log.csv': 'log.csv: is a file, but must be a folder',
+    'fleet log.csv --out log.csv': 'log.csv: is a file, but must be a folder',
+    'compensate missing.csv --model model.yaml --out x.csv': 'missing.csv: cannot be read',
+    'compensate log.csv --model missing.yaml --out x.csv': 'missing.yaml: there is no such file',
+    'compensate log.csv --model model.yaml --out ""': 'is empty; give a value or omit it',
+    'fit ""': 'is empty; give a value or omit it',
+    'emulate --protocol morse --model model.yaml': "protocol 'morse' is not known",
+    'emulate --protocol fizoptika --model model.yaml': 'sensitivity is not set',
+    'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
+    'reproduce newton': 'hong_park',
+    'simulate --model model.yaml --motion waltz --out x.csv': 'waltz: there is no such motion',
+    'compensate log.csv --model model.yaml --out x.csv --threshold -1': 'a number of 0 or more',
+    **{f'simulate --model model.yaml --motion rest --out x.csv {option}': said
+       for option, said in {
+           '--sample-rate 1e-300': '', '--sample-rate 1e300': '', '--sample-rate 1e9': '',
+           '--temperature nan': '', '--temperature 1e9': '',
+           '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
+
+
+@pytest.mark.parametrize('words, said', WRONG.items(), ids=WRONG)
+def test_wrong_use_is_answered_in_one_line_with_what_is_right_and_writes_nothing(
         run, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,w\n0,1,1\n1,2,2\n')
-    (tmp_path / 'model.yaml').write_text('effects: {bais: {bias: 0.1}}')
-    (tmp_path / 'noise.yaml').write_text(NOISY_GYRO)
-    (tmp_path / 'limits.yaml').write_text('maximum_rat_dps: 1')
-    code, text, error = run(*words.split())
-    assert (code, text, error.count('\n')) == (2, '', 1) and said in error
+    for name, text in {'log.csv': 'time_s,gyro_dps,w\n0,1,1\n1,2,2\n', 'model.yaml': NOISY_GYRO,
+                       'bais.yaml': 'effects: {bais: {bias: 0.1}}',
+                       'limits.yaml': 'maximum_rat_dps: 1'}.items():
+        (tmp_path / name).write_text(text)
+    before = os.listdir()
+    code, text, error = run(*shlex.split(words))
+    assert (code, text, error.count('\n')) == (2, '', 1) and said in error, error
+    assert os.listdir() == before
 
 
 def test_simulate_then_compensate_gives_the_true_heading_back(compensate, model, log):
@@ -179,35 +200,6 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
     assert abs(json.loads(text)['bias']) < 1e-5
 
 
-#: An unset variable of the shell leaves an empty argument.
-EMPTY = 'is empty; give a value or omit it'
-WRONG = {
-    'compensate missing.csv --model MODEL --out x.csv': 'missing.csv: cannot be read',
-    'compensate LOG --model missing.yaml --out x.csv': 'missing.yaml: there is no such file',
-    'compensate LOG --model MODEL --out ""': EMPTY, 'fit ""': EMPTY,
-    'emulate --protocol morse --model MODEL': "protocol 'morse' is not known",
-    'emulate --protocol fizoptika --model MODEL': 'sensitivity is not set',
-    'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
-    'reproduce newton': 'hong_park',
-    'simulate --model MODEL --motion waltz --out x.csv': 'waltz: there is no such motion',
-    'compensate LOG --model MODEL --out x.csv --threshold -1': 'give a number of 0 or more',
-    **{f'simulate --model MODEL --motion rest --out x.csv {option}': said for option, said in {
-        '--sample-rate 1e-300': '', '--sample-rate 1e300': '', '--sample-rate 1e9': '',
-        '--temperature nan': '', '--temperature 1e9': '',
-        '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
-
-
-@pytest.mark.parametrize('words, said', WRONG.items(), ids=WRONG)
-def test_wrong_use_ends_with_2_says_why_and_writes_nothing(
-        run, model, log, tmp_path, monkeypatch, words, said):
-    monkeypatch.chdir(tmp_path)
-    before = os.listdir()
-    code, text, error = run(*[{'MODEL': model, 'LOG': log}.get(word, word)
-                              for word in shlex.split(words)])
-    assert code == 2 and not text and said in error and 'Traceback' not in error
-    assert os.listdir() == before and (said != EMPTY or error.count('\n') == 1)
-
-
 def test_a_log_of_counts_wants_its_sensitivity(compensate, model):
     log = Log(counts=np.full(10, 100.0))
     done = compensate(log, model, '--rate', 10)
@@ -268,46 +260,11 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
     assert len(read_log(folder / 'log.csv')) > 4000
 
 
-@pytest.mark.parametrize('refusals', [0, 2, 3])
-def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(
-        ros_domain, capsys, monkeypatch, refusals):
-    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    from gyro_calibration.cli.demo_run import calibrate, CallRefused, MAX_ATTEMPTS
-    monkeypatch.setattr('gyro_calibration.cli.demo_run._wait', lambda *_: None)
-    answers = iter([CallRefused('calibrate: the gyro slipped')] * refusals + ['done'])
-
-    def call(*_):
-        answer = next(answers)
-        if isinstance(answer, CallRefused):
-            raise answer
-    with tqdm(total=60, disable=True) as bar:
-        if refusals < MAX_ATTEMPTS:
-            calibrate(SimpleNamespace(call_service=call), bar)
-        else:
-            with pytest.raises(CallRefused, match='slipped'):
-                calibrate(SimpleNamespace(call_service=call), bar)
-    assert capsys.readouterr().err.count('slipped; the run is repeated') == min(
-        refusals, MAX_ATTEMPTS - 1)
-
-
 def test_a_method_that_gives_no_standard_deviation_claims_none(run, compensate, log, tmp_path):
     code, text, _ = run('self-calibrate', log, '--method', 'rate', '--out', tmp_path / 'new.yaml')
     assert code == 0 and '+-' not in text
     assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
     assert np.isnan(compensate(log, tmp_path / 'new.yaml').columns['heading_std_rad'][-1])
-
-
-def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run, log, tmp_path):
-    lines = log.read_text().splitlines()
-    header = next(line for line in lines if not line.startswith('#')).split(',')
-    rows = [line.split(',') for line in lines if not line.startswith('#')][1:]
-    for row in rows[:300]:
-        for name in ('reference_heading_rad', 'reference_rate_rad_s'):
-            row[header.index(name)] = 'nan'
-    (tmp_path / 'lost.csv').write_text('\n'.join(','.join(row) for row in [header, *rows]) + '\n')
-    answer = json.loads(run('self-calibrate', tmp_path / 'lost.csv', '--json')[1])
-    assert (answer['scale_factor_error'] == pytest.approx(-0.1, abs=1e-6)
-            and abs(answer['time_offset_s']) < 1e-3)
 
 
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
@@ -352,3 +309,106 @@ def test_a_short_step_and_a_file_show_nothing(monkeypatch):
         with verb.show_progress('fit'):
             pass
         assert not stream.getvalue()
+
+
+# Logs of any length, which compensate reads in blocks
+
+
+POLYNOMIAL = (
+    '\neffects:\n  rate_temperature_polynomial:\n'
+    '    matrix_dps: [[2.0e-10, -3.0e-9, 1.0e-6, -2.0e-5], [-1.0e-8, 2.0e-7, -4.0e-5, 2.0e-3], '
+    '[3.0e-7, -4.0e-6, 4.0e-3, -0.05]]\n'
+    'valid: {rate: [-0.8, 0.8], temperature: [26.0, 45.0]}\n'
+    'noise: {angle_random_walk: 7.3e-4}\n'
+    'self_calibration: {scale_factor_error: 0.01, bias: 0.001, '
+    'covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}\n')
+
+#: Runs the program and then prints the peak memory of the process, KiB.
+_MEASURED = """
+import resource, sys
+from gyro_calibration.cli.main import main
+code = main(sys.argv[1:])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+sys.exit(code)
+"""
+
+
+def write_robot(path, rows):
+    """Write a log of the robot, which drives its way again and again."""
+    time = np.arange(16000) * 0.01
+    way = [f',{rate:.6f},{degc:.2f}\n'
+           for rate, degc in zip(ROBOT_MOTION.rate_at(time), 35.0 + 12.0 * np.sin(time / 20.0))]
+    with open(path, 'w') as file:
+        file.write('time_s,gyro_rad_s,temperature_degc\n')
+        file.writelines(f'{row / 100:.2f}{rest}'
+                        for row, rest in zip(range(rows), itertools.cycle(way)))
+
+
+@pytest.fixture
+def polynomial(tmp_path):
+    """Return the file of a model with noise, a self-calibration, and ranges that are left."""
+    path = tmp_path / 'model.yaml'
+    path.write_text(POLYNOMIAL)
+    return path
+
+
+def test_the_memory_does_not_grow_with_the_log(polynomial, tmp_path):
+    peaks = []
+    for rows in (100_000, 400_000):
+        write_robot(tmp_path / 'log.csv', rows)
+        words = ['compensate', 'log.csv', '--model', polynomial, '--out', 'out.csv',
+                 '--threshold', '0.3']
+        done = subprocess.run([sys.executable, '-c', _MEASURED, *map(str, words)],
+                              capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0 and f'{rows} rows compensated' in done.stdout, done.stderr
+        assert not done.stderr, 'a bar is for a terminal only'
+        peaks.append(int(done.stdout.split()[-1]) / 1024)
+    assert peaks[1] < peaks[0] + 14.0, 'MiB; half of what 300 000 more rows of twelve numbers are'
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Let logs be read in blocks of 300 rows."""
+    monkeypatch.setattr('gyro_calibration.cli.verb.BLOCK_ROWS', 300)
+    monkeypatch.setattr('gyro_calibration.cli.verb.read_log_blocks',
+                        lambda *given, **more: read_log_blocks(*given, rows=300, **more))
+
+
+WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--invert'],
+         'at a rate': ['--rate', '100'], 'unwrapped': ['--unwrap']}
+
+
+@pytest.mark.parametrize('words', WORDS.values(), ids=WORDS)
+def test_a_log_in_blocks_gives_the_columns_of_one_piece(
+        polynomial, tmp_path, words, request, compensate):
+    write_robot(tmp_path / 'log.csv', 4001)
+    lines = (tmp_path / 'log.csv').read_text().splitlines()
+    for lost in (1, 2, *range(290, 1300), 4001):  # outputs of whole blocks and of the last row
+        time, _, degc = lines[lost].split(',')
+        lines[lost] = f'{time},nan,{degc}'
+    (tmp_path / 'log.csv').write_text('\n'.join(lines) + '\n')
+    whole = compensate(tmp_path / 'log.csv', polynomial, '--json', *words)
+    request.getfixturevalue('small_blocks')
+    blocks = compensate(tmp_path / 'log.csv', polynomial, '--json', *words)
+    assert whole.text == blocks.text and '"rows_without_output": 1013' in whole.text
+    assert list(whole.columns) == list(blocks.columns) and len(whole.columns) == 6
+    for name, values in whole.columns.items():
+        np.testing.assert_allclose(blocks.columns[name], values, rtol=1e-12, err_msg=name)
+
+
+def test_a_log_without_any_output_is_refused(polynomial, small_blocks, compensate):
+    done = compensate(Log(output=np.full(1000, np.nan), time=np.arange(1000.0)), polynomial)
+    assert done.code == 1 and 'no gyro output is finite' in done.error and done.log is None
+
+
+@pytest.mark.parametrize('time, output, interval', [
+    # a gap of 3 s, then only every other sample
+    (np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)]), np.zeros(1001), 0.01),
+    # a table writes a row at 100 Hz, and the gyro has a value in one of ten
+    (np.arange(2000) / 100.0, np.where(np.arange(2000) % 10, np.nan, 0.0), 0.1)],
+    ids=['gaps', 'rows of others'])
+def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(
+        small_blocks, compensate, time, output, interval):
+    deviation = compensate(Log(output=output, time=time), GyroModel(noise=Noise(7.3e-4))).columns[
+        'rate_std_rad_s']
+    assert deviation[np.isfinite(output)] == pytest.approx(7.3e-4 / math.sqrt(interval), rel=1e-9)

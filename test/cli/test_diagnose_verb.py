@@ -155,14 +155,3 @@ def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, r
     assert code != 0 and not text and one_sentence(errors)
     assert sorted(tmp_path.rglob('*')) == before
     assert taken != 'found' or (tmp_path / taken).read_text() == 'mine'
-
-
-# data that allow an answer only in part
-
-
-def test_stretches_of_nan_are_left_out(log, diagnose):
-    output, reference = log.output.copy(), log.reference_rate.copy()
-    output[500:700], reference[2500:2650] = np.nan, np.nan
-    answer = answer_of(diagnose(replace(log, output=output, reference_rate=reference), '--json'))
-    assert [finding['effect'] for finding in answer['findings']
-            if finding['effect'] != 'dropped_samples'] == ['warm_up']

@@ -14,11 +14,7 @@ from dataclasses import replace
 from functools import cache
 
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
-from gyro_calibration.calibration.rate_table import (
-    compute_turn_errors,
-    fit_effects,
-    MIN_TURN_RATE,
-)
+from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects, MIN_TURN_RATE
 from gyro_calibration.cli.plots import (
     draw_error_surface,
     draw_headings,
@@ -180,15 +176,3 @@ def test_residuals_are_those_of_the_calibration_and_outlying_ones_do_not_set_the
         [MEASURED.temperature, (MEASURED.output - MEASURED.rate) / DEGREE])[kept])
     np.testing.assert_allclose(after,
                                np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)
-
-
-def test_the_curves_of_the_surface_are_what_the_model_takes_off(figure_of):
-    figure = figure_of(
-        lambda path: draw_error_surface(path, warm().model, (-1.5, 1.5), (0.0, 30.0)))
-    lines = figure.axes[1].get_lines()
-    assert [line.get_label() for line in lines] == [
-        'model at 0.0 °C', 'model at 10.0 °C', 'model at 20.0 °C', 'model at 30.0 °C']
-    assert len({line.get_linestyle() for line in lines}) == 4
-    output, error = (values * DEGREE for values in lines[1].get_data())
-    np.testing.assert_allclose(warm().model.output(output - error, np.full(len(output), 10.0)),
-                               output, atol=1e-9)

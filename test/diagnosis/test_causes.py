@@ -8,21 +8,19 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Causes: all that the catalogue of effects lists can be named."""
+"""Causes: all that the catalogue of effects lists can be named, also effects of the user's own."""
 
+import json
+import math
 import re
 import zlib
 
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
-from gyro_calibration.diagnosis.causes import (
-    CAUSES,
-    make_finding,
-    mark_suspected,
-    next_experiment,
-)
+from gyro_calibration.diagnosis.causes import CAUSES, make_finding, mark_suspected, next_experiment
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.logs.log import DEGREE, QUANTITIES
+from gyro_calibration.logs.log import QUANTITIES
+from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
 from gyro_calibration_bench.hidden import hide
 from gyro_calibration_bench.hidden.conditions import hide_look_alike, LOOK_ALIKES
 import numpy as np
@@ -60,18 +58,6 @@ def test_twins_are_given_the_experiment_that_physics_wants_in_either_order(pair,
         assert f'{other.replace("_", " ")} by 2.0 sigma, 2 such logs together by 2.8' in words
 
 
-def test_the_numbers_of_an_experiment_are_those_of_the_log(laid):
-    def numbers(one, other):
-        words = next_experiment(one, [(other, 0.0)], observed_range([laid])).partition(' (')[0]
-        return [float(each) for each in re.findall(r'-?\d+\.?\d*', words)]
-    top = float(np.abs(laid.channels.rate).max()) / DEGREE
-    assert numbers('sine_response', 'saturation') == pytest.approx([3.0 * top, top], rel=0.01)
-    low, high, again = numbers('bias_temperature', 'rate_ramp')
-    degc = laid.channels.temperature
-    assert low <= degc.min() and high == again >= degc.max() and high - low >= 20.0
-    assert numbers('warm_up', 'rate_ramp')[0] * 60.0 >= 4.0 * laid.duration
-
-
 def test_a_set_that_is_found_has_its_experiment():
     pair = ('bias_temperature', 'warm_up')
     generator = np.random.default_rng(zlib.crc32(b'a set'))
@@ -86,3 +72,72 @@ def test_a_set_that_is_found_has_its_experiment():
 def test_the_remedy_of_a_suspected_cause_says_once_that_it_is_to_be_recorded_again(name):
     remedy = mark_suspected(make_finding(name, {}, 0.01)).remedy
     assert remedy.count('record again') == 1 and CAUSES[name].separate_by in remedy
+
+
+# Effects of the user's own: a file that the command line names adds them to the catalogue
+
+
+OWN = """
+import numpy as np
+
+from gyro_calibration.model.effects import Effect, Parameter
+
+
+def twice_per_turn(channels):
+    return np.sin(2.0 * channels.heading), np.cos(2.0 * channels.heading)
+
+
+EFFECTS = [Effect('soft_iron', 'The bias changes twice per turn, as by soft iron nearby.',
+                  frozenset({'heading'}),
+                  (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')), twice_per_turn,
+                  along='heading')]
+"""
+MODEL = """
+effects: {bias: {bias: 1.0e-3}, soft_iron: {sine: 2.0e-3, cosine: -1.0e-3}}
+noise: {angle_random_walk: 1.0e-4}
+"""
+PROFILE = 'time_s,rate_dps\n0,0\n10,0\n12,20\n100,20\n104,-35\n200,-35\n204,12\n290,12\n300,0\n'
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Return a file with an effect of one's own, and forget that effect in the end."""
+    (tmp_path / 'own.py').write_text(OWN)
+    yield tmp_path / 'own.py'
+    for known in (USER_EFFECTS, CATALOGUE, CAUSES):
+        known.pop('soft_iron', None)
+
+
+def test_an_effect_of_ones_own_is_simulated_found_and_compensated(own, tmp_path, run):
+    (tmp_path / 'real.yaml').write_text(MODEL)
+    (tmp_path / 'profile.csv').write_text(PROFILE)
+    log, catalogue = tmp_path / 'log.csv', ['--catalogue', own]
+    assert run('simulate', '--model', tmp_path / 'real.yaml', '--motion', tmp_path / 'profile.csv',
+               '--sample-rate', '20', '--seed', '4', '--out', log, *catalogue)[0] == 0
+    code, text, error = run('diagnose', log, '--out', tmp_path / 'out', '--json', *catalogue)
+    assert code == 0, error
+    finding, = json.loads(text)['findings']
+    assert finding['effect'] == 'soft_iron' and finding['status'] == 'established'
+    low, high = finding['parameters']['soft_iron']['ci95']
+    assert low - 1e-4 < math.hypot(2e-3, 1e-3) < high + 1e-4 and high - low < 1e-3
+    assert run('compensate', log, '--model', tmp_path / 'out/model.yaml', '--out',
+               tmp_path / 'compensated.csv', *catalogue)[0] == 0
+
+
+def test_without_its_file_a_model_with_such_an_effect_is_refused(tmp_path, run):
+    (tmp_path / 'real.yaml').write_text(MODEL)
+    code, _, error = run('simulate', '--model', tmp_path / 'real.yaml', '--motion', 'robot',
+                         '--out', tmp_path / 'log.csv')
+    assert code == 2 and '--catalogue' in error
+
+
+@pytest.mark.parametrize('text, message', [
+    (None, 'not a Python file'), ('EFFECTS = [1]', '1 is not an Effect'), ('x = 1', 'EFFECTS'),
+    ('1 / 0', 'ZeroDivisionError'),
+    (OWN.replace("'soft_iron'", "'bias'"), 'the name bias is taken'),
+    (OWN.replace('return np.sin(2.0 * channels.heading), ', 'return '), 'coefficients')])
+def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(text, message, tmp_path, run):
+    if text is not None:
+        (tmp_path / 'own.py').write_text(text)
+    code, _, error = run('allan', 'log.csv', '--catalogue', tmp_path / 'own.py')
+    assert code == 2 and message in error and error.count('\n') == 1

@@ -70,17 +70,6 @@ def test_the_improvement_by_a_right_bias_and_scale_factor_is_measured_from_the_g
                for each in found.findings)
 
 
-def test_a_value_beside_a_model_is_what_comes_on_top_of_it():
-    log = drive(np.random.default_rng(3), bias=0.022, scale=0.03)
-    model = GyroModel((Term(BIAS, (0.02,)), Term(SCALE_FACTOR_ERROR, (0.0,))),
-                      noise=Noise(WHITE / np.sqrt(RATE)))
-    found = diagnose([log], np.random.default_rng(4), model)
-    bias = next(each for each in found.findings if each.effect == 'bias').parameters['bias']
-    assert bias.estimate == pytest.approx(0.002, rel=0.05)
-    assert 'adds to the value of the model' in found.findings[0].evidence
-    assert found.model.terms[0].values[0] == pytest.approx(0.02 + bias.estimate)
-
-
 # little to hold out
 
 PARTLY = {'nothing that is held out': [lambda time: (time < 40.0) | (time >= 295.0)],

@@ -16,14 +16,8 @@ import re
 
 from chance import fewest, most, seeded
 from diagnosed import log_of
-from gyro_calibration.calibration.reference_noise import keep_own_instants
 from gyro_calibration.diagnosis.data_quality import FALSE_ALARM_CHANCE, inspect_record
-from gyro_calibration.diagnosis.gates import (
-    identify_unit_factor,
-    is_at_rest,
-    refuse_unusable,
-    UNIT_FACTORS,
-)
+from gyro_calibration.diagnosis.gates import identify_unit_factor, refuse_unusable, UNIT_FACTORS
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import encoder_step
 from gyro_calibration.logs.stamps import fit_stamp_grid
@@ -61,13 +55,6 @@ def swing(generator, count=6000, noise=WHITE, scale=1.01, offset=2e-3):
                time=time, reference_rate=rate)
 
 
-def stepping(generator, noise, count=6000):
-    """Return a log of a gyro that turns at one rate for long, and at another then."""
-    rate = np.repeat([0.0, 0.7, 0.0, -0.7, 0.0, 0.3], count // 6)
-    output = 1.01 * rate + 2e-3 + simulate_noise(noise, count, INTERVAL, generator)
-    return Log(output=output, time=np.arange(count) * INTERVAL, reference_rate=rate)
-
-
 def found(log, model=None):
     """Return the findings by name."""
     return {finding.effect: finding for finding in inspect_record(log, model).findings}
@@ -88,12 +75,6 @@ def in_print(log):
 
 def coarse(log, step):
     return replace(log, output=np.round(log.output / step) * step)
-
-
-def in_digits(log, digits):
-    """Return a log as printed with so many significant digits, as by streams."""
-    return replace(log, output=np.array([float(f'{each:.{digits}g}')
-                                         for each in (log.output / DEGREE).tolist()]) * DEGREE)
 
 
 def zeroed(log, within):
@@ -148,26 +129,6 @@ def test_a_hidden_fault_is_found_alone(name, multiple, any_generator):
     assert sum(list(found(log_of(each))) == [name] for each in hidden) >= fewest(6, 1.0 - STATED)
 
 
-@pytest.mark.parametrize('rough, rate', [('steps', STATED), ('jolts', 0.03),
-                                         ('heavy tails', 0.05)])
-def test_a_rough_motion_or_rough_noise_seldom_has_outliers(rough, rate, any_generator):
-    """Of 300 logs each, none of steps, 3 % of jolts and 5 % of heavy tails had."""
-    logs = [roughened(rough, any_generator) for _ in range(16)]
-    assert sum('outliers' in found(log) for log in logs) <= most(16, rate)
-
-
-def roughened(rough, generator):
-    log = swing(generator)
-    steps = np.repeat(np.cumsum(generator.random(600) < 0.1) % 2, 10) * 0.5
-    jolts = np.convolve((generator.random(6000) < 0.01) * generator.normal(0.0, 1.0, 6000),
-                        [0.3, 1.0, 0.4], 'same')
-    more = {'steps': steps, 'jolts': jolts,
-            'heavy tails': generator.laplace(0.0, SIGMA, 6000)}[rough]
-    # The reference is two samples late, so that it does not explain the motion at once.
-    seen = log.reference_rate if rough == 'heavy tails' else np.roll(log.reference_rate + more, 2)
-    return replace(log, output=log.output + more, reference_rate=seen)
-
-
 @pytest.mark.parametrize('place', [0, 1, 2, -2, -1])
 def test_an_outlier_at_an_end_of_the_log_is_found(place, generator):
     log = swing(generator)
@@ -196,24 +157,7 @@ def with_corners(log, generator):
     return with_motion(log, rate + 4.0 * np.maximum(log.time % 30.0 - 29.5, 0.0), 'heading')
 
 
-def held_at_the_end(log, generator):
-    """Return a log whose reference ends before the output does, in motion."""
-    held = with_motion(log, log.reference_rate + np.exp(50.0 * (log.time - 60.0)), 'rate')
-    held.reference_rate[-2:] = held.reference_rate[-3]
-    return held
-
-
-def with_a_dead_zone(log, generator):
-    """Return a log with an output of zero in slow motion, and in single samples of reversals."""
-    corners = np.add.outer([20.0, 30.0, 40.0, 50.0], [0.0, 0.4]) + generator.uniform(0.0, 9.0)
-    rate = np.interp(log.time, corners.ravel(), [0.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
-    moved = with_motion(log, np.where(log.time < 20.0, 0.03 * np.sin(log.time), rate), 'rate')
-    within = np.abs(moved.reference_rate) < 20.0 * SIGMA
-    return replace(moved, output=moved.output - within * moved.reference_rate)
-
-
-@pytest.mark.parametrize('moved', [ending_in_motion, with_corners, held_at_the_end,
-                                   with_a_dead_zone])
+@pytest.mark.parametrize('moved', [ending_in_motion, with_corners])
 def test_what_motion_and_its_reference_do_is_no_outlier(moved, any_generator):
     logs = [moved(swing(any_generator), any_generator) for _ in range(8)]
     assert sum('outliers' in found(log) for log in logs) <= most(8, STATED)
@@ -239,23 +183,6 @@ def test_samples_that_quantization_repeats_are_no_repeated_samples(step, generat
     assert list(found(coarse(swing(generator), step * SIGMA))) == ['quantization']
 
 
-def test_samples_that_a_coarse_gyro_repeats_in_a_turn_are_found(generator):
-    log = coarse(swing(generator), 3.0 * SIGMA)
-    start = int(np.argmax(np.abs(np.diff(log.reference_rate[:5900], prepend=0.0))))
-    log.output[start:start + 30] = log.output[start]
-    stuck, = (each for each in inspect_record(log).findings if each.effect == 'stuck_samples')
-    assert stuck.p_value < 1e-4
-
-
-@pytest.mark.parametrize('noise', [1e-4, 1e-5])
-@pytest.mark.parametrize('digits', [5, 6])
-def test_repeats_of_what_is_printed_with_so_many_digits_are_no_fault(digits, noise, any_generator):
-    """Turns have coarser steps than rests."""
-    alarms = [name for _ in range(10)
-              for name in found(in_digits(stepping(any_generator, Noise(noise)), digits))]
-    assert len(alarms) <= most(10, STATED), alarms
-
-
 @pytest.mark.parametrize('ways', [1, 2])
 @pytest.mark.parametrize('within', [1.0, 3.0, 10.0, 50.0])
 def test_a_dead_band_is_no_fault_of_the_record(within, ways, any_generator):
@@ -268,15 +195,6 @@ def test_a_dead_band_is_no_fault_of_the_record(within, ways, any_generator):
             and all(record.usable.mean() > 0.99 for record in records))
 
 
-def test_zeros_in_a_turn_are_repeated_samples_beside_a_dead_band(generator):
-    log = zeroed(swing(generator), 10.0 * SIGMA)
-    places = np.flatnonzero(np.abs(log.reference_rate[:5900]) > 0.5)[:1] + np.arange(10)
-    log.output[places] = 0.0
-    quality = inspect_record(log)
-    assert 'stuck_samples' in [finding.effect for finding in quality.findings]
-    assert not quality.usable[places[1:]].any() and np.count_nonzero(~quality.usable) <= 12
-
-
 @pytest.mark.parametrize('low, high', [(-0.8, 0.8), (-math.inf, 0.7), (-0.9, math.inf)])
 def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     log = swing(generator)
@@ -286,22 +204,6 @@ def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     beyond = (log.output > high) | (log.output < low)
     assert (not quality.usable[beyond].any()
             and quality.usable[np.abs(log.reference_rate) < 0.6].all())
-
-
-def test_few_runs_at_a_limit_on_either_side_are_no_repeats_without_a_reference(generator):
-    time = np.arange(6000) * INTERVAL
-    rate = np.interp(time, [0, 5, 7, 10, 12, 20, 22, 25, 27, 40, 42, 45, 47, 60],
-                     [0.1, 0.1, 1, 1, 0, 0, -1, -1, 0, 0, 1, 1, 0.1, 0.1])
-    log = Log(output=np.clip(rate + SIGMA * generator.standard_normal(6000), -0.9, 0.9), time=time)
-    assert list(found(log)) == ['saturation']
-
-
-def test_a_constant_rate_of_coarse_steps_is_no_limit(generator):
-    log = swing(generator)
-    rate = np.sign(np.sin(0.3 * log.time)) * 0.5
-    output = (
-        np.round((rate + SIGMA * generator.standard_normal(6000)) / (10.0 * SIGMA)) * 10.0 * SIGMA)
-    assert 'saturation' not in found(replace(log, output=output, reference_rate=rate))
 
 
 def test_quantization_and_saturation_of_the_model_are_no_findings(generator):
@@ -339,18 +241,6 @@ def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
     assert not found(log, GyroModel((Term(SCALE_FACTOR_ERROR, (0.024,)),)))
 
 
-@pytest.mark.parametrize('jitter', ['none', '1 ms', 'late'])
-def test_lost_samples_are_counted_through_jitter(jitter, generator):
-    log = swing(generator)
-    kept = generator.random(6000) > 0.002
-    kept[[0, -1]] = True
-    shift = {'none': 0.0, '1 ms': np.round(log.time + 4e-4, 3) - log.time,
-             'late': generator.exponential(3e-4, 6000)}[jitter]
-    thinned = Log(output=log.output[kept], time=(log.time + shift)[kept],
-                  reference_rate=log.reference_rate[kept])
-    assert value(found(thinned)['dropped_samples']) == np.count_nonzero(~kept)
-
-
 def test_a_calculated_motion_has_no_encoder():
     """Stretches of constant rate and ramps have headings on a lattice, and rests one value."""
     time = np.arange(6000) * INTERVAL
@@ -361,18 +251,6 @@ def test_a_calculated_motion_has_no_encoder():
             and not encoder_step(np.cumsum(ramps) * 0.05))
     read = np.round(np.cumsum(ramps) * 0.05 / (0.03 * DEGREE)) * 0.03 * DEGREE
     assert encoder_step(read) == pytest.approx(0.03 * DEGREE)
-
-
-@pytest.mark.parametrize('every', [1, 2, 5, 7])
-def test_the_update_interval_of_a_held_reference_is_found(every, generator):
-    log = swing(generator)
-    held = log.reference_rate[np.arange(6000) // every * every]
-    own, found = keep_own_instants(replace(log, reference_rate=held))
-    assert (found is None) == (every == 1)
-    assert found is None or found.interval == pytest.approx(every * INTERVAL, rel=1e-6)
-    known = np.isfinite(own.reference_rate)
-    assert (np.flatnonzero(known) % every == 0).all() and known.mean() > 0.99 / every
-    assert own.reference_rate[known] == pytest.approx(log.reference_rate[known], abs=1e-12)
 
 
 GOOD = swing(np.random.default_rng(1))
@@ -432,15 +310,6 @@ def test_a_log_that_allows_a_diagnosis_is_accepted():
                             reference_rate=GOOD.reference_rate * half[::-1]), own)
     refuse_unusable(replace(GOOD, output=GOOD.output / DEGREE), own)
     refuse_unusable(Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
-
-
-def test_a_gyro_at_rest_needs_no_reference():
-    still = replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None)
-    for log in (still, replace(GOOD, reference_rate=None, moving=np.zeros(6000)),
-                replace(still, reference_rate=np.zeros(6000))):
-        refuse_unusable(log)
-        assert is_at_rest(log)
-    assert not is_at_rest(GOOD)
 
 
 RECORDINGS = {

@@ -163,17 +163,6 @@ def test_a_model_that_is_right_is_left_as_it_is_to_the_letter():
             and 'the model is unchanged' in headline(found)[1])
 
 
-def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
-    log = drive()
-    kept = np.delete(np.arange(len(log)), [1000, 2000, 2001, 3000])
-    fewer = Log(
-        **{name: getattr(log, name)[kept]
-           for name in ('time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
-    found = diagnosed(fewer, MODEL)
-    assert (names(found) == ['dropped_samples'] and found.model is MODEL
-            and 'the model is unchanged' in headline(found)[1])
-
-
 # a self-calibration behind the model
 
 BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
@@ -190,14 +179,7 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
     assert value(found.model, 'bias') == pytest.approx(2e-3 + 1.01 * 1e-3, abs=2e-4)
 
 
-# ranges
-
-def test_a_log_without_temperature_leaves_the_range_of_the_model():
-    log = replace(drive(term('warm_up', 60.0, 4e-3)), temperature=None)
-    found = diagnosed(log, MODEL)
-    assert names(found) == ['warm_up'] and found.model.temperature_range == MODEL.temperature_range
-    assert found.model.rate_range == (-1.5, 1.5)
-
+# units, limit and steps
 
 def at_rest(swing):
     """Return a log of a gyro that does not turn, or hardly does beside its noise."""
@@ -215,8 +197,6 @@ def test_a_log_without_motion_says_nothing_of_rates(swing):
             and value(found.model, 'bias') == pytest.approx(1e-3, abs=1e-4))
     assert any('is not added to the model' in remark for remark in found.remarks) == (swing > 0.0)
 
-
-# units, limit and steps
 
 @pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)],
                          ids=['no model', 'a model'])
@@ -236,14 +216,6 @@ def test_a_limit_and_steps_that_are_found_are_in_the_model(name, size):
             and is_in_extended_model(found.findings[0], found))
     assert found.model.covariance.shape == (3, 3) and found.model.terms[:2] == MODEL.terms
     assert diagnosed(drive(term(name, size), seed=5), found.model).verdict == 'adequate'
-
-
-def test_steps_that_go_into_the_model_are_not_in_its_noise_as_well():
-    steps = term('quantization', 1e-3)
-    found = diagnosed(drive(steps))
-    assert (names(found) == ['quantization']
-            and found.model.noise.angle_random_walk == pytest.approx(1.5e-4, rel=0.03))
-    assert diagnosed(drive(steps, seed=5), found.model).verdict == 'adequate'
 
 
 # where it comes from

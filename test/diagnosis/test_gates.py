@@ -121,14 +121,6 @@ def test_an_axis_that_follows_in_part_by_another_factor_is_another_motion(seed):
     assert gate.name == 'motion' and 'the output is 0.' in gate.evidence, gate
 
 
-@pytest.mark.parametrize('seed', seeds(3))
-def test_a_noisy_gyro_of_the_right_factor_passes(seed):
-    log = tilted(seed, 0.0)
-    noisy = replace(log, output=log.output / 0.15 + 2.0 * np.repeat(
-        np.random.default_rng(seed).standard_normal(len(TIME) // 10), 10))
-    assert not [gate for gate in check_gates(noisy) if gate.passed is False]
-
-
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
 def test_a_gyro_that_follows_passes_all_gates(noise):
     assert all(gate.passed for gate in check_gates(drive(1, noise)))
@@ -156,25 +148,11 @@ def small_turns(seed):
 
 
 @pytest.mark.parametrize('seed', seeds(3))
-def test_another_motion_of_small_turns_is_another_motion(seed):
-    log = replace(small_turns(seed)[0],
-                  reference_heading=small_turns(seed + 1000)[0].reference_heading)
-    gate = check_gates(log)[-1]
-    assert gate.name == 'motion' and gate.passed is False, gate
-
-
-@pytest.mark.parametrize('seed', seeds(3))
 def test_a_reference_of_the_same_small_turns_with_larger_errors_passes(seed):
     log, generator = small_turns(seed)
     errors = np.interp(TIME, np.arange(121.0), 5.0 * DEGREE * generator.standard_normal(121))
     assert not [gate for gate in check_gates(
         replace(log, reference_heading=log.reference_heading + errors)) if gate.passed is False]
-
-
-def test_a_late_reference_passes_all_gates():
-    log = drive(2, 1.0 * DEGREE)
-    assert all(gate.passed for gate in check_gates(
-        replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading))))
 
 
 def test_a_commanded_rate_that_hardly_changes_shows_no_unit():

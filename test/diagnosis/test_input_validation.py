@@ -14,14 +14,8 @@ from dataclasses import replace
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.diagnosis.data_quality import inspect_record
-from gyro_calibration.diagnosis.gates import (
-    is_at_rest,
-    MAX_TABLE_ROWS,
-    refuse_unusable,
-    select_reference,
-)
+from gyro_calibration.diagnosis.gates import is_at_rest, refuse_unusable, select_reference
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, refuse_wrapped, unwrap_heading
 import numpy as np
 import pytest
@@ -120,15 +114,6 @@ def test_a_log_that_is_a_gap_for_the_most_part_is_refused_with_where_it_is(log):
             DataRefused,
             match=r'12000 of .* samples can be used.*begins at 59\.990 s: cut the log there'):
         diagnose([log], np.random.default_rng(1))
-
-
-def test_samples_without_time_are_not_taken_for_a_rate_table():
-    rows = MAX_TABLE_ROWS + 1
-    with pytest.raises(DataRefused,
-                       match=f'{rows} rows, where a rate table has at most {MAX_TABLE_ROWS}: '
-                             '.*--rate'):
-        diagnose_table(Log(output=LOG.output[:rows], reference_rate=RATE[:rows]), None,
-                       np.random.default_rng(1))
 
 
 @pytest.mark.parametrize('first', [0.0, -np.pi])

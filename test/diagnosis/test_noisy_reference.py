@@ -20,16 +20,13 @@ from gyro_calibration.calibration.heading_regression import (
     find_drift,
     fit_spans,
     lay_out_spans,
-    whiten_regression,
 )
-from gyro_calibration.calibration.reference_noise import keep_own_instants, rate_noise_share
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
-from gyro_calibration.diagnosis.noisy_reference import _step_gains, search_causes
+from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
-from gyro_calibration.logs.recording import interpolate_with_gaps
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
@@ -96,13 +93,6 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
             and 'course over ground' in render_report(found))
 
 
-def test_a_short_drive_with_more_channels_than_spans_shows_nothing():
-    log = drive(0, 40.0)
-    log = select_rows(log, log.time < 25.0)
-    log = replace(log, supply=4.8 + 0.02 * log.time, specific_force=9.8 + np.cos(0.3 * log.time))
-    assert not diagnosed(log).findings
-
-
 def test_nothing_is_compared_across_a_hole_in_the_samples():
     log = drive(3)
     rows = np.abs(log.time - 100.0) > 12.0
@@ -123,14 +113,6 @@ def test_a_course_that_is_repeated_between_its_fixes_is_a_course():
     found = diagnosed(replace(log, reference_heading=held[last]))
     assert found.reference.kind == 'course'
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.05 * DEGREE)
-
-
-def test_the_last_digit_of_a_file_is_no_step_of_an_encoder():
-    log = drive(0)
-    heading = np.cumsum(log.output) / RATE
-    kinds = [classify_reference(replace(log, reference_heading=step * np.round(heading / step)))
-             for step in (1e-6, 1e-4 * DEGREE, 2.0 * np.pi / 65536, 0.1 * DEGREE)]
-    assert [each.kind for each in kinds] == 2 * ['motion_capture'] + 2 * ['encoder']
 
 
 def test_a_bias_that_held_out_parts_contradict_is_not_offered():
@@ -222,26 +204,6 @@ def test_a_random_walk_of_the_bias_is_no_step(step, seed):
     assert not [each for each in found.findings if each.effect == 'bias_step']
 
 
-@pytest.mark.parametrize('size', [0.2, 0.05])  # 17 and 4 times the noise of the gyro
-def test_odometry_that_was_interpolated_at_the_samples_of_the_gyro_is_not_exact(size):
-    log = turning_log(3, lambda time, _: 0.003)
-    walk = np.cumsum(np.random.default_rng(3).standard_normal(len(log))) / np.sqrt(RATE)
-    heading = np.cumsum(log.output - 0.003) / RATE / (1.0 + SCALE) + size * DEGREE * walk
-    log, _ = keep_own_instants(replace(
-        log, reference_heading=np.interp(log.time, log.time[::4], heading[::4])))
-    assert is_reference_limiting(log, classify_reference(log))
-
-
-def test_a_table_that_holds_its_rates_is_exact():
-    generator = np.random.default_rng(4)
-    time = np.arange(0.0, 240.0, 1.0 / RATE)
-    rate = np.repeat(generator.uniform(-1.0, 1.0, 48), 125)
-    output = (1.0 + SCALE) * rate + 0.003 + 2e-4 * np.sqrt(RATE) * generator.standard_normal(
-        len(time))
-    log = Log(output=output, time=time, reference_heading=np.cumsum(rate) / RATE)
-    assert not is_reference_limiting(log, classify_reference(log))
-
-
 HIDDEN = {
     'heading_sensitivity': lambda time, rate, heading, temperature: 0.01 * np.sin(heading + 0.5),
     'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0)}
@@ -287,13 +249,6 @@ def turning_once(seed):
               + 0.3 * DEGREE * generator.standard_normal(len(fixes)))
     return Log(time=time, reference_heading=np.interp(time, fixes, course), output=turn
                + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
-
-
-def test_a_course_has_no_error_of_a_shaft():
-    found = diagnosed(drive(5, 120.0, lambda time, rate, heading, temperature:
-                            0.3 * rate * np.sin(heading)))
-    assert 'shaft' in found.cannot_show['reference_once_per_rev']
-    assert 'reference_once_per_rev' not in {each.effect for each in found.findings}
 
 
 def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
@@ -405,17 +360,6 @@ def test_noise_is_no_effect_of_a_motion_in_which_effects_look_alike(seed):
     assert value(found.model, 'scale_factor_error') == pytest.approx(0.01, abs=0.004)
 
 
-@pytest.mark.parametrize('interval', [0.05, 0.1])
-def test_the_noise_of_a_reference_rate_is_seen_between_two_quick_reversals(interval):
-    def to_and_fro(time):
-        return np.interp(time % 10.0, [0.0, 0.1, 4.9, 5.1, 9.9, 10.0], [0, 1, 1, -1, -1, 0])
-
-    for seed in range(3):
-        log = swing(seed, to_and_fro, 1e-4, interval)
-        assert rate_noise_share(log) == pytest.approx(0.3, rel=0.4)
-        assert rate_noise_share(replace(log, reference_rate=to_and_fro(log.time))) < 1e-3
-
-
 def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
     # at a constant rate the rounding of a fine encoder is a saw, 28 times the noise of the gyro
     time, step = np.arange(0.0, 300.0, 0.02), 0.0055 * DEGREE
@@ -426,69 +370,6 @@ def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
                   reference_heading=np.floor(heading / step) * step)
         assert (classify_reference(log).kind == 'encoder'
                 and is_reference_limiting(log, classify_reference(log)) == even)
-
-
-def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
-    # as many swings show the same error of half a sample at each code, one of them that of noise
-    generator, time, step = np.random.default_rng(4), np.arange(0.0, 220.0, 0.01), 0.4 * DEGREE
-    rate = np.convolve(np.where(time % 12.0 < 6.0, 0.2, -0.2), np.hanning(60) / 29.5, 'same')
-    heading = np.cumsum(rate) * 0.01 - 0.005 * rate + 2.1 * DEGREE
-    log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
-              reference_heading=np.floor(heading / step) * step)
-    fit, found = search_causes(fit_spans(lay_out_spans(log, 'encoder')), 0.01,
-                               lambda share, words: None)
-    assert not fit.causes and not any(each.is_established for each in found)
-
-
-def test_intervals_hold_nothing_where_few_turning_points_of_a_swing_show_it():
-    # at an even rate each way, scale, cubic and once a revolution differ at the turns alone
-    generator, time = np.random.default_rng(12), np.arange(0.0, 220.0, 0.01)
-    sigmas = []
-    for _ in range(3):
-        period = generator.choice([8.0, 10.0, 12.0])
-        knots = period * np.array([0.0, 0.04, 0.46, 0.54, 0.96, 1.0])
-        size = 69.0 * DEGREE / (0.46 * period) * np.array([0.0, 1.0, 1.0, -1.0, -1.0, 0.0])
-        rate = np.interp(time % period, knots, size)
-        heading = np.cumsum(rate) * 0.01 - 0.005 * rate + generator.uniform(-np.pi, np.pi)
-        log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
-                  reference_heading=np.floor(heading / (0.4 * DEGREE)) * 0.4 * DEGREE)
-        for name in ('cubic_nonlinearity', 'reference_once_per_rev'):
-            found = fit_spans(lay_out_spans(log, 'encoder'), [CauseTerm(name)])
-            sigmas += [1.96 * found.values[place] / found.half_width(place)
-                       for place in range(3, len(found.values))]
-            sigmas.append(1.96 * (found.values[0] - 0.004) / found.half_width(0))
-    assert np.sqrt(np.mean(np.square(sigmas))) < 1.3, np.round(sigmas, 1)
-
-
-@pytest.mark.parametrize('seed', [1, evidence(2)])
-def test_a_coarse_encoder_shows_the_noise_of_the_gyro_and_no_delay(seed):
-    # the error of a code that stands while the shaft rests was taken for a random walk
-    hidden = hide_with_reference([], 0.0, np.random.default_rng(seed),
-                                 ImperfectReference('encoder', 0.5))
-    found = fit_spans(lay_out_spans(log_of(hidden), 'encoder'))
-    true = hidden.truth.expected
-    assert found.noise_size('angle_random_walk') < 3.0 * true['angle_random_walk']
-    log, scale = log_of(hidden), 1.0 + true['scale_factor_error']
-    for value, sought in ((found.values[0], scale - 1.0), (found.values[2], 0.0),
-                          (found.values[1], np.mean(log.output - scale * hidden.truth.rate))):
-        place = int(np.flatnonzero(found.values == value)[0])
-        assert abs(value - sought) < 2.0 * found.half_width(place), (place, value, sought)
-
-
-@pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])
-def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
-    # 20 Hz, interpolated at 100 Hz as of a bag, with a gyro that is late and has a scale error
-    generator, time = np.random.default_rng(5), np.arange(0.0, 60.0, 0.01)
-    rate = 0.8 * np.sin(0.9 * time) * np.sin(0.23 * time)
-    at = np.arange(begins, 60.0 - ends, 0.05)
-    heading = np.interp(at, time, np.cumsum(rate) * 0.01)
-    log = Log(output=1.02 * np.interp(time - 0.02, time, rate) + BIAS_TRUE
-              + 1e-3 * generator.standard_normal(len(time)), time=time,
-              reference_heading=interpolate_with_gaps(
-                  time, at, heading + 3e-4 * generator.standard_normal(len(at))))
-    assert np.isnan(log.reference_heading[[0, -1]]).all()
-    reference = classify_reference(log)
-    assert reference.kind == 'motion_capture' and 'lost' not in reference.evidence
 
 
 def odometry(seed, drift, asymmetry=0.0, warming=0.0):
@@ -535,14 +416,6 @@ def test_what_the_gyro_does_in_motion_is_no_drift_of_the_reference(hidden):
     assert sum(each is not None for each in drifts) <= 1
 
 
-def test_a_second_step_at_the_time_of_the_first_explains_nothing():
-    spans = lay_out_spans(drive(3), 'course')
-    fit = fit_spans(spans, [CauseTerm('bias_step', (spans.time[40],))])
-    data = whiten_regression(fit, fit.causes)
-    gains, sizes = _step_gains(fit, data, spans.time[[40, 80]])
-    assert gains[0] == sizes[0] == 0.0 < gains[1]
-
-
 @pytest.mark.parametrize('spans', [lay_out_spans(drive(3), 'course'),
                                    lay_out_spans(odometry(3, 0.0)[0])])
 def test_columns_of_steps_are_those_of_the_effect_but_beside_the_step(spans):
@@ -553,11 +426,3 @@ def test_columns_of_steps_are_those_of_the_effect_but_beside_the_step(spans):
     assert off.max() < 1e-3 * np.abs(exact).max()
     assert (off > 1e-9).sum(axis=0).max() <= 3
     assert not exact[:, -1].any() and not off[:, -1].any()
-
-
-@pytest.mark.parametrize('delay', [-4.0, 0.0, 4.0])
-def test_spans_before_and_after_the_log_of_the_gyro_are_not_compared(delay):
-    spans = replace(lay_out_spans(drive(4), 'course'), delay=delay)
-    covered = spans.is_measured[:len(spans.time) - 1]
-    assert covered[10:-10].all()
-    assert covered[0] == (delay >= 0.0) and covered[-1] == (delay <= 0.0)

@@ -20,12 +20,8 @@ from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.diagnosis import rate_table as diagnosis
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import (
-    CATALOGUE,
-    rate_temperature_polynomial,
-    STATIC_EFFECTS,
-)
-from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, SelfCalibration, Term
+from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial, STATIC_EFFECTS
+from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 import pytest
@@ -120,17 +116,6 @@ def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(withou
     assert members(found) == {'sine_response'}
 
 
-def test_asymmetry_and_a_parabola_are_a_set_where_it_is_small(without_gain):
-    generator = np.random.default_rng(5)
-    large = diagnosed(Table(), gyro('scale_factor_asymmetry', 0.02), generator)
-    assert names(large) == ['scale_factor_asymmetry'] and not large.findings[0].ambiguous_with
-    small = diagnosed(Table(),
-                      gyro('scale_factor_asymmetry', 1.5 * large.findings[0].minimum_detectable),
-                      generator)
-    assert (members(small.findings[0]) == {'scale_factor_asymmetry', 'quadratic_nonlinearity'}
-            and small.findings[0].separate_by)
-
-
 def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_again(without_gain):
     generator, truth = np.random.default_rng(6), gyro('bias_temperature', 1e-4)
     up = Table().measure(truth, generator)
@@ -141,24 +126,7 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
     assert members(found) == {'bias_temperature'}
 
 
-def test_a_model_of_a_mended_table_says_what_its_output_was_multiplied_by(without_gain):
-    table = Table().measure(gyro('scale_factor_asymmetry', 0.02), np.random.default_rng(8))
-    found = diagnose_table(replace(table, output=-table.output), None)
-    assert (found.model.origin['output_multiplied_by'] == [-1.0]
-            and any('was multiplied by -1' in remark for remark in found.remarks))
-
-
 # models that are put to the test
-
-def test_a_value_that_the_model_has_wrong_is_put_right(without_gain):
-    generator, truth = np.random.default_rng(8), gyro('sine_response', 0.3)
-    found = diagnosed(WANDERING, truth, generator, gyro('sine_response', 0.25))
-    assert names(found) == ['sine_response']
-    change = found.findings[0].parameters['k']
-    assert (change.interval[0] < 0.05 < change.interval[1]
-            and found.before.terms[-1].values == (0.25, 1.0))
-    assert (found.model.terms[-1].values[0] == pytest.approx(0.25 + change.estimate)
-            and len(found.model.terms) == 3)
 
 
 def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
@@ -169,29 +137,7 @@ def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
     assert [term.effect.name for term in found.model.terms] == [*NUISANCES, 'cubic_nonlinearity']
 
 
-def test_effects_are_named_on_top_of_a_polynomial(without_gain):
-    generator = np.random.default_rng(10)
-    polynomial = fit_effects(WANDERING.measure(GyroModel(LINEAR), generator),
-                             [rate_temperature_polynomial(3, 2)]).model
-    truth = GyroModel((*LINEAR, Term(STATIC_EFFECTS['scale_factor_temperature'],
-                                     (polynomial.reference_temperature, 5e-4))))
-    found = diagnosed(WANDERING, truth, generator, polynomial)
-    assert (names(found) == ['scale_factor_temperature']
-            and found.model.terms[0] == polynomial.terms[0])
-    low, high = found.findings[0].parameters['scale_factor_temperature'].interval
-    assert (low < 5e-4 < high and len(found.model.covariance) == sum(
-        len(term.fitted_indices) for term in found.model.terms))
-
-
-def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_before(without_gain):
-    model = replace(GyroModel(LINEAR), temperature_range=(20.0, 30.0),
-                    self_calibration=SelfCalibration(0.01), origin={'date': '2025'})
-    found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(21),
-                      model).model
-    assert found.temperature_range == (20.0,
-                                       pytest.approx(47.0)) and found.self_calibration is None
-    assert found.origin['before'] == [{'date': '2025'}]
-
+# what has no name, and what is no effect
 
 def test_what_dwells_cannot_test_of_a_model_is_left_and_reported(without_gain):
     model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
@@ -199,8 +145,6 @@ def test_what_dwells_cannot_test_of_a_model_is_left_and_reported(without_gain):
     assert (any('time_offset' in remark for remark in found.remarks)
             and model.terms[-1] in found.model.terms)
 
-
-# what has no name, and what is no effect
 
 @pytest.mark.parametrize('waves', [6.0, 40.0])
 def test_what_is_not_in_the_catalogue_gets_no_name(waves):

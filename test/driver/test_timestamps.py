@@ -17,7 +17,6 @@ from itertools import pairwise
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import (
     HostTimeConverter,
-    LowerLine,
     NodeTimeConverter,
     read_clock_pair,
     SampleClock,
@@ -243,38 +242,17 @@ def test_after_a_sequence_that_began_anew_stamps_are_soon_right_to_a_burst(
     assert (np.diff(run.stamps) > 0.0).all()
 
 
-def test_a_gyro_that_becomes_ten_times_slower_or_faster_has_lost_nothing(generator):
-    """One or two periods of the old rate may be taken for lost until it shows."""
-    slow, fast = true_times(100, 0.0, 20.0), true_times(1000, 0.0, 20.0)
-    for first, second in ((fast, slow), (slow, fast)):
-        times = np.concatenate([first, first[-1] + second])
-        run = play(SampleClock(1000.0), times, arrivals_of(times, generator))
-        assert run.clock.lost_count <= 2
-        assert run.error(30.0) < 0.002
-        assert (np.diff(run.stamps) > 0.0).all()
-
-
-@pytest.mark.parametrize(('before', 'after'), [(100, 5), (500, 5), (10, 2)])
-def test_stamps_follow_the_samples_of_a_gyro_that_becomes_as_slow_as_silences(
-        before, after, generator):
+@pytest.mark.parametrize(('nominal', 'before', 'after', 'error'), [
+    (1000.0, 1000, 100, 0.002), (1000.0, 100, 1000, 0.002), (100.0, 100, 5, 0.02),
+    (100.0, 500, 5, 0.02), (100.0, 10, 2, 0.02)])
+def test_a_gyro_that_becomes_slower_or_faster_has_lost_nothing(nominal, before, after, error):
+    """Also one at 5 Hz, where samples are as rare as silences."""
     first, second = true_times(before, 0.0, 20.0), true_times(after, 0.0, 20.0)
     times = np.concatenate([first, first[-1] + second])
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator))
-    assert abs(run.stamps - times).max() < 0.5 and run.error(25.0) < 0.02
-    assert not run.clock.lost_count
-
-
-def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(generator):
-    """Compared with every line through two of the points."""
-    x = np.arange(30.0)
-    y = np.maximum.accumulate(2.0 * x + generator.exponential(1.0, 30))
-    line = LowerLine(1.0)
-    for point in zip(x, y, strict=True):
-        line.add(*point)
-    sums = [(y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i))).sum() for i in range(30)
-            for j in range(i + 1, 30)
-            if (y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i)) > -1e-9).all()]
-    assert sum(y - [line.value_at(each) for each in x]) == pytest.approx(min(sums))
+    for seed in range(3):
+        run = play(SampleClock(nominal), times, arrivals_of(times, np.random.default_rng(seed)))
+        assert not run.clock.lost_count and (np.diff(run.stamps) > 0.0).all()
+        assert abs(run.stamps - times).max() < 0.5 and run.error(30.0) < error
 
 
 @pytest.mark.parametrize('by', [-HOUR, HOUR])
@@ -335,15 +313,6 @@ def test_what_is_lost_while_the_clock_is_set_is_a_gap_of_its_own_length(step, lo
     assert np.diff(times).max() == pytest.approx((lost + 1) * INTERVAL, abs=1e-6)
 
 
-def test_late_arrivals_are_no_step_of_the_clock():
-    stamps, times = HostTimeConverter(), [5.0]
-    stamps.update(0.0, 1000.0)
-    stamps.update(0.1, 999.8)  # by -0.3 s, but the stamps on their way are older
-    for number, waited in enumerate([0.01, 0.25, 0.0, 0.0, 0.01], 1):
-        times.append(stamps.convert_sample(5.0 + INTERVAL * number, times[-1], INTERVAL, waited))
-    assert np.diff(times) == pytest.approx(np.full(5, INTERVAL))
-
-
 @pytest.mark.parametrize('step', [0.12, -0.12, 0.2, -1.0])
 @pytest.mark.parametrize('gap, waited', [(0.15, 0.0005), (0.05, 0.15), (0.2, 0.33), (0.3, 0.18)])
 def test_a_gap_with_late_arrivals_after_a_step_keeps_its_length(step, gap, waited):
@@ -352,33 +321,15 @@ def test_a_gap_with_late_arrivals_after_a_step_keeps_its_length(step, gap, waite
     assert after - times[-1] == pytest.approx(gap)
 
 
-def test_another_jump_of_the_stamps_is_one():
-    times, _, stamps, _ = driven(0.0)
-    assert stamps.convert_sample(3600.0, times[-1], INTERVAL) == 3600.0 and stamps.steps.count == 0
-    assert stamps.convert_message(-50.0, times[-1]) == -50.0
-
-
-def test_a_clock_that_is_slewed_is_not_set_and_an_old_step_explains_nothing():
+def test_a_clock_that_is_slewed_is_not_set_and_an_old_step_explains_no_jump_of_the_stamps():
     stamps = HostTimeConverter()
+    assert stamps.convert_message(-50.0, 200.0) == -50.0
     for number in range(20000):
         assert stamps.update(0.01 * number, 1e9 + 0.01 * number * 1.0005) == 0.0
     assert stamps.update(200.0, 1e9 + 3800.0) > 3500.0
     stamps.update(211.0, 1e9 + 3811.0)
     stamps.update(212.0, 1e9 + 3812.0)
     assert stamps.convert_sample(3812.0, 200.0, 0.01) == 3812.0
-
-
-@pytest.mark.parametrize('step', [3600.0, -3600.0])
-def test_a_step_between_the_first_samples_leaves_times_that_go_on(step):
-    stamps = HostTimeConverter()
-    stamps.update(0.0, 1000.0)
-    first = stamps.convert_sample(5.0, -np.inf, np.inf)
-    stamps.update(0.1, 1000.1 + step)
-    times = [first]
-    for stamp in (5.01, 5.02):
-        times.append(stamps.convert_sample(stamp + step, times[-1],
-                                           np.inf if len(times) == 1 else 0.01))
-    assert times == pytest.approx([5.0, 5.01, 5.02])
 
 
 @pytest.mark.parametrize('pauses, found', [((0.002,), 10.001), ((0.3, 0.002), 10.301),

@@ -23,12 +23,10 @@ import time
 
 import fatal_tasks
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
-from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.logs import (
-    calibrate_log,
     compile_file_pattern,
     describe_log,
     find_logs,
@@ -51,11 +49,9 @@ from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
 import pytest
 from recordings import MCAP, record, text
-from scipy import stats
 
 DEGREE = np.pi / 180.0
 
@@ -257,13 +253,6 @@ def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch):
     assert 'interrupted after 0 of 1 logs; run the same command' in capsys.readouterr().err
 
 
-def test_a_reference_rate_that_is_never_steady_is_integrated_as_by_fit():
-    log = drive(0.01, 0)
-    method, model, _ = calibrate_log(replace(
-        log, reference_heading=None, reference_rate=np.gradient(log.reference_heading, log.time)))
-    assert method == 'likelihood' and model.terms[0].values[0] == pytest.approx(0.01, abs=1e-3)
-
-
 def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
     write_log(tmp_path / 'a_unit1.csv', drive(0.01, 0))
     one = LogTask(FleetLog(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'))
@@ -309,15 +298,6 @@ def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
         assert found[name].low < found[name].value < found[name].high
 
 
-def test_the_interval_of_one_more_unit_is_that_of_student():
-    values = np.random.default_rng(6).standard_normal(6)
-    pooled = PooledValue(Observations(values, np.full(6, 1e-6), np.arange(6), np.full(6, -1)))
-    found = pooled.estimate(units=1.0)
-    half = stats.t.ppf(0.975, 5) * np.std(values, ddof=1) * np.sqrt(1.0 + 1.0 / 6.0)
-    assert found.low[0] == pytest.approx(values.mean() - half, abs=0.03 * half)
-    assert found.high[0] == pytest.approx(values.mean() + half, abs=0.03 * half)
-
-
 def test_what_the_units_of_a_drive_share_does_not_move_a_unit():
     """The error of the reference of one drive is many times the difference between units."""
     values = np.array([[1.0, 1.1, 1.0, 0.9], [2.0, 1.9, 2.0, 2.1], [3.1, 3.0, 3.0, 2.9],
@@ -342,22 +322,6 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     (change,) = find_changes(pooled, date, names, names, 0.01)
     assert ((change.name, change.since) == ('7', '4')
             and change.size == pytest.approx(3.0, abs=0.5))
-
-
-def test_units_that_drift_apart_have_slopes_of_their_own():
-    """Over age, with references whose errors on each drive are many times larger."""
-    generator = np.random.default_rng(10)
-    unit, drive = np.indices((8, 6)).reshape(2, -1)
-    age, slopes = np.linspace(-1.5, 1.5, 6)[drive], np.linspace(-2.0, 4.0, 8)
-    values = (unit + slopes[unit] * age + 10.0 * generator.standard_normal(6)[drive]
-              + 0.1 * generator.standard_normal(48))
-    pooled = PooledValue(Observations(values, np.full(48, 0.1), unit, drive, age[:, None], 1))
-    assert pooled.components['slopes_0'].low < np.std(slopes) < pooled.components['slopes_0'].high
-    apart = pooled.estimate(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1)
-    assert apart.value - apart.value.mean() == pytest.approx(slopes - 1.0, abs=0.2)
-    whole = pooled.estimate(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)), part=1)
-    # the mean slope contains that of the references, the differences between units do not
-    assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
 
 
 def records(ramp=0.0):
@@ -436,19 +400,6 @@ def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
         assert values['bias'] - 1.96 * spread == pytest.approx(interval.low)
         assert values['bias'] + 1.96 * spread == pytest.approx(interval.high)
     assert GyroModel(tolerance=Tolerance(bias=1.0)).prior_deviations is None
-
-
-def test_a_run_of_20_s_is_drawn_to_the_prior_as_far_as_it_leaves_the_values_open():
-    """The scale of a gyro whose type is known to 0.1 %, against wheels that slip."""
-    time = np.arange(0.0, 20.0, 0.02)
-    motion = motion_from_rates(time, 0.5 * np.sin(2.0 * np.pi * time / 10.0))
-    noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
-    rate = 1.01 * motion.rate_at(time) + 0.002 + noise
-    alone, drawn = (self_calibrate(time, rate, motion, prior=prior)
-                    for prior in (None, np.array([1e-3, np.inf])))
-    assert np.sqrt(alone.covariance[0, 0]) > 5e-3 > 1e-3 > np.sqrt(drawn.covariance[0, 0])
-    assert abs(drawn.scale_factor_error) < 0.05 * abs(alone.scale_factor_error)
-    assert drawn.bias == pytest.approx(alone.bias, rel=0.05)
 
 
 def test_a_diagnosis_by_a_course_takes_what_is_usual_of_a_fleet_as_its_prior():

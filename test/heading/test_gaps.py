@@ -18,14 +18,9 @@ samples, over many drives.
 
 import math
 
-from faulty_heading import one
-from gyro_calibration.heading.integration import (
-    gap_variances,
-    integrate,
-    Intervals,
-)
+from gyro_calibration.heading.integration import gap_variances, integrate, Intervals
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
@@ -86,6 +81,9 @@ def test_lost_samples_are_counted_where_stamps_are_even_or_jitter(interval, jitt
     assert intervals.longest_gap == pytest.approx(np.diff(stamps).max())
 
 
+# what they leave unknown
+
+
 def test_samples_that_come_late_or_in_bursts_are_not_lost():
     late = np.arange(0.0, 10.0, 0.01)
     late[500:510] = late[509] - np.arange(9, -1, -1) * 2e-4
@@ -96,16 +94,6 @@ def test_samples_that_come_late_or_in_bursts_are_not_lost():
         for step in np.diff(stamps).tolist():
             intervals.add(step)
         assert intervals.lost_samples == 0
-
-
-def test_a_gyro_that_is_set_to_another_rate_loses_samples_for_a_while_only():
-    intervals = Intervals()
-    lost = [intervals.add(step) for step in [0.01] * 500 + [0.02] * 1000]
-    assert (sum(lost[:500]) == 0 < sum(lost) and not any(lost[-800:])
-            and intervals.usual_interval == 0.02)
-
-
-# what they leave unknown
 
 
 @pytest.mark.parametrize('share, longest', [(0.01, 1), (0.1, 1), (0.1, 20), (0.03, 85)])
@@ -167,34 +155,6 @@ def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
             and found.intervals.longest_gap == pytest.approx(0.9, abs=0.02))
 
 
-@pytest.mark.parametrize('false_alarms', [0.0, 0.1])
-@pytest.mark.parametrize('gap', [0.5, 0.99, 1.01, 30.0, 86400.0])
-def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap, false_alarms):
-    tracker = HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms))
-    lost, losses = round(gap / INTERVAL), 3
-    for index in range(400 * (losses + 1)):
-        message = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
-        assert bool(message) == (gap > 1.0 and index % 400 == 0 < index)
-    assert (tracker.intervals.lost_samples == losses * lost
-            and tracker.intervals.longest_gap == pytest.approx(gap + INTERVAL))
-    assert tracker.intervals.usual_interval == pytest.approx(INTERVAL)
-
-
-def test_a_correction_waits_for_motion_also_with_other_settings():
-    tracker = HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings())
-    still = np.array([0.0, -1.0])
-    generator, headings = np.random.default_rng(4), []
-    outputs = np.concatenate([np.full(1000, 0.1), np.zeros(3000)]) + 0.3 * DEGREE
-    outputs += simulate_noise(WHITE, len(outputs), INTERVAL, generator)
-    for index, output in enumerate(outputs.tolist()):
-        if index == 3000:
-            tracker.configure(Settings(maximum_gap=0.9))
-        tracker.add(INTERVAL * index, output, np.array([-output, -1.0]), None, still)
-        headings.append(tracker.heading)
-    assert tracker.is_resting and math.sqrt(tracker.variance) > 1.0 * DEGREE
-    assert np.ptp(headings[2900:]) == 0.0
-
-
 @pytest.mark.parametrize('option', [(), ('--rest',)])
 def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, compensate):
     model = GyroModel(noise=WHITE,
@@ -210,12 +170,3 @@ def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, compensa
         assert (f'{(~comes).sum()} samples are lost' in text) == lost
         deviations.append(float(text.partition('+-')[2].split()[0]))
     assert deviations[1] > 1.2 * deviations[0]
-
-
-def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is():
-    """A short run of `benchmarks/faulty_heading.py`, which tells by how much of 30 minutes."""
-    faults = 'clean', '1 % lost, bursts', '1 % lost, usual interval for each'
-    drives = [one(('RD2100', INTERVAL, 120.0, seed, faults)) for seed in range(2)]
-    clean, stamped, bridged = (math.sqrt(np.mean([drive[fault][0] ** 2 for drive in drives]))
-                               for fault in faults)
-    assert stamped < 1.3 * clean < 0.1 * bridged

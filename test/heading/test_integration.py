@@ -20,7 +20,7 @@ from gyro_calibration.heading.integration import (
     ThresholdFilter,
 )
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import (
     compensate,
     rate_sensitivity,
@@ -49,12 +49,6 @@ def filtered_singly(settings, time, rate):
     return np.array([threshold.apply(*sample) for sample in zip(time.tolist(), rate.tolist())])
 
 
-def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
-    time = np.concatenate([[0.0], np.cumsum(np.random.default_rng(0).uniform(0.001, 0.1, 500))])
-    heading = integrate(time, 0.3 - 0.02 * time)
-    assert heading == pytest.approx(0.3 * time - 0.01 * time ** 2, abs=1e-12)
-
-
 SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(),
             'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
             'long': Threshold(1.0 * DEGREE, 1.0), 'off': Threshold(0.0)}
@@ -80,30 +74,6 @@ def test_a_log_in_blocks_or_samples_is_filtered_and_integrated_as_in_one_piece(s
     assert deviation == pytest.approx(whole[2], rel=1e-12)
 
 
-def test_a_log_longer_than_the_cache_is_integrated_by_the_trapezoid_rule():
-    generator, count = np.random.default_rng(0), 2 * CACHE_BLOCK_SAMPLES + 5
-    time, rate = np.cumsum(generator.uniform(0.001, 0.1, count)), generator.normal(size=count)
-    steps = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
-    assert np.array_equal(integrate(time, rate, 0.25), np.cumsum([0.25, *steps]))
-
-
-def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_little():
-    """0.3 deg/s is 0.72 sigma of a 100 Hz sample (47 % beyond), 3.2 of a mean of 20 (0.13 %)."""
-    time = np.arange(20001) * INTERVAL
-    rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    passed = {window: (filter_rates(Threshold(window=window), time, rate) != 0.0).mean()
-              for window in (0.0, 0.2)}
-    assert passed[0.0] == pytest.approx(0.472, abs=0.02) and passed[0.2] < 0.01
-
-
-def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
-    time = np.arange(500) * INTERVAL
-    rate = 5.0 * DEGREE * np.sin(2 * np.pi * 10.0 * time)  # two whole periods in the window
-    assert (filtered_singly(Threshold(), time, rate)[20:] == 0.0).all()
-    seen = filtered_singly(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
-    assert np.array_equal(seen[20:], rate[20:])
-
-
 S, B = 0.02, 0.002
 UNCERTAIN = ((1e-4, -2e-6), (-2e-6, 1e-6))
 
@@ -124,26 +94,6 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
     ratios = np.mean(np.square(ends), axis=0) / deviation[[1500, 6000]] ** 2
     # To first order in s, 2 % here.
     assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)
-
-
-def test_over_a_long_gap_neither_blocks_nor_tracker_integrate():
-    model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
-    time, rate = (values[:3000] for values in noisy_robot())
-    time = time + 86400.0 * (np.arange(3000) >= 1000)
-    sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
-    covariance = uncertainty_covariance(model)
-    tracker = HeadingTracker(XV3500, covariance,
-                             Settings(false_alarms=0.0, threshold=Threshold(0.0)))
-    for sample in zip(time.tolist(), rate.tolist(), sensitivity.T):
-        tracker.add(*sample)
-    integrator = BlockIntegrator(Threshold(0.0), XV3500, covariance)
-    parts = [integrator.add(time[rows], rate[rows], sensitivity[:, rows])
-             for rows in (slice(0, 1000), slice(1000, 1700), slice(1700, 3000))]
-    _, heading, deviation = map(np.concatenate, zip(*parts))
-    turned = integrate(time[:1000], rate[:1000])[-1] + integrate(time[1000:], rate[1000:])[-1]
-    assert heading[-1] == pytest.approx(turned) == pytest.approx(tracker.heading)
-    assert deviation[999] < 0.1 and deviation[1000] > math.tau
-    assert deviation[-1] == pytest.approx(math.sqrt(tracker.variance), rel=1e-3)
 
 
 @pytest.mark.parametrize('settings', [Threshold(), Threshold(0.0)], ids=['threshold', 'pure'])

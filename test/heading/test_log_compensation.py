@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 
+from conftest import operations
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
 from gyro_calibration.logs.log import Log, read_log
@@ -21,7 +22,6 @@ from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import simulate_gyro_output
 import numpy as np
-from operations import operations
 import pytest
 
 VALUES = {'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),
@@ -90,16 +90,6 @@ def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_block
     log = replace(turned, output=output,
                   reference_heading=np.where(lost, np.nan, turned.reference_heading))
     assert in_blocks(model, log, size)[0] == pytest.approx(log.reference_rate, abs=1e-6)
-
-
-def test_before_its_first_value_a_reference_heading_is_that_value():
-    model = model_of(HEADING)
-    log = drive(model, lambda time: 0.0 * time)
-    heading = np.full(len(TIME), 1.5)
-    output = simulate_gyro_output(model, TIME, channels_from_log(
-        replace(log, reference_heading=heading)).with_rate(log.reference_rate, log.reference_rate))
-    late = replace(log, output=output, reference_heading=np.where(TIME < 5.0, np.nan, heading))
-    assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
 
 
 def test_rows_without_output_are_left_out(tmp_path, compensate):

@@ -20,7 +20,6 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     smooth_states,
 )
-from gyro_calibration.heading.stationary import RestScatter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
@@ -267,14 +266,6 @@ def test_false_alarms_are_as_rare_as_stated():
     assert 0 < alarms <= poisson.isf(RARE, 20.0), alarms
 
 
-def test_noise_that_is_twice_what_the_model_claims_is_learned():
-    motion = constant_rate_motion([(40, 0), (4, 45), (30, 0), (4, -45), (30, 0)])
-    time, true, _, rate = gyro(motion, np.random.default_rng(8),
-                               Noise(2.0 * XV3500.angle_random_walk))
-    found = follow(time, rate)
-    assert found.resting[(true == 0.0) & (time > 20.0)].mean() > 0.9
-
-
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
 def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, later):
@@ -296,26 +287,6 @@ def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, la
     assert math.sqrt(variances[1] - variances[0]) == pytest.approx(0.05 * 600.0 * DEGREE, rel=0.01)
 
 
-def test_the_first_rate_after_a_gap_or_a_jump_back_is_corrected_by_the_bias_estimate():
-    tracker = HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings())
-    generator = np.random.default_rng(12)
-    for index, true in enumerate([0.0] * 1200 + [0.2] * 200):
-        rate = (true + 0.3 * DEGREE
-                + XV3500.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL))
-        tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]), None, np.array([0.0, -1.0]))
-    for time in (200.0, 20.0):
-        rate = 0.2 + 0.3 * DEGREE
-        assert tracker.add(time, rate, np.array([-rate, -1.0]), None, np.array([0.0, -1.0]))
-        assert tracker.rate == pytest.approx(0.2, abs=0.05 * DEGREE)
-
-
-def test_a_mean_that_no_possible_scatter_explains_leaves_probabilities():
-    scatter = RestScatter()
-    scatter.begin_rest(0.0)
-    found = scatter.probabilities(np.where(scatter.counts > 0.0, -1e6, 0.0))
-    np.testing.assert_allclose(found, scatter.counts / scatter.counts.sum())
-
-
 @pytest.mark.parametrize('change', [0.001, 0.01, 0.02])
 def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(change):
     noise, generator = Noise(1e-5), np.random.default_rng(13)
@@ -327,17 +298,6 @@ def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(chan
     assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
 
 
-@pytest.mark.parametrize('interval', [0.45, 0.5], ids=['lost samples', '2 Hz'])
-def test_a_rest_is_found_where_one_interval_is_as_long_as_the_window(interval):
-    generator = np.random.default_rng(9)
-    time = (0.5 * np.arange(200.0) if interval == 0.5
-            else np.cumsum(np.where(np.arange(3000) % 100, INTERVAL, interval)))
-    rate = (XV3500.angle_random_walk * generator.standard_normal(len(time))
-            / math.sqrt(np.median(np.diff(time))))
-    resting = follow(time, rate).resting
-    assert resting.mean() > 0.9 and resting[-1]
-
-
 def test_hindsight_does_not_reach_over_a_gap():
     time = np.arange(0.0, 30.0, INTERVAL)
     time = time[(time < 10.33) | (time > 20.33)]
@@ -345,12 +305,6 @@ def test_hindsight_does_not_reach_over_a_gap():
     live, later = follow(time, rate), follow(time, rate, hindsight=True)
     assert later.heading == pytest.approx(live.heading, abs=1e-6)
     assert later.variance[time < 20.0].max() < 1e-3 * later.variance[time > 20.0].min()
-
-
-def test_a_rest_is_found_where_samples_come_in_bursts():
-    generator, index = np.random.default_rng(10), np.arange(6000)
-    rate = 10.0 * XV3500.angle_random_walk * generator.standard_normal(len(index))
-    assert follow(index // 10 * 0.1 + index % 10 * 2e-4, rate).resting.mean() > 0.95
 
 
 def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
@@ -363,17 +317,6 @@ def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
                 tracker.reset()
     assert len(doubtful) > 200 and tracker.is_resting
     assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(0.0, abs=1.0 * DEGREE)
-
-
-def test_another_calibration_and_a_reset_do_not_make_the_heading_jump():
-    tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    for index in range(100):
-        tracker.add(0.05 * index, 0.5, np.array([-0.5, -1.0]))
-    before, variance = tracker.heading, tracker.variance
-    tracker.use_calibration(XV3500, np.diag([1e-6, 1e-9]))
-    assert tracker.heading == before and tracker.variance == pytest.approx(variance)
-    tracker.reset()
-    assert tracker.heading == 0.0 and tracker.variance == 0.0
 
 
 def test_another_calibration_at_rest_keeps_the_correction_that_waits_for_motion():

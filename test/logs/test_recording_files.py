@@ -329,16 +329,6 @@ def test_a_compressed_file_may_not_grow_without_bound(tmp_path, monkeypatch):
         read_recording(tmp_path / 'bomb.db3.zstd')
 
 
-def test_a_sentence_shows_no_text_of_a_file_that_a_terminal_would_obey(make, tmp_path):
-    bad = '/imu\x1b[2J\n' + 300 * 'x'
-    topics = {name: degc(make) for name in (bad, *(f'/t{n}' for n in range(30)))}
-    for storage in ('MCAP', 'SQLITE3'):
-        with pytest.raises(LogError) as caught:
-            read_recording(write(tmp_path / storage, topics, storage=storage))
-        assert (str(caught.value).isprintable() and len(str(caught.value)) < 2500
-                and 'and 11 more' in str(caught.value))
-
-
 def test_a_compressed_recording_says_which_package_it_needs(make, tmp_path, monkeypatch):
     time = np.arange(300) / RATE
     topics = {'imu': gyro(make, time, time)}

@@ -189,13 +189,6 @@ def test_the_matrix_of_eq_11_gives_the_error_of_eq_12_and_one_subtraction_compen
             output - eq_12(C, output, degc), abs=1e-12)
 
 
-@pytest.mark.parametrize('matrix', [C, C[:, 2:], C[2:], [[0.5]], [[1e-4, 0.5]]],
-                         ids=['3x4', '3x2', '1x4', '1x1', '1x2'])
-def test_the_matrix_of_eq_11_comes_out_as_it_went_in(matrix):
-    assert polynomial_to_matrix(*polynomial_from_matrix(matrix)) == pytest.approx(
-        np.array(matrix), rel=1e-12, abs=0)
-
-
 def test_a_centred_and_scaled_polynomial_is_written_out_as_eq_11():
     effect = rate_temperature_polynomial(3, 2)
     values = (0.1, 1.7, 35.0, 10.0, *np.random.default_rng(0).normal(size=12) * 1e-3)

@@ -140,13 +140,6 @@ def test_a_bad_file_is_refused_in_one_sentence_with_file_place_and_remedy(tmp_pa
             and len(sentence) < 800)
 
 
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(ModelError, match='there is no such file; calibrate first'):
-        read_model(tmp_path / 'model.yaml')
-    with pytest.raises(ModelError, match='cannot be read'):
-        read_model(tmp_path)
-
-
 def test_a_calibration_cut_off_within_a_number_is_refused(tmp_path):
     path, stored = tmp_path / 'model.yaml', SelfCalibration(0.0125, 9.3e-6, ((1e-9, 0), (0, 2e-9)))
     write_model(path, GyroModel(self_calibration=stored))
@@ -157,13 +150,6 @@ def test_a_calibration_cut_off_within_a_number_is_refused(tmp_path):
             found.append(read_model(path).self_calibration)
     values = {(each.scale_factor_error, each.bias) for each in found if each}
     assert found[-1] == stored and values == {(0.0125, 9.3e-6)}
-
-
-def test_self_calibration_is_eq_3_of_hong_and_park():
-    """Their example: s = -10 %, b = 0.1 rad/s give s_bar = 1.111 and b_bar = -0.111."""
-    calibration = SelfCalibration(-0.1, 0.1)
-    assert (round(calibration.scale, 3), round(calibration.offset, 3)) == (1.111, -0.111)
-    assert calibration.correct((1 - 0.1) * 0.4 + 0.1) == pytest.approx(0.4, abs=1e-15)
 
 
 # Settings files, which model files and others are

@@ -74,14 +74,6 @@ def test_a_random_walk_stays_one_and_no_wander_stays_none(span):
     assert fit_gauss_markov(Noise(7e-4), 0.01, span)[0].density == 0.0
 
 
-def test_the_error_of_the_allan_deviation_is_the_largest_one():
-    process, error = fit_gauss_markov(NOISE, 0.01, 3600.0)
-    times = 0.01 * 2.0 ** np.arange(19)
-    made = NOISE.angle_random_walk ** 2 / times + process.allan_variance(times)
-    ratio = np.sqrt(made / NOISE.allan_variance(times))
-    assert max(ratio.max(), 1.0 / ratio.min()) - 1.0 == pytest.approx(error, rel=1e-6)
-
-
 def test_the_bias_is_the_output_at_rest_at_the_temperature():
     model = GyroModel((term('bias', 1e-3), term('scale_factor_error', 0.05),
                        term('bias_temperature', 25.0, 1e-5), term('warm_up', 60.0, 0.2)),

@@ -13,10 +13,9 @@
 import math
 import re
 
-from gyro_calibration.calibration.self_calibration import ReferenceErrors, RunLimits
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION_MOTION, constant_rate_motion
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
     CalibrationRun,
@@ -460,8 +459,12 @@ def turn_to_and_fro(rig, rest):
         rig.go(seconds)
 
 
-def test_odometry_is_a_reference(tmp_path):
+@pytest.mark.parametrize('has_yaw', [True, False], ids=['headings', 'rates alone'])
+def test_odometry_is_a_reference(tmp_path, has_yaw):
     rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    rig.odometry = lambda stamp, reading: rig.pipeline.add_odometry(
+        stamp, math.remainder(reading.heading, math.tau) * has_yaw,
+        Velocity(angular=(0.0, 0.0, reading.rate)))
     turn_to_and_fro(rig, 13.5)
     assert rig.ended
     success, message = rig.session.conclude()
@@ -469,6 +472,18 @@ def test_odometry_is_a_reference(tmp_path):
     kept = stored(rig)
     assert kept.method == 'odometry' and kept.scale_factor_error == pytest.approx(SCALE, abs=2e-3)
     assert kept.standard_deviations[0] > 0.0099 * (1 + SCALE), 'no run is better than its odometry'
+
+
+@pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
+                                           (lambda given: given[:20], '20 messages came'),
+                                           (lambda given: given[::-1], 'increasing stamps')],
+                         ids=['none', 'too few', 'out of order'])
+def test_odometry_that_cannot_be_used_is_refused(tmp_path, spoil, reason):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    turn_to_and_fro(rig, 13.5)
+    rig.session.run.odometry = spoil(rig.session.run.odometry)
+    success, message = rig.session.conclude()
+    assert not success and reason in message, message
 
 
 def test_odometry_that_is_computed_from_the_gyro_is_no_reference(tmp_path):
@@ -543,33 +558,7 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     assert not success and words in message, message
 
 
-# A run alone: when it is complete, and what it is compared with
-
-
-SLOW = 0.02  # s between samples
-ROUND = constant_rate_motion([(3.0, 0.0), (12.0, 60.0), (3.0, 0.0)])
-BEGIN = 1000.0  # s
-
-
-def ran(kind, motion, duration=None, drift=0.0):
-    """Return a run over a motion and the rest after it, where it may drift, rad/s."""
-    profile = motion if kind == PROFILE else None
-    length = motion.duration if duration is None else duration
-    run = CalibrationRun(kind, length, 0.0, profile, RunLimits(), ReferenceErrors(0.01), 2)
-    noise = 1e-4 * np.random.default_rng(0).standard_normal(2000)
-    for number in range(2000):
-        time = number * SLOW
-        heading, turning = (float(of(np.array(time)))
-                            for of in (motion.heading_at, motion.rate_at))
-        rate = (1 + SCALE) * turning + BIAS + noise[number] + drift * (time > motion.duration)
-        if number % 3 == 0:
-            run.odometry.append((BEGIN + time, heading, turning))
-        run.add(BEGIN + time, rate, rate, 25.0)
-        if kind in (ODOMETRY, TURNS) and time >= motion.duration:
-            run.finish()
-        if run.due_end_reason is not None:
-            break
-    return run, run.due_end_reason
+# A run alone: when it is complete
 
 
 def test_turns_that_are_not_finished_are_given_up():
@@ -592,42 +581,9 @@ def test_a_run_of_known_length_may_be_longer_than_one_that_waits_for_a_call(kind
     assert run.due_end_reason == ''
 
 
-def test_odometry_without_a_yaw_is_taken_by_its_rates():
-    run, _ = ran(ODOMETRY, CALIBRATION_MOTION, 20.0)
-    run.odometry = [(time, 0.0, rate) for time, _, rate in run.odometry]
-    assert fit_run(run, Noise(), '')[0].scale_factor_error == pytest.approx(SCALE, abs=5e-3)
-
-
-@pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
-                                           (lambda given: given[:20], '20 messages came'),
-                                           (lambda given: given[::-1], 'increasing stamps')],
-                         ids=['none', 'too few', 'out of order'])
-def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
-    run, _ = ran(ODOMETRY, CALIBRATION_MOTION, 20.0)
-    run.odometry = spoil(run.odometry)
-    with pytest.raises(DataRefused, match=reason):
-        fit_run(run, Noise(), '')
-
-
-def test_the_gyro_may_count_the_turns_and_a_wrong_count_is_refused():
-    run, _ = ran(TURNS, ROUND, math.inf)
-    run.turns = 0
-    assert '2 whole turns' in fit_run(run, Noise(), '')[1]
-    run.turns = 3
-    with pytest.raises(DataRefused, match='3 were given|turns'):
-        fit_run(run, Noise(), '')
-
-
-def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
-    run, _ = ran(ODOMETRY, CALIBRATION_MOTION, 20.0, drift=20.0 * DEGREE)
-    run.odometry = [each for each in run.odometry if each[0] <= BEGIN + 20.0]
-    run.limits = RunLimits(max_time_offset=0.5)
-    assert 'at rest after it' not in fit_run(run, Noise(), '')[1]
-
-
 def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():
     run = CalibrationRun(REST, 10.0, 0.0)
     for number, noise in enumerate(1e-5 * np.random.default_rng(1).standard_normal(520)):
-        run.add(number * SLOW, BIAS, BIAS + noise, 25.0)
+        run.add(0.02 * number, BIAS, BIAS + noise, 25.0)
     with pytest.raises(DataRefused, match='the gyro is dead'):
         fit_run(run, Noise(), '')

@@ -20,8 +20,6 @@ Tests wait for events; they accept that a machine that delays samples by 0.25 s 
 import math
 import os
 import signal
-import subprocess
-import sys
 import time
 
 from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
@@ -29,7 +27,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
-from robot import now, Robot, RosRobot
+from rig import now, Robot, RosRobot
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray
@@ -196,18 +194,6 @@ def test_names_types_and_qualities_are_those_of_the_documents(hold):
     assert {'calibrated', 'running'} <= {pair.key for pair in status.values}
 
 
-def test_samples_that_come_while_the_node_is_not_let_run_are_all_used(by_udp, start):
-    node, gyro = start()
-    os.killpg(node.process.pid, signal.SIGSTOP)
-    for _ in range(100):  # as many fit into the buffer of a socket
-        gyro.send(0.5)
-        time.sleep(PACE)
-    os.killpg(node.process.pid, signal.SIGCONT)
-    gyro.wait_until(lambda: len(gyro.imu) == 100, what='all samples')
-    yaw = gyro.imu[-1].orientation
-    assert 2.0 * math.atan2(yaw.z, yaw.w) == pytest.approx(0.5 * 1.0, abs=0.01)
-
-
 def test_parameters_are_checked_described_and_taken_on_at_once(hold):
     held = hold(stationary__threshold=0)
     names = held.node.get_parameters_by_prefix('')
@@ -358,40 +344,6 @@ def test_without_a_clock_of_the_simulation_nothing_drives_and_where_it_stops_the
     answer = stage.drive()
     begin, robot.clock_stands = now(), True
     assert stage.refused(answer, 'ROS time stands still', begin) < 2.0
-
-
-_CALLER = """
-import rclpy
-from std_srvs.srv import Trigger
-rclpy.init()
-node = rclpy.create_node('caller')
-client = node.create_client(Trigger, '/compensation_node/calibrate')
-client.wait_for_service()
-try:
-    rclpy.spin_until_future_complete(node, client.call_async(Trigger.Request()))
-finally:
-    node.destroy_node()
-"""
-
-
-@pytest.mark.evidence
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
-def test_a_caller_that_is_ended_in_mid_run_leaves_a_robot_that_stops(stage, number):
-    """At once where it says goodbye; killed, it is missed after up to 20 s, or the run is over."""
-    robot = stage.robot()
-    stage.node()
-    caller = subprocess.Popen([sys.executable, '-c', _CALLER], stderr=subprocess.PIPE)
-    stage.wait_until(lambda: abs(robot.robot.rate) > FULL_RATE, 60.0, 'full rate')
-    begin = now()
-    caller.send_signal(number)
-    caller.communicate()
-    stage.wait_until(lambda: robot.commands[-1][1] == 0.0 and now() - robot.commands[-1][0] > 1.0
-                     and abs(robot.robot.rate) < 1e-4, 40.0, 'the end of the run')
-    driven = [when for when, rate in robot.commands if rate and when > begin]
-    assert number == signal.SIGKILL or max(driven, default=begin) - begin < 2.0
-    answer = stage.drive()
-    stage.call('cancel_calibration')
-    stage.wait_until(answer.done, what='the answer')
 
 
 def test_a_node_that_is_ended_in_mid_run_commands_zero_first_and_answers(stage):

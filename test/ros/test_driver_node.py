@@ -195,15 +195,6 @@ def test_steps_of_the_clock_are_counted():
     assert values['last_event'].startswith('the clock of this computer was set by -7200.0 s')
 
 
-def test_listening_is_a_warning_and_what_was_recognized_is_reported():
-    world = World(30.0, baud=find_protocol('kvh_ecore').baud)
-    world.gyro('kvh_ecore')
-    reports = reported(world, 'auto')
-    assert reports[0][:2] == (WARN, 'listening for a protocol')
-    assert (reports[-1][2]['protocol'] == 'kvh_ecore'
-            and 'kvh_ecore explains' in reports[-1][2]['detected'])
-
-
 @pytest.mark.parametrize('node_class, name, parameters, words', [
     (DriverNode, 'driver_node: gyro', {'port': '/nonexistent/gyro'}, 'does not exist'),
     (CompensationNode, 'compensation_node: heading', {'use_sim_time': 'true'},
