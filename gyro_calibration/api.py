@@ -327,8 +327,8 @@ class Diagnosed(PrintedResult):
         write_diagnosis(folder, self.found)
 
 
-def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
-             kind: str | None = None) -> Diagnosed:
+def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0, kind: str | None = None,
+             time_limit: float | None = None) -> Diagnosed:
     """
     Measure the error of a simulation against logs, name the causes, extend the model.
 
@@ -339,13 +339,14 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
     seed : of the random draws of significance tests
     kind : of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or rest;
         None takes what the log shows
+    time_limit : s; the search for causes ends after half of it, and what was found is confirmed
 
     """
     _require_logs(*logs)
     if model is not None:
         _require_model(model)
     _require_choice('kind', kind, REFERENCE_KINDS)
-    found = diagnose_logs(logs, model, seed, kind)
+    found = diagnose_logs(logs, model, seed, kind, time_limit=time_limit)
     return Diagnosed(found.model, found)
 
 

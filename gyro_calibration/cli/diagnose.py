@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
+import time
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress
@@ -47,6 +48,9 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help='kind of the reference; default: detected from the log')
     parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
                         'model.yaml, the extended model')
+    parser.add_argument('--time-limit', type=verb.positive_number, metavar='S', help='the search '
+                        'for causes ends after half of it, s, and what was found is confirmed and '
+                        'reported; default: none')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
                         help='seed of the random draws of significance tests; default: 0')
 
@@ -58,7 +62,7 @@ def run(given: argparse.Namespace) -> Answer:
     model = None if given.model is None else read_model(given.model)
     with show_progress('diagnosis') as on_progress:
         found = diagnose_logs(logs, model, given.seed, given.reference_kind, given.log,
-                              on_progress)
+                              on_progress, given.time_limit)
     found = replace(found, logs=tuple(given.log))
     if found.model is not model:
         origin = {**found.model.origin, **verb.make_origin(found.logs)}
@@ -69,16 +73,27 @@ def run(given: argparse.Namespace) -> Answer:
 
 def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind: str | None = None,
                   names: Sequence[str] = (),
-                  on_progress: OnProgress = lambda share, words: None) -> Diagnosis:
-    """Diagnose logs in time, or a rate table; a model that is not extended is unchanged."""
+                  on_progress: OnProgress = lambda share, words: None,
+                  time_limit: float | None = None) -> Diagnosis:
+    """
+    Diagnose logs in time, or a rate table; a model that is not extended is unchanged.
+
+    The search for causes ends after half of a time limit, s, as what follows may take as long.
+    """
+    begin = time.monotonic()
+
+    def on_step(share: float | None, words: str) -> bool:
+        on_progress(share, words)
+        return time_limit is not None and time.monotonic() - begin > 0.5 * time_limit
+
     table = any(log.time is None for log in logs)
     if table and len(logs) > 1:
         raise InputError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
                          'alone, or give the sample rate in Hz with --rate')
     found = (diagnose_table(logs[0], None if model is None else merge_self_calibration(model),
-                            on_progress=on_progress)
+                            on_progress=on_step)
              if table else diagnose(logs, np.random.default_rng(seed), model, names=names,
-                                    on_progress=on_progress, reference_kind=kind))
+                                    on_progress=on_step, reference_kind=kind))
     return (found if model is None or is_model_extended(found)
             else replace(found, before=model, model=model))
 

@@ -21,10 +21,13 @@ from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 
-#: Is called with the share of the work done, None if unknown, and the step that begins.
+#: Is called with the share of the work done, None if unknown, and the step that begins; returns
+#: whether the time limit is near, so that the search ends and no gain is measured.
 OnProgress: TypeAlias = Callable[[float | None, str], object]
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
+TIME_LIMIT_REMARK = ('The time limit was reached: there may be more causes, and the gain of the '
+                     'model was not measured.')
 #: Why a model is not offered.
 NOT_OFFERED = ('On the held-out parts, the errors of the extended model are larger than those of '
                'the model before; it is not offered.')

@@ -68,6 +68,7 @@ from gyro_calibration.diagnosis.findings import (
     probabilities,
     Reference,
     SEARCH_ALARM_SHARE,
+    TIME_LIMIT_REMARK,
     Unexplained,
     VALUE_ALARM_SHARE,
 )
@@ -163,7 +164,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         best
     false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
-    on_progress : is called with None and the name of each step that begins
+    on_progress : is called with None and the name of each step that begins; returns whether to end
     reference_kind : of the reference, one of `gates.REFERENCE_KINDS`; None is found
         from the log
 
@@ -256,13 +257,13 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     simulated = Noise() if model is None else model.noise
     figures = fit_noise_parameters(found, simulated, rounds)
     noise = figures.noise
-    on_progress(None, 'cross-validation')
+    is_late = on_progress(None, 'cross-validation')
     changed = [] if model is None else list(_model_value_findings(found, model, noise, rate))
     within = [(known, members) for known, members in zip(found.causes, selection.alternatives)
               if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
     gain = None
-    if (lasting or changed) and not is_scale_implausible(found):
+    if (lasting or changed) and not is_scale_implausible(found) and not is_late:
         tried = {each.cause for _, members in within for each, _ in members}
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
@@ -298,8 +299,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      residual_curves(left, shown), heading_error_curve(left, shown),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
-                      *searched.remarks), rate, heading_shares=of_heading,
-                     reference=references[0] if len(logs) == 1 else None)
+                      *searched.remarks, *[TIME_LIMIT_REMARK] * bool(is_late)), rate,
+                     heading_shares=of_heading, reference=references[0] if len(logs) == 1 else None)
 
 
 def _diagnose_beside_motion(log: Log, searched: _Searched, given: Replay, reference: Reference,

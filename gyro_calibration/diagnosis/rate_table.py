@@ -179,7 +179,9 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
     groups = parts * count // (parts.max() + 1)
     errors = {name: np.full(len(dwells), np.nan) for name in ('given', 'plain', 'extended')}
     for number in range(count):
-        on_progress((number + 1) / (count + 2), f'cross-validation, part {number + 1} of {count}')
+        if on_progress((number + 1) / (count + 2),
+                       f'cross-validation, part {number + 1} of {count}'):
+            break
         hidden = groups == number
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:

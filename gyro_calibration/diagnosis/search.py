@@ -430,7 +430,8 @@ def _select_forward(search: Search) -> Causes:
     """Add causes one by one (forward selection)."""
     named: Causes = ()
     for _ in range(2 * MAX_CAUSES):  # some are removed again
-        search.on_progress(None, f'search for causes, {len(named)} found')
+        if search.on_progress(None, f'search for causes, {len(named)} found'):
+            break
         one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
         more = _with_part_of_log(search, named) if one_more is None else (*named, one_more)
         if not more:

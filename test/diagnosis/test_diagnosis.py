@@ -22,6 +22,7 @@ import itertools
 from diagnosed import described as told
 from diagnosed import diagnosis_of, held, judge_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.findings import TIME_LIMIT_REMARK
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Log
@@ -116,6 +117,20 @@ def test_effects_together_are_all_named(seed, names):
     log, = hidden_in(names, 5.0, seed)
     found = diagnosis_of([log], np.random.default_rng(seed))
     assert judge_diagnosis(log, found, ENCODER).is_right, told(log, found)
+
+
+def test_a_search_that_ends_in_time_reports_what_was_found_so_far():
+    log, = hidden_in(('scale_factor_asymmetry', 'bias_temperature'), 20.0, 0, reference={})
+    steps = []
+
+    def on_step(share, words):
+        steps.append(words)
+        return 'search for causes, 1 found' in steps
+
+    found = diagnose([log_of(log)], np.random.default_rng(0), on_progress=on_step)
+    assert [each.status for each in found.findings] == ['established', 'suspected']
+    assert set(names_of(found)) == set(log.truth.names)
+    assert found.gain is None and TIME_LIMIT_REMARK in found.remarks
 
 
 def test_a_coarse_output_and_another_effect_are_both_named():
