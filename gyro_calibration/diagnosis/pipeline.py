@@ -300,7 +300,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
                       *searched.remarks, *[TIME_LIMIT_REMARK] * bool(is_late)), rate,
-                     heading_shares=of_heading, reference=references[0] if len(logs) == 1 else None)
+                     heading_shares=of_heading,
+                     reference=references[0] if len(logs) == 1 else None)
 
 
 def _diagnose_beside_motion(log: Log, searched: _Searched, given: Replay, reference: Reference,
