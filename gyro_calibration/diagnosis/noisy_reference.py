@@ -159,12 +159,12 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior, instants))
     extended, found = search_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
                                     on_progress)
-    is_late = on_progress(None, 'cross-validation')
+    time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
     lasting_terms = [each for each in extended.causes if not each.is_single_event]
     lasting = (extended if not events else plain if not lasting_terms
                else fit_spans(plain.spans, lasting_terms))
-    gain = None if is_late else _cross_validated_gain(plain, lasting)
+    gain = None if time_is_up else _cross_validated_gain(plain, lasting)
     model_fit = lasting
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
@@ -210,7 +210,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                      None if not changed and model is not None else gain, before, after,
                      _untestable_causes(plain), [curve], heading_curve(parts, time), None,
                      (*record.remarks, *_remarks(reference, extended, prior is not None),
-                      *[NOT_OFFERED] * rejected, *[TIME_LIMIT_REMARK] * bool(is_late)),
+                      *[NOT_OFFERED] * rejected, *[TIME_LIMIT_REMARK] * bool(time_is_up)),
                      false_alarm_rate, trace=trace,
                      method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
                      reference=replace(reference, noise=noise), heading_shares=of_heading)

@@ -257,13 +257,13 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     simulated = Noise() if model is None else model.noise
     figures = fit_noise_parameters(found, simulated, rounds)
     noise = figures.noise
-    is_late = on_progress(None, 'cross-validation')
+    time_is_up = on_progress(None, 'cross-validation')
     changed = [] if model is None else list(_model_value_findings(found, model, noise, rate))
     within = [(known, members) for known, members in zip(found.causes, selection.alternatives)
               if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
     gain = None
-    if (lasting or changed) and not is_scale_implausible(found) and not is_late:
+    if (lasting or changed) and not is_scale_implausible(found) and not time_is_up:
         tried = {each.cause for _, members in within for each, _ in members}
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
@@ -299,7 +299,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      residual_curves(left, shown), heading_error_curve(left, shown),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, gain, model),
-                      *searched.remarks, *[TIME_LIMIT_REMARK] * bool(is_late)), rate,
+                      *searched.remarks, *[TIME_LIMIT_REMARK] * bool(time_is_up)), rate,
                      heading_shares=of_heading,
                      reference=references[0] if len(logs) == 1 else None)
 
