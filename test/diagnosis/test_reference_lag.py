@@ -108,6 +108,29 @@ def test_a_command_at_5_hz_shows_the_gyro_and_the_lag_alone(kind, jitter, asymme
     assert values['bias'] == pytest.approx(BIAS, abs=0.03 * DEGREE)
 
 
+def accelerated(rate, limit):
+    """Return how a rate exceeds that of a robot with a limit of acceleration, rad/s²."""
+    limited, most = [rate[0]], limit * INTERVAL
+    for wanted in rate[1:].tolist():
+        limited.append(limited[-1] + min(max(wanted - limited[-1], -most), most))
+    return rate - limited
+
+
+@pytest.mark.parametrize('kind', ['steps', 'trapezoids'])
+@pytest.mark.parametrize('seed', seeds(3))
+def test_a_limit_of_acceleration_is_said_to_be_of_the_motion(kind, seed):
+    log = commanded_log(kind, 1e-4, 51 + seed, lambda rate, time: -(1.0 + SCALE) * accelerated(
+        rate, 0.5), 0.2)
+    found = diagnose([log], np.random.default_rng(0))
+    assert {each.effect for each in found.findings if each.status == 'established'} == {
+        'reference_lag'} and not found.unexplained
+    remarks = ' '.join(found.remarks)
+    assert 'The motion has more of its own' in remarks or 'follows its command' in remarks
+    (scale, deviation), = [(value, deviation) for name, _, value, deviation
+                           in found.model.estimates() if name == 'scale_factor_error']
+    assert abs(scale - SCALE) < 4.0 * deviation
+
+
 def test_a_command_that_is_held_between_updates_has_no_noise():
     log = commanded_log('swing', 3e-4, 3)
     held = log.reference_rate[np.arange(COUNT) // 4 * 4]
