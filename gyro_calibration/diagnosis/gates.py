@@ -621,6 +621,11 @@ def reference_angle(log: Log) -> Array:
             else integrate(log.time, bridge_gaps(values)))
 
 
+def _are_equal(rates: Array) -> bool:
+    """Tell whether mean rates over spans differ by rounding alone."""
+    return not np.ptp(rates) > _EQUAL_RATES * np.abs(rates).max()
+
+
 def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     """Compare the changes of heading over spans of each length; none if there are too few."""
     assert log.time is not None and log.output is not None
@@ -637,7 +642,7 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     chosen = known[np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0)]
     at, heading = log.time[chosen], reference[chosen]
     rates = np.diff(heading) / np.diff(at)
-    if not np.ptp(rates) > _EQUAL_RATES * np.abs(rates).max():
+    if _are_equal(rates):
         return []
     white = white_noise_deviation(output) ** 2 * float(np.median(np.diff(log.time)))
     return [_regress_at_best_lag(log.time, turned, at[::together], heading[::together], span,
@@ -671,11 +676,10 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
         values = np.linalg.lstsq(columns[kept], change[kept], rcond=None)[0]
         off = change - columns @ values
         kept = np.abs(off) <= 6.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-15
-        rates = change[kept] / steps[kept]
-        # Beside long rests, all turns of the gyro are outlying if the reference makes others; and
-        # beside a commanded rate that stays the same, all others.
+        # With long rests, all turns of the gyro are outlying if the reference makes others; and
+        # with a commanded rate that stays the same, all others.
         if (kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum()
-                or np.ptp(rates) <= _EQUAL_RATES * np.abs(rates).max()):
+                or _are_equal(change[kept] / steps[kept])):
             kept[:] = True
     variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
     if (left >= (1.0 - _MIN_MOTION_COHERENCE) * variance

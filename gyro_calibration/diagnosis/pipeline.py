@@ -246,8 +246,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     search = searched.search
     selection = confirm_causes(search, searched.causes)
     if searched.followed is not None and selection.unnamed and len(logs) == 1:
-        return _diagnose_beside_motion(logs[0], searched, replays[0], references[0], model, rate,
-                                       on_progress)
+        return _diagnose_by_spans(logs[0], searched, replays[0], references[0], model, rate,
+                                  on_progress)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
     on_progress(None, 'noise figures')
@@ -304,9 +304,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      reference=references[0] if len(logs) == 1 else None)
 
 
-def _diagnose_beside_motion(log: Log, searched: _Searched, given: Replay, reference: Reference,
-                            model: GyroModel | None, rate: float,
-                            on_progress: OnProgress) -> Diagnosis:
+def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: Reference,
+                       model: GyroModel | None, rate: float,
+                       on_progress: OnProgress) -> Diagnosis:
     """Diagnose a log by spans, if its motion has more of its own than a response to a command."""
     assert searched.followed is not None and log.reference_rate is not None
     motion = searched.followed.replays[0]
@@ -336,7 +336,7 @@ class _Searched:
 
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                  on_progress: OnProgress, is_command: bool) -> _Searched:
-    """Search for causes, beside the motion that follows where a log follows its reference."""
+    """Search for causes, given the motion that follows where a log follows its reference."""
     def find_settled(fit: RegressionFit, follows: bool) -> tuple[Mask, Unexplained] | None:
         """Return the samples in dwells if the residual is larger between them."""
         return (_find_settled(logs[0], fit, rate, follows)

@@ -14,7 +14,7 @@ A motion that follows its reference rate with dynamics of its own, as a robot fo
 Its delay, lag and overshoot are those of the drives, not of the gyro. They are fitted as a linear
 response of any shape, and the log is then diagnosed against the motion that follows, without what
 any other such response would explain. A delay, a lag or a clock rate of the gyro cannot be known
-beside them, and neither can a slip.
+then, and neither can a slip.
 
 """
 
@@ -39,7 +39,7 @@ from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.stats import norm
 
-#: Causes that cannot be known beside the dynamics of a motion, which may also vibrate.
+#: Causes that cannot be told from the dynamics of a motion, which may also vibrate.
 HIDDEN_CAUSES = frozenset({
     'clock_rate', 'interference_tone',
     *(name for name, cause in CAUSES.items() if cause.along == 'rate_change')})
@@ -82,7 +82,7 @@ def is_late(replays: Sequence[Replay]) -> bool:
         columns = np.column_stack([
             rate, np.cumsum(rate), np.arange(len(rate)), np.ones(len(rate))])
         delays.append(-each.point_interval * np.linalg.lstsq(columns, difference)[0][0])
-    return follows_rate(replays) and float(np.mean(delays)) > MAX_GYRO_LAG
+    return float(np.mean(delays)) > MAX_GYRO_LAG
 
 
 def follows_rate(replays: Sequence[Replay]) -> bool:
@@ -104,7 +104,7 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
     """
     Return a log with the motion that follows as the reference, and its mean delay, s.
 
-    The number of lags is the likeliest one by the information criterion of Bayes, beside effects
+    The number of lags is the likeliest one by the information criterion of Bayes, with effects
     of the gyro along the motion.
 
     """
