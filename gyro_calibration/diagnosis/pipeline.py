@@ -314,10 +314,14 @@ def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: 
                          np.nan)
     found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
                                         rate, on_progress)
-    hidden = {name: _HIDDEN_REASON for name in searched.hidden if name in CAUSES}
+    # nor can a single event be told from what the motion has of its own
+    hidden = {name: _HIDDEN_REASON
+              for name in (*searched.hidden, 'bias_step', 'reference_slip') if name in CAUSES}
+    shares = {name: share for name, share in found.heading_shares.items() if name not in hidden}
+    shares['left'] += sum(found.heading_shares.values()) - sum(shares.values())
     return replace(found, findings=(*(each for each in found.findings
                                       if each.effect not in hidden), *searched.findings),
-                   cannot_show={**found.cannot_show, **hidden},
+                   cannot_show={**found.cannot_show, **hidden}, heading_shares=shares,
                    remarks=(*found.remarks, _MOTION_REMARK))
 
 

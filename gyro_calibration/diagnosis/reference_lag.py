@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
@@ -86,8 +87,9 @@ def is_late(replays: Sequence[Replay]) -> bool:
 
 
 def follows_rate(replays: Sequence[Replay]) -> bool:
-    """Tell whether the motion may follow the reference of logs, which is a rate that changes."""
-    return all('reference_rate' in each.available_channels and np.ptp(each.channels.rate) > 0.0
+    """Tell whether the reference of logs is a rate whose changes show how a motion follows it."""
+    return all('reference_rate' in each.available_channels
+               and np.count_nonzero(np.diff(each.channels.rate)) >= MIN_STRETCHES
                for each in replays)
 
 
