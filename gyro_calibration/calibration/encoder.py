@@ -235,13 +235,13 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     # the gyro's lag is assumed to be about that of a filter of 20 ms
     fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
            fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
-                          lag_deviation=_GYRO_LAG_DEVIATION))
+                          lag_deviation=_GYRO_LAG_DEVIATION, bias_wanders=True))
     response_variance = 0.0
     if motion.rate is not None and method == 'likelihood':
         # the variance of the times by which a motion is late is seldom above their mean squared
         exact = fit.scale_factor_error
         fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
-            0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION))
+            0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION), bias_wanders=True)
         # the shape of the response is not known: what it changes is uncertain
         response_variance = (fit.scale_factor_error - exact) ** 2
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')

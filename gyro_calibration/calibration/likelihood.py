@@ -27,7 +27,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import math
 
-from gyro_calibration.calibration.noise_grid import TridiagonalMatrix
+from gyro_calibration.calibration.noise_grid import bias_wander_columns, TridiagonalMatrix
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.quality import encoder_step
@@ -129,11 +129,11 @@ class _Increments:
     """Increments of headings of gyro and reference between blocks, each a mean over points."""
 
     # reference increments, rad; intervals, s; the change by a time offset, rad/s; by a lag,
-    # rad/s²; by errors that several points share, rad; shape (n, 4 + k)
+    # rad/s²; by errors that several points share, rad; by a wandering bias, s; shape (n, m)
     columns: Array
-    prior_deviation: Array  # prior standard deviations of the values, shape (4 + k,)
-    prior_factors: Array  # possible factors of the prior standard deviations, shape (m, 4 + k)
-    prior_mean: Array  # prior means of the values, shape (4 + k,)
+    prior_deviation: Array  # prior standard deviations of the values, shape (m,)
+    prior_factors: Array  # possible factors of the prior standard deviations, shape (l, m)
+    prior_mean: Array  # prior means of the values, shape (m,)
     gyro_increments: Array  # increments of the gyro's integral, rad, shape (n,)
     # variance of the increments of a random walk, and covariance of each with the one before, s,
     # shape (n,)
@@ -149,8 +149,11 @@ class _Increments:
     # rad/s², shape (n, 2); empty for a profile
     accelerations: Array = field(default_factory=lambda: np.empty((0, 2)))
     acceleration_time: float = 0.0
+    wander_count: int = 0  # number of the last columns, of a wandering bias
 
 
+#: Sizes of a rate random walk of the bias that are possible, rad/s/√s.
+_RATE_RANDOM_WALKS = np.geomspace(1e-7, 1e-2, 6)
 #: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
 #: random walk, and are not modelled as one.
 MAX_BLOCK_DURATION = 0.5
@@ -167,12 +170,13 @@ class _RunAlignment:
     """A run and a motion, aligned at any time offset and lag."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
-                 slip_deviation: float, excess_turn: tuple[float, float] | None):
+                 slip_deviation: float, excess_turn: tuple[float, float] | None,
+                 bias_wanders: bool):
         self._time, self._rate = time, rate
         self._prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
         self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
-        self.is_measured = motion.rate is None
+        self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
                                                 excess_turn)
@@ -202,6 +206,13 @@ class _RunAlignment:
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
         prior = np.append(self._prior_deviation, points.shared_deviation)
         prior_factors = np.insert(points.prior_factors, [0] * 4, 1.0, axis=1)
+        count = 0
+        if self._bias_wanders:
+            wander, (part,) = bias_wander_columns(means[:, 1], bias_instability=None)
+            columns, count = np.column_stack([columns, wander]), wander.shape[1]
+            prior = np.append(prior, np.sqrt(part.variance))
+            prior_factors = np.array([np.append(factors, np.full(count, size))
+                                      for factors in prior_factors for size in _RATE_RANDOM_WALKS])
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
@@ -213,7 +224,7 @@ class _RunAlignment:
         start_offsets = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
                                         [means[0, 4] - known[0, 4]]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
-                           1.0 / precision, means[:, 1], start_offsets, accelerations, base)
+                           1.0 / precision, means[:, 1], start_offsets, accelerations, base, count)
 
     def require_increments(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""
@@ -507,18 +518,34 @@ class _Estimate:
     dof: float
     rate_variance: float
     noise: _IncrementCovariance
-    influence: Array
     log_likelihood: float
+    weighted: Array  # inverse of the covariance times the instruments of the columns
+
+    @property
+    def inverse(self) -> Array:
+        """Return the inverse of the normal matrix, with the priors."""
+        return self.covariance * ((self.dof - 2.0) / (self.dof * self.rate_variance))
+
+    def influence(self, data: _Increments) -> Array:
+        """
+        Return the effect of the noise of each block on (s, b), shape (n, 2).
+
+        A bias that wanders is part of the noise.
+
+        """
+        wander = data.columns.shape[1] - data.wander_count
+        noise = self.residual + data.columns[:, wander:] @ self.values[wander:]
+        return noise[:, None] * (self.weighted @ self.inverse[:2].T)
 
 
 #: Variance of a block's reference noise over what the rate noise adds from block to block.
 _NOISE_RATIOS = np.geomspace(1e-3, 1e5, 25)
 
 
-def _solve_weighted(data: _Increments, noise: _IncrementCovariance, instrument: Array,
+def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Array,
                     prior: Array) -> _Estimate:
     """Solve the weighted normal equations, and compute the likelihood of noise and prior."""
-    weighted, count = noise.solve(instrument), len(data.gyro_increments)
+    count = len(data.gyro_increments)
     matrix, known = weighted.T @ data.columns, np.isfinite(prior)
     # of the deviations from a solution without priors, of which rounding leaves more digits
     start = np.linalg.lstsq(matrix, weighted.T @ data.gyro_increments, rcond=1e-14)[0]
@@ -542,8 +569,7 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, instrument: 
         + np.sum(((values - data.prior_mean) / prior)[known] ** 2 + 2.0 * np.log(prior[known]))
         + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum())
     return _Estimate(prior, values, dof / (dof - 2.0) * rate_variance * inverse, residual, dof,
-                     rate_variance, noise, residual[:, None] * (weighted @ inverse[:2].T),
-                     float(log_likelihood))
+                     rate_variance, noise, float(log_likelihood), weighted)
 
 
 def _average_over_noise(data: _Increments,
@@ -558,9 +584,9 @@ def _average_over_noise(data: _Increments,
     """
     typical = float(np.median(data.walk_variance) / np.median(data.reference_variance))
     noises = [_IncrementCovariance(data, ratio) for ratio in _NOISE_RATIOS * typical]
-    estimates = [_solve_weighted(data, noise, _instrument(data, noise),
-                                 data.prior_deviation * factors)
-                 for noise in noises for factors in prior_factors]
+    estimates = [_solve_weighted(data, noise, weighted, data.prior_deviation * factors)
+                 for noise in noises for weighted in [noise.solve(_instrument(data, noise))]
+                 for factors in prior_factors]
     logarithms, values, covariances = (
         np.array([getattr(each, name) for each in estimates])
         for name in ('log_likelihood', 'values', 'covariance'))
@@ -599,7 +625,8 @@ def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
         instrument = _instrument(data, estimate.noise)
         instrument[:, 0] += (estimate.noise.expected_reference_error(estimate.residual)
                              / _nonzero_scale(estimate.values[0]))
-        estimate = _solve_weighted(data, estimate.noise, instrument, estimate.prior_deviation)
+        estimate = _solve_weighted(data, estimate.noise, estimate.noise.solve(instrument),
+                                   estimate.prior_deviation)
     return estimate
 
 
@@ -610,7 +637,8 @@ def _nonzero_scale(scale: float) -> float:
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
                    lag_deviation: float = LAG_DEVIATION, slip_deviation: float = 0.0,
-                   excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
+                   excess_turn: tuple[float, float] | None = None,
+                   bias_wanders: bool = False) -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
@@ -639,13 +667,15 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         fraction of it
     excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides a profile;
         the bias is then that of the rest after it. None without one
+    bias_wanders : whether it may do so by a random walk; it is then the mean over the motion
 
     Raises
     ------
     DataRefused : gyro and motion hardly overlap
 
     """
-    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn)
+    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn,
+                              bias_wanders)
     offset, data, averages, averaged_covariance, estimate = _fit_offset(
         alignment, largest_time_offset)
     values, covariance = estimate.values[:2], averaged_covariance[:2, :2]
@@ -669,8 +699,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     # a profile itself has no noise, so that the ratio of the noises is not estimated
+    alone_noise = _IncrementCovariance(data, 0.0)
     alone = estimate if alignment.is_measured else _solve_weighted(
-        data, _IncrementCovariance(data, 0.0), data.columns, estimate.prior_deviation)
+        data, alone_noise, alone_noise.solve(data.columns), estimate.prior_deviation)
     residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
     dof = alone.dof + (not alignment.is_measured)
     reference_noise = (math.sqrt(estimate.rate_variance * estimate.noise.ratio)
@@ -680,7 +711,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         (abs(found.excess_rate) * float(inside.sum()),
          math.sqrt(found.explained_squares) / noise_deviation),
         math.sqrt(averaged_covariance[2, 2]),
-        np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
+        np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end),
         *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
         residual_squares, dof, slip_deviation=slip)
 
@@ -709,7 +740,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
             offset, lag = offset - delay_change, lag + lag_change
             data = alignment.require_increments(offset, lag)
             noise = _IncrementCovariance(data, estimate.noise.ratio)
-            estimate = _solve_weighted(data, noise, _instrument(data, noise),
+            estimate = _solve_weighted(data, noise, noise.solve(_instrument(data, noise)),
                                        estimate.prior_deviation)
         if (len(prior_factors) == len(data.prior_factors)
                 and abs(offset - before) < _OFFSET_TOLERANCE):
@@ -735,15 +766,15 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
                                             data.start_offsets[2:-1], data.start_offsets[-1])
     scale, bias = _nonzero_scale(estimate.values[0]), estimate.values[1]
     prior = estimate.noise.ratio * data.reference_variance[0]
-    first = np.eye(len(data.gyro_increments))[0]
+    first = np.append(1.0, np.zeros(len(data.gyro_increments) - 1))
     error = prior * float(estimate.noise.solve(estimate.residual)[0])
-    weighted = estimate.noise.solve(data.columns)
-    left = (float(estimate.noise.solve(first)[0])
-            - weighted[0] @ np.linalg.pinv(weighted.T @ data.columns, rcond=1e-14) @ weighted[0])
+    row = estimate.noise.solve(data.columns)[0]
+    left = float(estimate.noise.solve(first)[0]) - row @ estimate.inverse @ row
     variance = (estimate.rate_variance * (max(prior - prior ** 2 * left, 0.0) + elapsed / 3.0)
                 + elapsed ** 2 * estimate.covariance[1, 1])
-    variance += shared @ estimate.covariance[4:, 4:] @ shared
-    start = heading + (shared @ estimate.values[4:] - error - gyro_angle + bias * elapsed) / scale
+    of_shared = slice(4, 4 + len(shared))
+    variance += shared @ estimate.covariance[of_shared, of_shared] @ shared
+    start = heading + (shared @ estimate.values[of_shared] - error - gyro_angle + bias * elapsed) / scale
     return float(start), math.sqrt(variance) / abs(scale)
 
 
@@ -808,7 +839,7 @@ def _weigh_stretch(estimate: _Estimate, data: _Increments, found: DeviatingStret
             / max(len(logarithms), 1))  # the mean over all stretches, each against none
     widened = replace(data, columns=np.insert(data.columns, 4, stretch_column, axis=1),
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
-    other = _solve_weighted(widened, estimate.noise, widened.columns,
+    other = _solve_weighted(widened, estimate.noise, estimate.noise.solve(widened.columns),
                             np.insert(estimate.prior_deviation, 4, EXCESS_RATE_DEVIATION))
     return odds / (1.0 + odds), other.values[:2], other.covariance[:2, :2]
 

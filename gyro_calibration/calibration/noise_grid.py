@@ -277,7 +277,7 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
     time : of the points, s, shape (n + 1,)
     bias_instability : range of B, rad/s, or None without flicker
     rate_random_walk : range of K, rad/s/√s, or None without rate random walk
-    cosine_count : their number, limited to half the number of spans
+    cosine_count : their number
 
     Returns
     -------
@@ -285,7 +285,7 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
 
     """
     duration = float(time[-1] - time[0])
-    omega = math.pi * np.arange(1, max(min(cosine_count, (len(time) - 1) // 2), 1) + 1) / duration
+    omega = math.pi * np.arange(1, cosine_count + 1) / duration
     columns = np.diff(np.sin(omega * (time - time[0])[:, None]) / omega, axis=0)
     parts = [SharedNoise(name, 2.0 / duration / omega**power, limits, mean)
              for name, power, mean, limits in (
