@@ -12,11 +12,16 @@
 Measure the coverage of 95 % intervals of scale factor error and bias with a wandering bias.
 
     python benchmarks/encoder_intervals.py [RUNS]
+    python benchmarks/encoder_intervals.py motions [RUNS]
 
 Ten minutes at 20 Hz to and fro, an encoder of 0.088 deg, s = 2 %, b = 0.3 deg/s at the beginning,
 white noise of 0.3 deg/sqrt(h). Prints a table in Markdown. The true bias is the one at the
 beginning, from which it wanders; for the drift with temperature it is the mean over the log, which
 is the best for a model without a term for it.
+
+With `motions`, two minutes at 100 Hz of a robot, by hand, of a wheel, and of swings of one
+frequency, beside references of several kinds, with a bias that wanders as a Gauss-Markov process
+of 2 to 20 s; b is compared with its mean. The simulator shares nothing with the package.
 
 """
 
@@ -25,12 +30,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 import sys
+import warnings
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
 from gyro_calibration.model.motion import Motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
+from scipy.signal import lfilter
 
 SCALE_FACTOR_ERROR, BIAS, STEP, INTERVAL = 0.02, 0.3 * DEGREE, 0.088 * DEGREE, 0.05
 WHITE, FLICKER, WALK = 0.3 * DEGREE / 60, 20 * DEGREE / 3600, 1.0 * DEGREE / 3600
@@ -87,6 +95,79 @@ def table(runs: int, duration: float = 600.0) -> Iterator[str]:
                    f'| {s_stated:.5f} % | {b:.5f} deg/s | {b_stated:.5f} deg/s |')
 
 
+def moved(kind: str, count: int, generator: np.random.Generator) -> Array:
+    """Return rates at 100 Hz, rad/s, of a kind of motion."""
+    if kind == 'robot':
+        rate, row = np.zeros(count), 300
+        while row < count:
+            end = row + int(generator.uniform(100, 400))
+            rate[row:end] = generator.choice([-1.0, 1.0]) * generator.uniform(20.0, 90.0)
+            row = end + int(generator.uniform(50, 300))
+        rate = gaussian_filter1d(rate, 15.0)
+    elif kind == 'hand':
+        rate = gaussian_filter1d(generator.standard_normal(count), 25.0)
+        rate *= 60.0 / rate.std()
+    elif kind == 'wheel':
+        rate = gaussian_filter1d(np.repeat(generator.normal(0.0, 40.0, count // 200), 200), 30.0)
+    else:
+        rate = 60.0 * np.sin(2.0 * np.pi * float(kind) * np.arange(count) * 0.01)
+    return rate * DEGREE
+
+
+def referred(kind: str, heading: Array, generator: np.random.Generator) -> Array:
+    """Return headings of a kind of reference, rad."""
+    noise = generator.standard_normal(len(heading)) * DEGREE
+    if kind == 'encoder':
+        return np.round(heading / (0.088 * DEGREE)) * 0.088 * DEGREE
+    if kind == 'smoothed':
+        heading = uniform_filter1d(heading, 25)
+    elif kind == '10 Hz':
+        heading = np.where(np.arange(len(heading)) % 10 == 0, heading, np.nan)
+    return heading + (0.1 if kind == 'noisy' else 0.003) * noise
+
+
+def run_motion(case: tuple[str, str, float, int]) -> Array:
+    """Return error and standard deviation of s and b of one run, shape (2, 2), nan if refused."""
+    motion, reference, wander, seed = case
+    generator = np.random.default_rng([seed, *map(ord, motion + reference), round(1e3 * wander)])
+    time = np.arange(12000) * 0.01
+    rate = moved(motion, len(time), generator)
+    heading = np.append(0.0, np.cumsum(0.005 * (rate[1:] + rate[:-1])))
+    kept = 1.0 - 0.01 / np.exp(generator.uniform(np.log(2.0), np.log(20.0)))
+    bias = wander * DEGREE * lfilter([np.sqrt(1.0 - kept ** 2)], [1.0, -kept],
+                                     generator.standard_normal(len(time)))
+    s = generator.uniform(-0.02, 0.02)
+    output = ((1.0 + s) * rate + 0.1 * DEGREE + bias
+              + 0.05 * DEGREE * generator.standard_normal(len(time)))
+    try:
+        fit = calibrate_encoder(Log(output=output, time=time, reference_heading=referred(
+            reference, heading, generator)), 'likelihood').fit
+    except DataRefused:
+        return np.full((2, 2), np.nan)
+    return np.array([(fit.scale_factor_error - s, fit.bias - 0.1 * DEGREE - bias.mean()),
+                     np.sqrt(np.diag(fit.covariance))])
+
+
+def table_of_motions(runs: int) -> Iterator[str]:
+    yield '| motion | reference | wander, deg/s | rms error of s | standardized | refused |'
+    yield '|---|---|---|---|---|---|'
+    cases = [*((motion, reference, wander) for motion in ('robot', 'hand', 'wheel')
+               for reference in ('fine', 'noisy', 'encoder', 'smoothed', '10 Hz')
+               for wander in (0.0, 0.02, 0.2)),
+             *((hertz, reference, 0.0) for hertz in ('0.2', '0.4', '0.8')
+               for reference in ('fine', 'encoder'))]
+    with ProcessPoolExecutor(initializer=warnings.simplefilter, initargs=('ignore',)) as pool:
+        for motion, reference, wander in cases:
+            found = np.array(list(pool.map(
+                run_motion, [(motion, reference, wander, seed) for seed in range(runs)])))
+            s, ratio = np.sqrt(np.nanmean([found[:, 0, 0] ** 2,
+                                           (found[:, 0, 0] / found[:, 1, 0]) ** 2], axis=1))
+            yield (f'| {motion} | {reference} | {wander:g} | {100.0 * s:.4f} % | {ratio:.2f} '
+                   f'| {np.isnan(found[:, 0, 0]).sum()} of {runs} |')
+
+
 if __name__ == '__main__':
-    for line in table(int(sys.argv[1]) if len(sys.argv) > 1 else 400):
+    of_motions = sys.argv[1:2] == ['motions']
+    counts = [int(word) for word in sys.argv[1 + of_motions:2 + of_motions]]
+    for line in table_of_motions(*counts or [12]) if of_motions else table(*counts or [400]):
         print(line, flush=True)

@@ -476,8 +476,8 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     covariance = scatter * np.outer(widening, widening)
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
-    if motion.rate is not None:  # what priors on the response of the motion leave open
-        covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(fit.covariance[0, 0])))
+    # what the prior of the lag leaves open
+    covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(fit.covariance[0, 0])))
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
         covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error

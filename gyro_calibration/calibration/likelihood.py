@@ -16,8 +16,8 @@ trapezoid rule against the reference.
 
 Errors within a block (vibration, backlash, an eccentric encoder) are no random walk. The
 covariance of the increments is a banded matrix with one unknown ratio, which is solved exactly for
-each ratio of a grid. Blocks are shorter where the heading swings so fast that means over 0.5 s
-would attenuate it.
+each ratio of a grid. A bias may wander by a random walk, of sizes of a grid too. Blocks are
+shorter where the heading swings so fast that means over 0.5 s would attenuate it.
 
 """
 
@@ -152,6 +152,9 @@ class _Increments:
     wander_count: int = 0  # number of the last columns, of a wandering bias
 
 
+#: Factors of the prior standard deviation of a measured lag, for its wide tails, as of Student's
+#: law with two degrees of freedom: a reference may have been smoothed.
+_LAG_FACTORS = (1.0, 4.0)
 #: Sizes of a rate random walk of the bias that are possible, rad/s/√s.
 _RATE_RANDOM_WALKS = np.geomspace(1e-7, 1e-2, 6)
 #: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
@@ -206,6 +209,9 @@ class _RunAlignment:
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
         prior = np.append(self._prior_deviation, points.shared_deviation)
         prior_factors = np.insert(points.prior_factors, [0] * 4, 1.0, axis=1)
+        if self.is_measured:
+            prior_factors = np.repeat(prior_factors, len(_LAG_FACTORS), axis=0)
+            prior_factors[:, 3] = np.resize(_LAG_FACTORS, len(prior_factors))
         count = 0
         if self._bias_wanders:
             wander, (part,) = bias_wander_columns(means[:, 1], bias_instability=None)
@@ -568,6 +574,8 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
         (count - len(prior) - 1.0) * math.log(rate_variance) + dof + noise.log_determinant
         + np.sum(((values - data.prior_mean) / prior)[known] ** 2 + 2.0 * np.log(prior[known]))
         + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum())
+    if np.diag(inverse).min() < 0.0:  # an instrument without information
+        log_likelihood = -1e300
     return _Estimate(prior, values, dof / (dof - 2.0) * rate_variance * inverse, residual, dof,
                      rate_variance, noise, float(log_likelihood), weighted)
 
@@ -590,6 +598,7 @@ def _average_over_noise(data: _Increments,
     logarithms, values, covariances = (
         np.array([getattr(each, name) for each in estimates])
         for name in ('log_likelihood', 'values', 'covariance'))
+    logarithms -= 2.0 * np.log(np.tile(prior_factors[:, 3], len(noises)))
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     return (weights @ values, np.tensordot(weights, covariances, 1)
@@ -774,7 +783,8 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
                 + elapsed ** 2 * estimate.covariance[1, 1])
     of_shared = slice(4, 4 + len(shared))
     variance += shared @ estimate.covariance[of_shared, of_shared] @ shared
-    start = heading + (shared @ estimate.values[of_shared] - error - gyro_angle + bias * elapsed) / scale
+    start = heading + (shared @ estimate.values[of_shared] - error - gyro_angle
+                       + bias * elapsed) / scale
     return float(start), math.sqrt(variance) / abs(scale)
 
 
