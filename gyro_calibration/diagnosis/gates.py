@@ -59,6 +59,7 @@ from gyro_calibration.logs.log import (
 )
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    cross_rotation,
     encoder_step,
     find_codes,
     robust_deviation,
@@ -773,7 +774,8 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return (log.reference_rate is not None
                 and (is_slow(log.reference_rate)
                      or rate_noise_share(log) > _MAX_RATE_NOISE_SHARE))
-    if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
+    if (reference.kind in ('course', 'odometry') or reference.evidence == 'as given'
+            or cross_rotation(log).size):  # of which a part is in the output
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     interval = float(np.median(np.diff(log.time)))
