@@ -51,6 +51,8 @@ from gyro_calibration.calibration.heading_regression import (
 from gyro_calibration.calibration.likelihood import (
     fit_likelihood,
     MAX_BLOCK_DURATION,
+    MISALIGNMENT_REMEDY,
+    oblique_angle,
     ScaleBiasFit,
 )
 from gyro_calibration.calibration.noise_grid import (
@@ -89,6 +91,7 @@ from gyro_calibration.logs.log import (
 )
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    cross_rotation,
     encoder_step,
     find_holes,
     quantization_step,
@@ -112,6 +115,8 @@ _GYRO_LAG_DEVIATION = 2e-4
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
+#: Chance by which an axis that is parallel is stated to be oblique.
+_MISALIGNMENT_LEVEL = 0.01
 #: Share of the largest differences that show their tail, and the probability that noise alone
 #: exceeds the limit of a jump in a log.
 _TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
@@ -189,7 +194,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     """
     refuse_wrapped(log)
     log, repeated = drop_repeated_headings(log)
-    time, output, motion = _extract_motion(log)
+    time, output, motion, crossing = _extract_motion(log)
     if method is None:
         method = 'likelihood'
         if log.reference_heading is not None and log.time is not None:
@@ -200,13 +205,13 @@ def calibrate_encoder(log: Log, method: str | None = None,
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps = _bridge_jumps(log)
         if jumps:
-            time, output, motion = _extract_motion(log)
+            time, output, motion, crossing = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
         fit = fit_course(log, technology)
     else:
-        fit, bounds = _fit_encoder(time, output, motion, method, technology)
+        fit, bounds = _fit_encoder(time, output, motion, crossing, method, technology)
     model = GyroModel(
         (Term(BIAS, (fit.bias,)), Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
         fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())),
@@ -225,7 +230,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         (*repeated, *jumps, *_list_remarks(fit, method, technology)))
 
 
-def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
+def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
     limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET)
@@ -235,7 +240,8 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     # the gyro's lag is assumed to be about that of a filter of 20 ms
     fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
            fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
-                          lag_deviation=_GYRO_LAG_DEVIATION, bias_wanders=True))
+                          lag_deviation=_GYRO_LAG_DEVIATION, cross_rotation=crossing,
+                          bias_wanders=True))
     response_variance = 0.0
     if motion.rate is not None and method == 'likelihood':
         # the variance of the times by which a motion is late is seldom above their mean squared
@@ -248,6 +254,9 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     refuse_scale(fit.scale_factor_error, 'reference',
                  'give or omit --invert, or turn the gyro over')
     corrected = (output - fit.bias) / (1.0 + fit.scale_factor_error)
+    if fit.misalignment.size:  # the heading about the axis of the gyro
+        motion = replace(motion, heading=motion.heading + crossing @ fit.misalignment / (
+            1.0 + fit.scale_factor_error))
     drift = _estimate_drift(motion, _heading_residual(
         time - np.nan_to_num(fit.time_offset), corrected, motion).heading, fit.bias, technology)
     # a bias within chance that could make a heading worse
@@ -315,8 +324,8 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
         'or where rows are missing; the heading is compared before and after, not over, each jump']
 
 
-def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
-    """Return time and output of the gyro, and the reference motion, without lost samples."""
+def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
+    """Return time and output of the gyro, motion and its cross rotation, without lost samples."""
     heading, rate = log.reference_heading, log.reference_rate
     if log.time is None or log.output is None or (heading is None and rate is None):
         raise DataRefused('the log holds no reference over time: it needs the columns time_s, '
@@ -346,7 +355,8 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
     if motion.duration > 1e8:  # three years
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
                           'check that time_s is in s, or give --rate')
-    return log.time[output_known] - start, log.output[output_known], motion
+    return (log.time[output_known] - start, log.output[output_known], motion,
+            cross_rotation(log)[reference_known])
 
 
 def _find_holes(time: Array) -> Array:
@@ -480,8 +490,11 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(fit.covariance[0, 0])))
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
         covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
+    # the components of a misalignment scatter as the scale factor error does
+    widening = covariance[0, 0] / np.nan_to_num(fit.covariance[0, 0], nan=math.inf)
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
-                   + float(slope) * (drift.bias - fit.bias), covariance=covariance)
+                   + float(slope) * (drift.bias - fit.bias), covariance=covariance,
+                   misalignment_covariance=max(widening, 1.0) * fit.misalignment_covariance)
 
 
 def _scatter_between(group: NDArray[np.intp], influence: Array) -> Array:
@@ -508,6 +521,12 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
         yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
+    if fit.misalignment.size:
+        angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
+        if chance < _MISALIGNMENT_LEVEL:
+            yield (f'the axis of the gyro is oblique to that of the attitude by '
+                   f'{angle / DEGREE:.2f} +- {half / DEGREE:.2f} deg (95 %), so that parts of the '
+                   f'rotations about other axes are in the output: {MISALIGNMENT_REMEDY}')
     if method == 'course':
         if fit.reference_drift is not None:
             rate, half = (each / DEGREE for each in fit.reference_drift)

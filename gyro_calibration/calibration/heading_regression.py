@@ -24,7 +24,9 @@ with the integrals ``J``. A point is the mean over some samples; the observation
 differences between points, so that a gap of the reference is a long span. A rest is one more
 observation: a turn by 0; the spans do not contain it. It is in a gap, as of a vehicle whose course
 is lost then, or the reference stands, as odometry does, which may drift in motion; then the drift
-is one more value, and the rests determine the bias. What differs between the kinds of references
+is one more value, and the rests determine the bias. An attitude shows the rotation about the two
+axes across that of the gyro too; as the axes of gyro and reference are never exactly parallel,
+parts of it, two more values, are in the output. What differs between the kinds of references
 is in `ReferenceTreatment`. The computing time is proportional to the number of spans.
 
 A course over ground, the direction of travel by satellites, differs from the heading by the side
@@ -77,9 +79,11 @@ from gyro_calibration.logs.log import (
 )
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    cross_rotation,
     encoder_step,
     find_holes,
     mark_rows,
+    MISALIGNMENT_DEVIATION,
     quantization_step,
     robust_deviation,
     white_noise_deviation,
@@ -176,13 +180,13 @@ class CauseTerm(NamedTuple):
     @property
     def value_count(self) -> int:
         """Return the number of its columns."""
-        if self.cause == 'reference_once_per_rev':
+        if self.cause in ('reference_once_per_rev', 'axis_misalignment'):
             return 2
         effect = CATALOGUE.get(self.cause)
         return max(len(effect.coefficients), 1) if effect is not None else 1
 
 
-_CLOCK_TERM = CauseTerm('clock_rate')
+_CLOCK_TERM, MISALIGNMENT_TERM = CauseTerm('clock_rate'), CauseTerm('axis_misalignment')
 
 
 @dataclass(frozen=True)
@@ -211,6 +215,11 @@ class Spans:
     adds_up: bool  # whether the reference is never lost, as odometry, which adds up its errors
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
+
+    @cached_property
+    def cross_rotation(self) -> Array:
+        """Return the rotation of the reference about the cross axes, rad, (m, 2) or (m, 0)."""
+        return cross_rotation(self.log)
 
     @cached_property
     def is_measured(self) -> Mask:
@@ -254,9 +263,16 @@ class Spans:
         return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
     def all_causes(self, causes: Sequence[CauseTerm]) -> list[CauseTerm]:
-        """Return causes, after the drift of a reference that stands, which is always fitted."""
-        own = [CauseTerm('reference_drift')] * bool(self.stands.any())
+        """Return causes, after those that are always fitted, misalignment and drift."""
+        own = [MISALIGNMENT_TERM] * bool(self.cross_rotation.size)
+        own += [CauseTerm('reference_drift')] * bool(self.stands.any())
         return [*dict.fromkeys([*own, *causes])]
+
+    def prior_deviations(self, causes: Sequence[CauseTerm]) -> Array:
+        """Return the prior standard deviations of the values, infinite of most causes."""
+        return np.concatenate([self.treatment.prior, *(
+            np.full(each.value_count, MISALIGNMENT_DEVIATION if each == MISALIGNMENT_TERM
+                    else math.inf) for each in self.all_causes(causes))])
 
     def value_slice(self, causes: Sequence[CauseTerm], cause: CauseTerm) -> slice:
         """Return the places of the values of one of the causes."""
@@ -346,6 +362,11 @@ class Spans:
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
+        if cause == MISALIGNMENT_TERM:
+            means = [np.bincount(self.point_index, np.interp(self.value_times, time, each))
+                     / np.bincount(self.point_index) for each in self.cross_rotation.T]
+            return np.pad(np.diff(means), ((0, 0), (0, len(self.rests)))).T * np.where(
+                self.is_measured, -1.0, 0.0)[:, None]
         if cause.cause == 'reference_drift':
             return self.span_changes(self.time_in_motion)[:, None]
         if cause.cause == 'reference_slip':
@@ -610,9 +631,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
 
     """
     given, causes = causes, spans.all_causes(causes)
-    prior = np.array(spans.treatment.prior)
-    free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
-
+    free = spans.prior_deviations(causes)
     count = len(spans.time) - 1
     delayed = replace(spans, delay=spans.delay or find_delay(spans))
     point_variances: Array = np.ones(count + 1)
@@ -728,8 +747,7 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     rates = spans.point_means(np.asarray(spans.channels.rate))
     in_motion = spans.point_means(spans.time_in_motion) + spans.time_outside
     durations = spans.rest_durations
-    prior = spans.treatment.prior
-    deviation = np.append(prior, np.full(columns.shape[1] - len(prior), np.inf))
+    prior, deviation = spans.treatment.prior, spans.prior_deviations(causes)
     observed, (waves, shared) = spans.observed, spans.bias_wander()
 
     def fit_with(correlation: Array | None = None, reference_walk: Array | None = None,
@@ -896,10 +914,8 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
         size = noise.sizes[part.name][2] if use_max else noise.likeliest_sizes[part.name]
         variance += size ** 2 * part.variance
     columns = np.column_stack([design_matrix(spans, causes), waves])
-    width = columns.shape[1] - waves.shape[1]
-    prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
-    prior[:3, :3] = np.diag(1.0 / np.array(spans.treatment.prior))
-    prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
+    deviation = np.append(spans.prior_deviations(causes), np.sqrt(variance))
+    prior = np.diag(1.0 / deviation)[np.isfinite(deviation)]
     stretches = spans.stretch_numbers
     sectors = [spans.shaft_sectors] if spans.uses_code_changes else []
     clusters = tuple(np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
@@ -943,13 +959,20 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                           'does not follow the course. Check that both belong to one drive, and '
                           'check axis, sign, units, and that the gyro responds')
     covariance = fit.normal_covariance
-    scale, bias, delay, *drifts = fit.values.tolist()
-    drift = (drifts[0], fit.half_width(len(BASE_VALUES))) if drifts else None
+    axes = (fit.value_slice(MISALIGNMENT_TERM) if MISALIGNMENT_TERM in fit.causes
+            else slice(0))
+    scale, bias, delay = fit.values[:len(BASE_VALUES)].tolist()
+    drift = None
+    if spans.stands.any():
+        place = fit.value_slice(CauseTerm('reference_drift')).start
+        drift = float(fit.values[place]), fit.half_width(place)
     return ScaleBiasFit(scale, bias, covariance[:2, :2], delay,
                         fit.noise_size('angle_random_walk'), fit.noise_size('reference'),
                         time_offset_deviation=math.sqrt(covariance[2, 2]), reference_drift=drift,
                         # a course may be lost in the rests before and after the drive alone
-                        reference_adds_up=spans.adds_up and bool(spans.stands.all()))
+                        reference_adds_up=spans.adds_up and bool(spans.stands.all()),
+                        misalignment=fit.values[axes],
+                        misalignment_covariance=covariance[axes, axes])
 
 
 def find_drift(log: Log) -> tuple[float, float] | None:
@@ -1017,14 +1040,14 @@ def is_noisy(log: Log) -> bool:
     """
     Tell whether a heading errs like a course.
 
-    It has no steps and is as noisy from span to span, or it drifts in motion.
+    It has no steps, is no attitude, and is as noisy from span to span; or it drifts in motion.
 
     """
     assert log.reference_heading is not None
     if find_drift(log) is not None:
         return True
-    if quantization_step(log.reference_heading[np.isfinite(log.reference_heading)]
-                         ) > MAX_ROUNDING_STEP:
+    if cross_rotation(log).size or quantization_step(
+            log.reference_heading[np.isfinite(log.reference_heading)]) > MAX_ROUNDING_STEP:
         return False
     spans = lay_out_spans(log)
     count = len(spans.time) - 1

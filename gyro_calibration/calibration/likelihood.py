@@ -29,8 +29,8 @@ import math
 
 from gyro_calibration.calibration.noise_grid import bias_wander_columns, TridiagonalMatrix
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused
-from gyro_calibration.logs.quality import encoder_step
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
+from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,31 @@ class ScaleBiasFit:
     # 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
     reference_adds_up: bool = False  # whether the reference adds up its errors, as odometry
+    # components of the axis of the gyro along the cross axes of the reference, rad, shape (k,),
+    # and their covariance, shape (k, k); k is 2 where it shows the rotation about these, else 0
+    misalignment: Array = field(default_factory=lambda: np.empty(0))
+    misalignment_covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+
+#: What to do about an oblique axis.
+MISALIGNMENT_REMEDY = ('turn the axes of the attitude into those of the gyro, or turn about one '
+                       'axis only; the model of one axis does not contain it')
+
+
+def oblique_angle(misalignment: Array, covariance: Array) -> tuple[float, float, float]:
+    """
+    Return the angle of a misalignment, rad, half its interval of 95 %, and its p-value.
+
+    Parameters
+    ----------
+    misalignment, covariance : of the two components, shapes (2,) and (2, 2), rad and rad²
+
+    """
+    angle = float(np.hypot(*misalignment))
+    along = misalignment / max(angle, 1e-300)
+    square = float(misalignment @ np.linalg.pinv(covariance) @ misalignment)
+    return (angle, NORMAL_QUANTILE_975 * math.sqrt(along @ covariance @ along),
+            math.exp(-0.5 * square))  # the chi-squared distribution of two degrees of freedom
 
 
 #: Limit of significance, standard deviations: noise does not exceed it in 10 000 stretches a run,
@@ -174,7 +199,7 @@ class _RunAlignment:
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
                  slip_deviation: float, excess_turn: tuple[float, float] | None,
-                 bias_wanders: bool):
+                 cross_rotation: Array, bias_wanders: bool):
         self._time, self._rate = time, rate
         self._prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
@@ -182,7 +207,7 @@ class _RunAlignment:
         self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
-                                                excess_turn)
+                                                excess_turn, cross_rotation)
 
     def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
         """
@@ -313,16 +338,18 @@ def block_duration(motion: Motion) -> float:
 
 
 def _select_reference_points(motion: Motion, block: float, slip_deviation: float,
-                             excess_turn: tuple[float, float] | None) -> _ReferencePoints:
+                             excess_turn: tuple[float, float] | None,
+                             cross_rotation: Array) -> _ReferencePoints:
     """Return where a motion is known: at its samples, or for an encoder where it steps."""
     if motion.rate is not None:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
                                 *tracking_error_columns(motion, time, slip_deviation, excess_turn))
     step = encoder_step(motion.heading)
-    if not step:
+    if not step or cross_rotation.size:
+        ones = np.ones(cross_rotation.shape[1])
         return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
-                                np.empty((len(motion.time), 0)))
+                                cross_rotation, MISALIGNMENT_DEVIATION * ones, ones[None])
     step_crossings = _find_step_crossings(motion, step)
     constant_readings = _find_constant_readings(motion, step, block)
     order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
@@ -647,6 +674,7 @@ def _nonzero_scale(scale: float) -> float:
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
                    lag_deviation: float = LAG_DEVIATION, slip_deviation: float = 0.0,
                    excess_turn: tuple[float, float] | None = None,
+                   cross_rotation: Array | None = None,
                    bias_wanders: bool = False) -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset by likelihood.
@@ -676,6 +704,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         fraction of it
     excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides a profile;
         the bias is then that of the rest after it. None without one
+    cross_rotation : of the motion about the two axes across that of the reference, at the times of
+        a measured motion, rad, shape (n, 2) or (n, 0); None where it is not known
     bias_wanders : whether it may do so by a random walk; it is then the mean over the motion
 
     Raises
@@ -683,8 +713,10 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     DataRefused : gyro and motion hardly overlap
 
     """
+    if cross_rotation is None:
+        cross_rotation = np.empty((len(motion.time), 0))
     alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn,
-                              bias_wanders)
+                              cross_rotation, bias_wanders)
     offset, data, averages, averaged_covariance, estimate = _fit_offset(
         alignment, largest_time_offset)
     values, covariance = estimate.values[:2], averaged_covariance[:2, :2]
@@ -706,6 +738,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     slips = averages[data.prior_deviation == slip_deviation]
     slips = slips[:len(slips) // 2]
     slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
+    of_axes = slice(4, 4 + cross_rotation.shape[1])
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     # a profile itself has no noise, so that the ratio of the noises is not estimated
     alone_noise = _IncrementCovariance(data, 0.0)
@@ -722,7 +755,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         math.sqrt(averaged_covariance[2, 2]),
         np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end),
         *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
-        residual_squares, dof, slip_deviation=slip)
+        residual_squares, dof, slip_deviation=slip, misalignment=estimate.values[of_axes],
+        misalignment_covariance=averaged_covariance[of_axes, of_axes])
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[

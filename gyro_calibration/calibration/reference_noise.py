@@ -25,6 +25,7 @@ from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    cross_rotation,
     find_runs,
     quantization_step,
     white_noise_deviation,
@@ -132,8 +133,8 @@ def heading_difference(log: Log) -> HeadingDifference:
     Separate the difference of the headings of gyro and reference by its growth over time.
 
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    a lag and a scale factor of the motion are fitted. An error that was smoothed shows at lags
-    beyond its time constant.
+    a lag, a scale factor and a misalignment of the axis are fitted. An error that was smoothed
+    shows at lags beyond its time constant.
 
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
@@ -144,6 +145,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     turned, slope, output, heading, time = (each[own] for each in (
         integrate_with_curvature(log.time, output), np.gradient(output, log.time), output,
         log.reference_heading, log.time))
+    crossing = cross_rotation(log)[own].T
     # a slow reference has its values at the samples next to its own instants
     apart = np.diff(time)
     interval = float(apart[apart < 2.0 * np.median(apart)].mean())
@@ -151,7 +153,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
         off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
-                         for each in (heading - turned, turned, output, slope))
+                         for each in (heading - turned, turned, output, slope, *crossing))
         known = np.abs(time[2 * lag:] - time[:-2 * lag] - 2.0 * lag * interval) < interval
         if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
             columns = np.column_stack(motions)[known]
@@ -223,12 +225,17 @@ def _select_quietest(fast: Array, block: int) -> Mask:
 
 
 def is_course(log: Log) -> bool:
-    """Tell whether a heading is lost at times, as a course at low speed, and errs like one."""
+    """
+    Tell whether a heading is lost at times, as a course at low speed, and errs like one.
+
+    A direction of travel has no rotation about other axes, so an attitude is none.
+
+    """
     log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
     lost = float(find_lost_reference(known).mean())
-    if lost == 0.0:
+    if lost == 0.0 or cross_rotation(log).size:
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))

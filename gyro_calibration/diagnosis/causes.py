@@ -78,6 +78,9 @@ _OTHER_CAUSES = (
     ('reference_drift', 'The reference drifts in motion, and stands at rest, as odometry does.',
      'rad/s', 'reference', 'time reference_heading', 'time',
      CATALOGUE['vibration_rectification'].experiment),
+    ('axis_misalignment', 'The axis of the gyro is oblique to that of the attitude: parts of the '
+     'rotations about other axes are in the output.', 'rad', 'reference', 'time cross_axis_1',
+     'heading', ''),
     ('reference_lag', 'The motion follows the reference rate with a lag of its own, as a robot '
      'follows its command.', 's', 'reference', 'time reference_rate', 'rate_change', ''),
     ('reference_quantization', 'The reference heading is quantized, so that its rate between '

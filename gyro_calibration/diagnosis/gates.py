@@ -59,6 +59,7 @@ from gyro_calibration.logs.log import (
 )
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    cross_rotation,
     encoder_step,
     find_codes,
     robust_deviation,
@@ -470,6 +471,8 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: Least residual over the longest spans, and least rotation of the reference, rad, for which
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
+#: Chance by which the white noise of a gyro is taken for turns of its own.
+_NOISE_LEVEL = 0.01
 #: Relative difference of mean rates over spans that is rounding.
 _EQUAL_RATES = 1e-9
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
@@ -484,7 +487,7 @@ class Agreement(NamedTuple):
     deviation: float
     coherence: float  # common share of the variance
     residual: float  # standard deviation, rad
-    noise_share: float  # share of the variance of the integral that is white noise of the output
+    noise_share: float  # largest share of the variance of the integral that may be white noise
 
     def is_followed(self) -> bool:
         """Tell whether the reference may have made half the turns of the gyro, at least."""
@@ -670,6 +673,12 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
     """Return the agreement without outlying spans."""
     scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
+
+    def variance_of(values: Array) -> float:
+        """Return the variance in the kept spans without what a steady rate turns in each."""
+        time, values = steps[kept], values[kept]
+        return float(np.var(values - time * (time @ values) / (time @ time)))
+
     turned = np.abs(gyro), np.abs(change)
     kept = np.ones(len(change), dtype=bool)
     for _ in range(3):
@@ -677,19 +686,16 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
         off = change - columns @ values
         kept = np.abs(off) <= 6.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-15
         # With long rests, all turns of the gyro are outlying if the reference makes others; and
-        # with a commanded rate that stays the same, all others.
+        # with a rate that stays the same, all others, while the rest has nothing in common.
         if (kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum()
-                or _are_equal(change[kept] / steps[kept])):
+                or np.var(off[kept]) >= (1.0 - _MIN_MOTION_COHERENCE) * variance_of(change)):
             kept[:] = True
-    variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
-    if (left >= (1.0 - _MIN_MOTION_COHERENCE) * variance
-            and turned[1][kept].sum() < 0.5 * turned[1].sum()):
-        # those of the reference are outlying, and the rest agrees no better
-        variance, left = float(np.var(change)), float(np.var(off))
+    variance, left = variance_of(change), float(np.var(off[kept]))
     coherence = max(1.0 - left / variance, 0.0) if variance > 0.0 else 0.0
     deviation = math.sqrt(
-        left / max(kept.sum() - 2, 1) / max(float(np.var(columns[kept, 0])), 1e-300))
-    noise_share = white * float(steps[kept].mean()) / max(float(np.var(gyro[kept])), 1e-300)
+        left / max(kept.sum() - 2, 1) / max(variance_of(gyro) / scale ** 2, 1e-300))
+    noise_share = (white * float(steps[kept].mean()) / max(variance_of(gyro), 1e-300)
+                   * float(stats.chi2.isf(_NOISE_LEVEL, kept.sum())) / kept.sum())
     return Agreement(float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left),
                      min(noise_share, 1.0))
 
@@ -773,7 +779,8 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return (log.reference_rate is not None
                 and (is_slow(log.reference_rate)
                      or rate_noise_share(log) > _MAX_RATE_NOISE_SHARE))
-    if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
+    if (reference.kind in ('course', 'odometry') or reference.evidence == 'as given'
+            or cross_rotation(log).size):  # of which a part is in the output
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     interval = float(np.median(np.diff(log.time)))

@@ -37,11 +37,13 @@ from gyro_calibration.calibration.heading_regression import (
     HEADING_TREATMENT,
     lay_out_spans,
     MIN_STRETCHES,
+    MISALIGNMENT_TERM,
     SpanFit,
     Spans,
     whiten_regression,
     WhitenedRegression,
 )
+from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.own_instants import OwnInstants
 from gyro_calibration.diagnosis.candidates import (
     lasting_shapes,
@@ -182,7 +184,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     of_heading = heading_error_shares([(parts, time)],
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
     findings = [*_value_findings(extended, model, false_alarm_rate, reference),
-                *_drift_findings(extended, false_alarm_rate), *record.findings,
+                *_reference_findings(extended, false_alarm_rate), *record.findings,
                 *(each for cause in found for each in [_cause_finding(cause, extended)]
                   if not each.parameters[each.effect].contains_zero)]
     findings = mark_parts_of_log(findings)
@@ -256,11 +258,20 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                            evidence=f'evidence from {effective:.0f} stretches', **known)
 
 
-def _drift_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
-    """Give the drift of a reference in motion against the rests in which it stands."""
-    name, place = 'reference_drift', len(BASE_VALUES)
-    if name not in {each.cause for each in fit.causes}:
+def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
+    """Give the misalignment, and the drift of a reference against the rests in which it stands."""
+    if MISALIGNMENT_TERM in fit.causes:
+        name, places = MISALIGNMENT_TERM.cause, fit.value_slice(MISALIGNMENT_TERM)
+        angle, half, chance = oblique_angle(fit.values[places], fit.normal_covariance[
+            places, places])
+        if chance < false_alarm_rate:
+            yield make_finding(
+                name, {name: Estimate.from_half_width(angle, half, CAUSES[name].unit)},
+                max(chance, MIN_PROBABILITY), remedy=MISALIGNMENT_REMEDY)
+    name = 'reference_drift'
+    if CauseTerm(name) not in fit.causes:
         return
+    place = fit.value_slice(CauseTerm(name)).start
     deviation = math.sqrt(fit.covariance[place, place])
     chance = float(2.0 * student.sf(abs(fit.values[place]) / deviation, fit.freedom[place]))
     if chance < false_alarm_rate:
@@ -447,7 +458,9 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     # under the noise of the plain fit, given the prior of the wandering bias
     noisy = whiten_regression(plain, ())
     prior = len(noisy.observed) - len(spans.observed)
-    models = {'given': (spans.base_columns()[:, 2:], noisy.design[:, 2:]),
+    # a misalignment is of no model
+    given = slice(2, 3 + spans.cross_rotation.shape[1])
+    models = {'given': (design_matrix(spans, ())[:, given], noisy.design[:, 2:]),
               'plain': (design_matrix(spans, ()), noisy.design),
               'extended': (design_matrix(extended.spans, extended.causes),
                            whiten_regression(extended, extended.causes, plain).design)}
@@ -481,7 +494,8 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
         if plain.lacks_turns and _follows_the_rate(cause.name):
             return ('fewer than three stretches turn, which do not distinguish it from a scale '
                     'factor error')
-        return {'reference_drift': 'the reference is known in no rest',
+        return {'axis_misalignment': 'the reference is planar',
+                'reference_drift': 'the reference is known in no rest',
                 'reference_once_per_rev': 'a course over ground has no shaft'}.get(
                     cause.name, 'the errors of the reference hide it over short spans')
 

@@ -40,13 +40,19 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
     'reference_rate_dps': ('reference_rate', DEGREE),
     'reference_heading_rad': ('reference_heading', 1.0),
     'reference_heading_deg': ('reference_heading', DEGREE),
+    'cross_axis_1_rad': ('cross_axis_1', 1.0),
+    'cross_axis_1_deg': ('cross_axis_1', DEGREE),
+    'cross_axis_2_rad': ('cross_axis_2', 1.0),
+    'cross_axis_2_deg': ('cross_axis_2', DEGREE),
     'acceleration_mps2': ('specific_force', 1.0),
     'supply_v': ('supply', 1.0),
     'moving': ('moving', 1.0),
 }
 QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
-#: Parts of a quaternion, from which a reader computes the reference heading.
+#: Parts of a quaternion, from which a reader computes the reference heading and `ROTATIONS`.
 ATTITUDE = ('attitude_w', 'attitude_x', 'attitude_y', 'attitude_z')
+#: The rotation about the axis of the gyro and about the next two, in the order x, y, z, x, y.
+ROTATIONS = ('reference_heading', 'cross_axis_1', 'cross_axis_2')
 #: Axes of a gyro; column names may contain one, such as gyro_x_dps.
 AXES = ('x', 'y', 'z')
 

@@ -53,6 +53,7 @@ from gyro_calibration.logs.columns import (
     find_columns,
     is_header,
     QUANTITIES,
+    ROTATIONS,
     suggest_columns,
 )
 import numpy as np
@@ -85,7 +86,7 @@ MAX_TIME = 1e12
 _ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
 _MAX_MAGNITUDES = {'temperature': 1e5}
-_NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading', *ATTITUDE)
+_NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
 #: Line numbers of the rows and the line after, quantity -> values in SI, other columns as text.
 _ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
@@ -119,6 +120,9 @@ class Log:
     specific_force: Array | None = None  # along the input axis, m/s²
     supply: Array | None = None  # V
     moving: Array | None = None  # 1 or 0
+    # rotation of the reference about the next two axes of the sensor, rad; nan where lost
+    cross_axis_1: Array | None = None
+    cross_axis_2: Array | None = None
     notes: tuple[str, ...] = ()  # the lines before the header, without their '#'
     # other columns of the file, as text; the second of two equal names becomes `name.1`
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -509,25 +513,26 @@ class _AxisRotation:
 
     def __init__(self, axis: str):
         self._axis = AXES.index(axis)
-        self._angle, self._output = 0.0, np.empty((0, 3))  # time, output and its integral
+        self._angles = np.zeros(3)  # about the axis and the next two
+        self._output = np.empty((0, 3))  # time, output and its integral
         self._last = np.empty((0, 6))  # time, integral of the output, quaternion
 
     def replace_attitude(self, arrays: dict[str, Array]) -> None:
-        """Replace the parts of a quaternion, in quantity -> values, by the reference heading."""
+        """Replace the parts of a quaternion, in quantity -> values, by the `ROTATIONS`."""
         if ATTITUDE[0] not in arrays:
             return
         attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
         known = np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < 0.4  # as in recordings
         time, by_gyro = self._integrate_output(arrays, len(attitude))
-        heading = np.full(len(attitude), np.nan)
+        angles = np.full((len(attitude), 3), np.nan)
         if known.any():
             rows = np.column_stack([time, by_gyro, attitude])[known]
             path = np.concatenate([self._last, rows])
             turned = self._turned(path)[max(len(self._last) - 1, 0):]
-            angles = self._angle + np.cumsum(turned)
-            heading[known] = angles if len(self._last) else np.concatenate([[0.0], angles])
-            self._angle, self._last = float(heading[known][-1]), rows
-        arrays['reference_heading'] = heading
+            turned = turned if len(self._last) else np.insert(turned, 0, 0.0, axis=0)
+            angles[known] = self._angles + np.cumsum(turned, axis=0)
+            self._angles, self._last = angles[known][-1], rows
+        arrays |= zip(ROTATIONS, angles.T)
 
     def _integrate_output(self, arrays: Mapping[str, Array], count: int) -> tuple[Array, Array]:
         """Return time, s or rows, and the integral of the output, rad, nan without an output."""
@@ -546,21 +551,23 @@ class _AxisRotation:
         return time, angle
 
     def _turned(self, path: Array) -> Array:
-        """Return the angles from row to row of time, integral and quaternion, rad, (n - 1,)."""
+        """Return the angles from row to row of time, integral and quaternion, rad, (n - 1, 3)."""
         if len(path) < 2:
-            return np.empty(0)
+            return np.empty((0, 3))
         time, apart, by_gyro = path[:, 0], np.diff(path[:, 0]), np.diff(path[:, 1])
         attitude = Rotation.from_quat(path[:, [3, 4, 5, 2]])
         step = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
         usual = apart < 1.5 * np.median(apart)
-        turned = step[:, self._axis].copy()
-        coning = np.cross(step[:-1], step[1:])[:, self._axis] / 12.0
-        turned[1:] -= np.where(usual[:-1] & usual[1:], coning, 0.0)
+        coning = np.cross(step[:-1], step[1:]) / 12.0
+        turned = step.copy()
+        turned[1:] -= np.where((usual[:-1] & usual[1:])[:, None], coning, 0.0)
+        turned = np.roll(turned, -self._axis, axis=1)
         gap = np.flatnonzero(~usual)
         if not len(gap) or not np.isfinite(by_gyro).all():
             return turned
-        drift = abs((by_gyro - turned)[usual].sum()) / apart[usual].sum()
-        turned[gap] += 2.0 * np.pi * np.rint((by_gyro - turned)[gap] / (2.0 * np.pi))
+        difference = by_gyro - turned[:, 0]
+        drift = abs(difference[usual].sum()) / apart[usual].sum()
+        turned[gap, 0] += 2.0 * np.pi * np.rint(difference[gap] / (2.0 * np.pi))
         # the coning that rotations as long as the gap, before and after it, would add
         first = np.searchsorted(time, time[gap] - apart[gap])
         last = np.minimum(np.searchsorted(time, time[gap + 1] + apart[gap]), len(time) - 1)
@@ -571,7 +578,7 @@ class _AxisRotation:
             added = np.linalg.norm(np.cross(step[gap], near), axis=1) * longer / 12.0
             largest = np.maximum(largest, added)
         unsure = gap[largest > drift * apart[gap]]
-        turned[unsure] = by_gyro[unsure]
+        turned[unsure] = np.column_stack([by_gyro[unsure], np.zeros((len(unsure), 2))])
         return turned
 
 

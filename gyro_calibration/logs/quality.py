@@ -16,10 +16,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
+from gyro_calibration.logs.columns import ROTATIONS
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
 from scipy.special import ndtri
 
+#: Standard deviation of the misalignment of the axes of gyro and reference, rad, as the cross-axis
+#: sensitivity in data sheets of MEMS gyros (MPU-6050: 2 %).
+MISALIGNMENT_DEVIATION = 0.02
 #: Least alignment of codes on a lattice (length of the mean phasor): 1 for exact codes, 0 for
 #: continuous values.
 _MIN_ALIGNMENT = 0.7
@@ -42,6 +46,24 @@ def bridge_gaps(values: Array) -> Array:
         return values
     places = np.arange(len(values))
     return np.interp(places, places[known], values[known])
+
+
+def cross_rotation(log: Log) -> Array:
+    """
+    Return the rotation about the cross axes, rad, gaps bridged, (n, 2); (n, 0) if it is planar.
+
+    It is planar if by a usual misalignment it turns the heading by less than the white noise of
+    the gyro does.
+
+    """
+    given = [getattr(log, name) for name in ROTATIONS[1:]]
+    if log.time is None or log.output is None or any(
+            each is None or np.isfinite(each).sum() < 2 for each in given):
+        return np.empty((len(log), 0))
+    turned, interval = np.column_stack([bridge_gaps(each) for each in given]), np.diff(log.time)
+    noise = white_noise_deviation(log.output) * math.sqrt(np.median(interval) * interval.sum())
+    is_planar = MISALIGNMENT_DEVIATION * np.ptp(turned, axis=0).max() <= noise
+    return turned[:, :0] if is_planar else turned
 
 
 def white_noise_deviation(values: Array, order: int = 3) -> float:

@@ -18,7 +18,13 @@ from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, unwrap_heading
+from gyro_calibration.logs.log import (
+    DataRefused,
+    DEGREE,
+    Log,
+    log_from_table,
+    unwrap_heading,
+)
 import numpy as np
 import pytest
 
@@ -46,6 +52,22 @@ def tumbling(log):
     tilt = np.cos(0.9 * TIME)
     return replace(
         log, output=log.output * tilt + 1.5 * np.sin(0.13 * TIME) * np.sqrt(1.0 - tilt**2))
+
+
+@pytest.mark.parametrize('ramps', [False, True])
+@pytest.mark.parametrize('digits', [6, 9])
+def test_an_attitude_that_turns_at_one_rate_is_no_unit_error(ramps, digits):
+    time = np.arange(0.0, 120.0, 1.0 / 70.7)  # spans of unequal length
+    rate = 30.0 * DEGREE * np.clip(np.minimum(time - 5.0, 115.0 - time), 1.0 - ramps, 1.0)
+    half = 0.5 * np.cumsum(rate) / 70.7
+    log = log_from_table({
+        'time_s': time, 'qw': np.cos(half).round(digits), 'qz': np.sin(half).round(digits),
+        'qx': 0.0 * time, 'qy': 0.0 * time,
+        'gyro_rad_s': 1.01 * np.interp(time - 0.03, time, rate)
+        + 3e-4 * np.random.default_rng(1).standard_normal(len(time))},
+        {'attitude': 'qw/qx/qy/qz'})
+    gates = {each.name: each.passed for each in check_gates(log)}
+    assert gates.get('unit', True) and gates['motion'] is (True if ramps else None)
 
 
 @pytest.mark.parametrize('frequency, delay', [(0.265, 0.083), (0.307, 0.064), (0.344, 0.055)])

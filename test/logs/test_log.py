@@ -397,6 +397,15 @@ def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(
         np.testing.assert_allclose(heading[:400], turned[:400], atol=2e-5)
         # over the gap of 0.1 s, the angle by an output without errors
         np.testing.assert_allclose(heading[known], turned[known], atol=5e-5)
+    across = np.cumsum(0.5e-3 * (rates[1:, :2] + rates[:-1, :2]), axis=0)[19::20]
+    for log in found:
+        for angle, true in zip((log.cross_axis_1, log.cross_axis_2), across.T):
+            np.testing.assert_allclose(angle[1:400], true[:399], atol=2e-5)
+    np.testing.assert_array_equal(read_log(path, columns=names, axis='y').cross_axis_2[:400],
+                                  found[0].cross_axis_1[:400], 'the order is x, y, z, x, y')
+    write_log(tmp_path / 'again.csv', found[0])
+    np.testing.assert_array_equal(read_log(tmp_path / 'again.csv').cross_axis_2,
+                                  found[0].cross_axis_2)
 
 
 @pytest.mark.parametrize('tumbles', [True, False])

@@ -1,0 +1,72 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+
+from dataclasses import replace
+
+from attitudes import attitude_log, BIAS, SCALE, tumbling
+from chance import fewest, seeded
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.heading_regression import fit_spans, lay_out_spans
+from gyro_calibration.calibration.reference_noise import heading_difference
+from gyro_calibration.logs.log import DEGREE, log_from_table
+from gyro_calibration.logs.quality import cross_rotation
+import numpy as np
+import pytest
+
+
+def test_scale_and_bias_hold_beside_an_oblique_axis():
+    logs, source = 30, seeded('an oblique axis')
+    inside, axes = np.zeros(2, dtype=int), 0
+    for _ in range(logs):
+        misalignment = source.uniform(-0.7, 0.7, 2) * DEGREE
+        fit = calibrate_encoder(attitude_log(source.integers(2**32), misalignment)).fit
+        off = np.array([fit.scale_factor_error - SCALE, fit.bias - BIAS])
+        inside += np.abs(off) < 1.96 * np.sqrt(np.diag(fit.covariance))
+        axes += np.sum(np.abs(fit.misalignment - misalignment)
+                       < 1.96 * np.sqrt(np.diag(fit.misalignment_covariance)))
+    assert (inside >= fewest(logs, 0.9)).all() and axes >= fewest(2 * logs, 0.88)
+
+
+@pytest.mark.parametrize('method', [None, 'course'])
+def test_an_oblique_axis_is_stated_and_a_parallel_one_is_not(method):
+    for seed, misalignment in ((1, (0.0, 0.0)), (2, (0.5 * DEGREE, -0.3 * DEGREE))):
+        found = calibrate_encoder(attitude_log(seed, misalignment), method)
+        stated = [each for each in found.remarks if 'the axis of the gyro is oblique' in each]
+        assert len(stated) == any(misalignment)
+        assert not stated or 'by 0.58 +- 0.0' in stated[0], stated
+        assert found.method == (method or 'likelihood')
+
+
+def test_rotations_about_other_axes_are_no_noise_of_the_reference():
+    log = attitude_log(3, (0.01, 0.01), sizes=(20.0, 90.0, 90.0))
+    without = replace(log, cross_axis_1=None)
+    least, most = (heading_difference(each).total_walk for each in (log, without))
+    assert most > 0.5 * DEGREE > 4.0 * least
+
+
+def test_a_planar_attitude_gives_the_answers_of_its_heading():
+    table, rates = tumbling(4, noise=0.0)
+    turned = np.cumsum(rates[:, 2]) * 0.01
+    noise = 1e-3 * np.random.default_rng(4).standard_normal(len(turned))
+    half = 0.5 * (turned + noise)
+    planar = log_from_table(table | {'qw': np.cos(half), 'qx': 0.0 * half, 'qy': 0.0 * half,
+                                     'qz': np.sin(half)}, {'attitude': 'qw/qx/qy/qz'})
+    alone = replace(planar, cross_axis_1=None, cross_axis_2=None)
+    # a wobble that the gyro could not show is no rotation either
+    wobble = 0.2 * DEGREE * np.sin(planar.time)
+    for log in (planar, replace(planar, cross_axis_1=wobble, cross_axis_2=wobble)):
+        assert cross_rotation(log).shape == (len(log), 0)
+        (fit, other), (spans, others) = zip(
+            *((calibrate_encoder(each).fit, fit_spans(lay_out_spans(each, 'motion_capture')))
+              for each in (log, alone)))
+        assert (fit.covariance == other.covariance).all() and fit.bias == other.bias
+        assert (spans.values == others.values).all()
+        assert (spans.covariance == others.covariance).all()
