@@ -39,6 +39,7 @@ from gyro_calibration.diagnosis.replay import (
     Replay,
     spline_derivative_gain,
 )
+from gyro_calibration.diagnosis.search import VALUE_PENALTY
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
@@ -193,12 +194,13 @@ def _changed_figures(bands: BandEnergies, limits: Limits,
     def likeliest(changed: frozenset[int]) -> tuple[float, BandEnergies, Array]:
         fits = [(*each.fit(held(changed))[::-1], each) for each in kinds]
         cost, figures, kind = min(fits, key=lambda each: each[0])
-        return cost, kind, figures
+        # a bias instability has a time as well
+        return cost + 2.0 * VALUE_PENALTY * (1 in changed), kind, figures
 
     def chance(changed: frozenset[int], place: int) -> float:
-        """Return the p-value of a change; that of the bias instability has a time as well."""
+        """Return the p-value of a change."""
         gain = likeliest(changed - {place})[0] - likeliest(changed)[0]
-        return float(chi2.sf(max(gain, 0.0), 2 if place == 1 else 1))
+        return float(chi2.sf(max(gain, 0.0), 1))
 
     changed: frozenset[int] = frozenset()
     while more := limits.keys() - changed:
@@ -209,14 +211,13 @@ def _changed_figures(bands: BandEnergies, limits: Limits,
     found = {}
     for place in changed:
         if (p_value := chance(changed, place)) < level:
-            least, kind, figures = likeliest(changed)
-            others = (NOISE_NAMES[other] for other in limits.keys() - changed
-                      if likeliest(changed - {place} | {other})[0] - least
+            cost, kind, figures = likeliest(changed)
+            others = (NOISE_NAMES[other] for other in sorted(limits.keys() - changed)
+                      if likeliest(changed - {place} | {other})[0] - cost
                       < 2.0 * RULED_OUT_DEFICIT)
             found[NOISE_NAMES[place]] = ChangedFigure(
                 float(np.exp(0.5 * figures[place])),
-                _likelihood_interval(kind, place, figures, least, held(changed)), p_value,
-                tuple(others))
+                _likelihood_interval(kind, place, figures, held(changed)), p_value, tuple(others))
     return found
 
 
@@ -257,12 +258,16 @@ def drop_tone_bands(bands: BandEnergies) -> BandEnergies:
     return bands
 
 
-def _likelihood_interval(bands: BandEnergies, place: int, best: Array, min_cost: float,
+def _likelihood_interval(bands: BandEnergies, place: int, best: Array,
                          limits: Limits) -> tuple[float, float]:
     """Return the 95 % interval of a figure by the profile of the likelihood."""
+    def cost(shift: float) -> float:
+        return bands.fit({**limits, place: (best[place] + shift,) * 2}, best)[1]
+
+    least = cost(0.0)
+
     def excess(shift: float) -> float:
-        own = {place: (best[place] + shift,) * 2}
-        return bands.fit({**limits, **own}, best)[1] - min_cost - float(chi2.ppf(0.95, 1))
+        return cost(shift) - least - float(chi2.ppf(0.95, 1))
 
     low, high = ((brentq(excess, 0.0, end, xtol=1e-3) if excess(end) > 0.0 else unlimited)
                  for end, unlimited in ((-12.0, -np.inf), (12.0, 12.0)))
