@@ -197,8 +197,9 @@ def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
     if 'temperature' in has:
         middle = float(temperature.mean())
         yield 'bias_temperature', (middle,)
-        # usual, mean and first temperature
-        for reference in (25.0, 20.0, middle, float(temperature[0])):
+        # that of data sheets, mean and first temperature; of two that are as likely, a few kelvin
+        # apart, the coefficients differ by more than their intervals
+        for reference in (25.0, middle, float(temperature[0])):
             yield 'bias_temperature_quadratic', (reference,)
         for filter_time in (0.3, 1.0, 3.0, 10.0):
             yield 'bias_temperature_rate', (filter_time,)

@@ -437,6 +437,7 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     if (rate is not None and line is not None and log.time is not None
             and log.reference_rate is None):
         rate = _follow_corners(log, rate, line)
+        line = fit_line(log.time, rate, output) or line
     factor, units = 1.0, []
     if rate is not None and line is not None:
         # a factor in addition to the scale factor of the model

@@ -89,7 +89,7 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
         term_covariance = np.zeros((len(terms), len(terms)))
         new = replace(new, terms=_merge_terms(new.terms, terms),
                       covariance=_extended_covariance(new, terms, term_covariance))
-    figures = replace(given.noise, **{each.effect: getattr(noise, each.effect)
+    figures = replace(given.noise, **{each.effect: each.parameters[each.effect].estimate
                                       for each in findings if each.effect in NOISE_NAMES})
     if model is not None and have_same_effects(new, model) and figures == model.noise:
         return model

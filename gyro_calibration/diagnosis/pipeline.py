@@ -103,11 +103,11 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
     allan_curves,
+    find_changed_figures,
     fit_noise_parameters,
     heading_error_curve,
     model_residuals,
     NOISE_NAMES,
-    NoiseParameters,
     residual_curves,
 )
 from gyro_calibration.diagnosis.search import (
@@ -255,8 +255,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
               if model is None else any(term.effect is QUANTIZATION for term in model.terms))
     simulated = Noise() if model is None else model.noise
-    figures = fit_noise_parameters(found, simulated, rounds)
-    noise = figures.noise
+    noise = fit_noise_parameters(found, rounds)
     time_is_up = on_progress(None, 'cross-validation')
     changed = [] if model is None else list(_model_value_findings(found, model, noise, rate))
     within = [(known, members) for known, members in zip(found.causes, selection.alternatives)
@@ -274,7 +273,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     findings += searched.findings
     # a motion that follows has noise of its own
     if model is not None and not searched.hidden:
-        findings += _noise_findings(figures, model, rate, search.problem.replays)
+        findings += _noise_findings(found, model, rate, rounds)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
     inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
@@ -477,20 +476,16 @@ def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
                                f'{abs(value.value) / deviation:.3g} sigma from zero')
 
 
-def _noise_findings(figures: NoiseParameters, model: GyroModel, false_alarm_rate: float,
-                    replays: Sequence[Replay]) -> Iterator[Finding]:
-    """Give the noise figures that differ from those of the model and lie outside its bounds."""
-    has_steps = any(each.heading_step for each in replays)  # which hide white noise
-    for name, chance in figures.p_values.items():
-        interval, bounds = figures.intervals[name], model.noise_bounds.get(name)
-        if (chance < VALUE_ALARM_SHARE * false_alarm_rate
-                and not (has_steps and name == NOISE_NAMES[0])
-                and not (bounds and interval[0] <= bounds[1] and bounds[0] <= interval[1])):
-            unit, value = CAUSES[name].unit, getattr(figures.noise, name)
-            yield make_finding(name, {name: Estimate(value, interval, unit)}, chance,
-                               evidence='the model states '
-                               f'{format_amount(getattr(model.noise, name), unit, name)}, '
-                               f'the log {format_amount(value, unit, name)}')
+def _noise_findings(fit: RegressionFit, model: GyroModel, false_alarm_rate: float,
+                    is_rounding_modelled: bool) -> Iterator[Finding]:
+    """Give the noise figures that differ from those of the model."""
+    for name, each in find_changed_figures(fit, model, VALUE_ALARM_SHARE * false_alarm_rate,
+                                           is_rounding_modelled).items():
+        unit = CAUSES[name].unit
+        yield make_finding(name, {name: Estimate(each.value, each.interval, unit)}, each.p_value,
+                           each.alternatives, evidence='the model states '
+                           f'{format_amount(getattr(model.noise, name), unit, name)}, '
+                           f'the log {format_amount(each.value, unit, name)}')
 
 
 def _untestable_causes(search: Search, logs: Sequence[Log],

@@ -192,12 +192,21 @@ class Replay:
     def resample(self, values: Array, fill_deviation: float = 0.0, least_reach: int = 1) -> Array:
         """Return samples on the even grid; interpolated ones get white noise, if any is given."""
         whole = _bridge_gaps(values[self.valid], self.grid_index, least_reach)
-        if fill_deviation and len(whole) > len(self.grid_index):
-            lost = np.ones(len(whole), dtype=bool)
-            lost[self.grid_index] = False
-            whole[lost] += fill_deviation * self.fill_noise[lost]
+        if fill_deviation:
+            whole = whole + fill_deviation * self.fill_noise * self._is_filled
         whole = whole[:self.point_count * self.decimation]
         return whole.reshape(-1, self.decimation).mean(axis=1)
+
+    @property
+    def _is_filled(self) -> Mask:
+        """Return where the even grid has no sample, shape (place[-1] + 1,)."""
+        return np.asarray(np.bincount(self.grid_index) == 0)
+
+    @property
+    def filled_points(self) -> Mask:
+        """Return the points of which a sample is interpolated."""
+        filled = self._is_filled[:self.point_count * self.decimation]
+        return np.asarray(filled.reshape(-1, self.decimation).any(axis=1))
 
     @property
     def _least_reach(self) -> int:

@@ -17,22 +17,33 @@ The curves are along each variable, of the given and of the extended simulation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+import math
+from typing import TypeAlias
 
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.diagnosis.candidates import common_channels
-from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
+from gyro_calibration.diagnosis.findings import (
+    Curve,
+    HeadingCurve,
+    NoiseCurve,
+    RULED_OUT_DEFICIT,
+)
 from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles,
     cosine_transform,
+    NoiseShape,
     Replay,
     spline_derivative_gain,
 )
+from gyro_calibration.diagnosis.search import VALUE_PENALTY
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
-from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize
@@ -41,17 +52,23 @@ from scipy.stats import chi2
 NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 #: Probability that a frequency band of noise alone is rejected, per log.
 _BAND_REJECTION_CHANCE = 1e-3
+#: Standard deviation of a Gauss-Markov process whose Allan deviation has its peak at the floor by
+#: a bias instability of 1: the peak is at 1.89 correlation times.
+_MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
+#: Index of a figure -> lowest and highest logarithm of its square.
+Limits: TypeAlias = Mapping[int, tuple[float, float]]
 #: Bins of a curve, and points of a line over time.
 CURVE_BINS, CURVE_POINTS = 40, 600
 
 
 @dataclass(frozen=True)
-class NoiseParameters:
-    """Noise fitted to a residual."""
+class ChangedFigure:
+    """A noise figure that differs from that of the model, beside others that do."""
 
-    noise: Noise  # the figures
-    intervals: dict[str, tuple[float, float]]  # of 95 % of each, by name
-    p_values: dict[str, float]  # p-value of the model's figure, by name
+    value: float
+    interval: tuple[float, float]  # of 95 %
+    p_value: float
+    alternatives: tuple[str, ...]  # names of the figures whose change explains as much
 
 
 @dataclass(frozen=True)
@@ -65,35 +82,36 @@ class BandEnergies:
     # reference
     unit_variances: Array
     known_variance: Array  # variance by other noise, shape (b,)
+    # variance of the bands by Gauss-Markov processes with the Allan floor of a bias instability
+    # of 1, shape (b, k)
+    markov_variances: Array
 
     def take(self, kept: NDArray[np.bool_]) -> BandEnergies:
         """Return some of the bands."""
-        return BandEnergies(self.energy[kept], self.count[kept], self.unit_variances[kept],
-                            self.known_variance[kept])
+        return BandEnergies(*(getattr(self, each.name)[kept] for each in fields(self)))
 
     def variance(self, logarithms: Array) -> Array:
         """Return the variance by squared figures, given by their logarithms."""
         return np.asarray(self.known_variance + self.unit_variances @ np.exp(logarithms))
 
-    def fit(self, fixed: tuple[int, float] | None = None,
+    def fit(self, limits: Limits | None = None,
             start: Array | None = None) -> tuple[Array, float]:
         """
         Return the most likely logarithms of squared figures, and twice their negative likelihood.
 
         Parameters
         ----------
-        fixed : index and logarithm of a squared figure that is not fitted
+        limits : index -> lowest and highest logarithm of a squared figure
         start : logarithms to begin with
 
         """
+        low, high = (np.full(self.unit_variances.shape[1], end) for end in (-60.0, 20.0))
+        for place, ends in (limits or {}).items():
+            low[place], high[place] = ends
         usual = self.energy / self.count
-        begin = (start if start is not None
-                 else np.log((usual[:, None] / self.unit_variances).min(axis=0)))
-        free = np.array([place for place in range(len(begin)) if fixed is None
-                         or place != fixed[0]])
-        logarithms = begin.copy()
-        if fixed is not None:
-            logarithms[fixed[0]] = fixed[1]
+        logarithms = np.clip(start if start is not None else np.log(
+            (usual[:, None] / self.unit_variances).min(axis=0)), low, high)
+        free = np.flatnonzero(low < high)
 
         def cost(some: Array) -> tuple[float, Array]:
             logarithms[free] = some
@@ -102,45 +120,105 @@ class BandEnergies:
             return (float((self.count * np.log(variance) + self.energy / variance).sum()),
                     (slope @ self.unit_variances[:, free]) * np.exp(some))
 
+        if not len(free):
+            return logarithms, cost(logarithms[free])[0]
+        begin = logarithms[free]
         shifts = [0.0, *(-3.0 * (free == place) for place in free[1:])]
-        best = min((minimize(cost, begin[free] + shift, jac=True, method='L-BFGS-B',
-                             bounds=[(-60.0, 20.0)] * len(free)) for shift in shifts),
+        best = min((minimize(cost, begin + shift, jac=True, method='L-BFGS-B',
+                             bounds=list(zip(low[free], high[free]))) for shift in shifts),
                    key=lambda one: one.fun)
         logarithms[free] = best.x
         return logarithms, float(best.fun)
 
 
-def fit_noise_parameters(fit: RegressionFit, expected: Noise,
-                         is_rounding_modelled: bool = False) -> NoiseParameters:
+def fit_noise_parameters(fit: RegressionFit, is_rounding_modelled: bool = False) -> Noise:
     """
-    Fit noise figures to the residual, and compare them with those expected of a model.
+    Fit noise figures to the residual.
 
     Frequencies with more power than the noise, such as those of a vibration, are left out. The
     angle random walk is without rounding noise if the model has quantization; otherwise it may
-    include it. Figures are not compared if the expected angle random walk is 0.
+    include it.
 
     """
     bands = drop_tone_bands(_band_energies(fit))
-    without = _fit_and_test(bands, expected)
-    if is_rounding_modelled or not bands.known_variance.any():
-        return without
-    whole = _fit_and_test(replace(bands, known_variance=0.0 * bands.known_variance), expected)
-    return replace(whole, p_values={name: max(chance, without.p_values[name])
-                                    for name, chance in whole.p_values.items()})
-
-
-def _fit_and_test(bands: BandEnergies, expected: Noise) -> NoiseParameters:
-    best, least = bands.fit()
+    if not is_rounding_modelled:
+        bands = replace(bands, known_variance=0.0 * bands.known_variance)
+    best, _ = bands.fit()
     # a figure that is less than 1 % of the noise everywhere is 0
     shares = (bands.unit_variances * np.exp(best) / bands.variance(best)[:, None]).max(axis=0)
-    noise = Noise(**{name: float(np.exp(0.5 * best[place])) if shares[place] > 0.01 else 0.0
-                     for place, name in enumerate(NOISE_NAMES)})
-    chance = {}
-    for place, name in enumerate(NOISE_NAMES if expected.angle_random_walk else ()):
-        at = 2.0 * float(np.log(max(getattr(expected, name), 1e-12)))
-        chance[name] = float(chi2.sf(max(bands.fit((place, at), best)[1] - least, 0.0), 1))
-    return NoiseParameters(noise, {name: _likelihood_interval(bands, place, best, least)
-                                   for place, name in enumerate(NOISE_NAMES)}, chance)
+    return Noise(**{name: float(np.exp(0.5 * best[place])) if shares[place] > 0.01 else 0.0
+                    for place, name in enumerate(NOISE_NAMES)})
+
+
+def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
+                         is_rounding_modelled: bool) -> dict[str, ChangedFigure]:
+    """
+    Find the noise figures that differ from those of a model, one by one, the clearest first.
+
+    A figure lies within its bounds in the model, or has its value, until its change explains more
+    than chance. A model states the floor of the Allan deviation: its bias instability is flicker
+    or a Gauss-Markov process of any correlation time. The angle random walk may include the
+    rounding of the output, unless the model has quantization. It is not compared with an encoder,
+    whose steps hide it, and no figure is if the model has none.
+
+    """
+    expected = model.noise
+    if not expected.angle_random_walk:
+        return {}
+    bands = drop_tone_bands(_band_energies(fit))
+    limits = {}
+    for place, name in enumerate(NOISE_NAMES):
+        low, high = model.noise_bounds.get(name, (getattr(expected, name),) * 2)
+        limits[place] = 2.0 * math.log(max(low, 1e-12)), 2.0 * math.log(max(high, 1e-12))
+    if any(each.heading_step for each in fit.problem.replays):
+        del limits[0]
+    found = _changed_figures(bands, limits, level)
+    if not is_rounding_modelled and bands.known_variance.any():
+        other = _changed_figures(replace(bands, known_variance=0.0 * bands.known_variance), limits,
+                                 level)
+        found = {name: each for name, each in other.items() if name in found}
+    return found
+
+
+def _changed_figures(bands: BandEnergies, limits: Limits,
+                     level: float) -> dict[str, ChangedFigure]:
+    kinds = [bands]
+    for own in bands.markov_variances.T:
+        kinds.append(replace(bands, unit_variances=bands.unit_variances.copy()))
+        kinds[-1].unit_variances[:, 1] = own
+
+    def held(changed: frozenset[int]) -> dict[int, tuple[float, float]]:
+        return {place: ends for place, ends in limits.items() if place not in changed}
+
+    @cache
+    def likeliest(changed: frozenset[int]) -> tuple[float, BandEnergies, Array]:
+        fits = [(*each.fit(held(changed))[::-1], each) for each in kinds]
+        cost, figures, kind = min(fits, key=lambda each: each[0])
+        # a bias instability has a time as well
+        return cost + 2.0 * VALUE_PENALTY * (1 in changed), kind, figures
+
+    def chance(changed: frozenset[int], place: int) -> float:
+        """Return the p-value of a change."""
+        gain = likeliest(changed - {place})[0] - likeliest(changed)[0]
+        return float(chi2.sf(max(gain, 0.0), 1))
+
+    changed: frozenset[int] = frozenset()
+    while more := limits.keys() - changed:
+        best = min(more, key=lambda place: chance(changed | {place}, place))
+        if chance(changed | {best}, best) >= level:
+            break
+        changed |= {best}
+    found = {}
+    for place in changed:
+        if (p_value := chance(changed, place)) < level:
+            cost, kind, figures = likeliest(changed)
+            others = (NOISE_NAMES[other] for other in sorted(limits.keys() - changed)
+                      if likeliest(changed - {place} | {other})[0] - cost
+                      < 2.0 * RULED_OUT_DEFICIT)
+            found[NOISE_NAMES[place]] = ChangedFigure(
+                float(np.exp(0.5 * figures[place])),
+                _likelihood_interval(kind, place, figures, held(changed)), p_value, tuple(others))
+    return found
 
 
 def _band_energies(fit: RegressionFit) -> BandEnergies:
@@ -153,14 +231,19 @@ def _band_energies(fit: RegressionFit) -> BandEnergies:
     used = np.concatenate(
         [coefficient_angles(each.point_count) < (np.pi if each.decimation == 1 else 0.25 * np.pi)
          for each in problem.replays])
-    parts = [1.0 / step, 1.0 / angle, step / (2.0 - 2.0 * np.cos(angle))]
+    wave = 2.0 - 2.0 * np.cos(angle)
+    parts = [1.0 / step, 1.0 / angle, step / wave]
     if problem.noise_shapes[0].rounding_ratio:
         parts.append(spline_derivative_gain(angle) / step)
+    times = {each.correlation_time for each in problem.noise_shapes if each.markov_ratio}
+    markov = [_MARKOV_RATIO ** 2 * (NoiseShape(0.0, 1.0, time).variance(angle, step) - 1.0) / step
+              for time in sorted(times)]
     energy, count, *totals = (np.add.reduceat(part * used, problem.band_starts)
-                              for part in (left ** 2, np.ones(len(left)), coarse, *parts))
+                              for part in (left ** 2, np.ones(len(left)), coarse, *parts, *markov))
     kept = count > 0.0
     known, *means = (total[kept] / count[kept] for total in totals)
-    return BandEnergies(energy[kept], count[kept], np.column_stack(means), known)
+    return BandEnergies(energy[kept], count[kept], np.column_stack(means[:len(parts)]), known,
+                        np.column_stack(means[len(parts):]))
 
 
 def drop_tone_bands(bands: BandEnergies) -> BandEnergies:
@@ -176,11 +259,15 @@ def drop_tone_bands(bands: BandEnergies) -> BandEnergies:
 
 
 def _likelihood_interval(bands: BandEnergies, place: int, best: Array,
-                         min_cost: float) -> tuple[float, float]:
+                         limits: Limits) -> tuple[float, float]:
     """Return the 95 % interval of a figure by the profile of the likelihood."""
+    def cost(shift: float) -> float:
+        return bands.fit({**limits, place: (best[place] + shift,) * 2}, best)[1]
+
+    least = cost(0.0)
+
     def excess(shift: float) -> float:
-        return (bands.fit((place, best[place] + shift), best)[1] - min_cost
-                - float(chi2.ppf(0.95, 1)))
+        return cost(shift) - least - float(chi2.ppf(0.95, 1))
 
     low, high = ((brentq(excess, 0.0, end, xtol=1e-3) if excess(end) > 0.0 else unlimited)
                  for end, unlimited in ((-12.0, -np.inf), (12.0, 12.0)))

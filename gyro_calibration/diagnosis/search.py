@@ -65,6 +65,7 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 from scipy.special import logsumexp
@@ -378,9 +379,13 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
     value = 0.5 * (size[indices] / deviation) ** 2 - likely - VALUE_PENALTY
     # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
-    # of an encoder is constant at rest, and differs by up to a step between two rests.
+    # of an encoder is constant at rest, and differs by up to a step between two rests. What the
+    # gyro turns in a gap is not known.
     is_temporary = wide[indices] / size[indices] < 0.3
-    value[is_temporary | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
+    near_gap = maximum_filter1d(replay.filled_points,
+                                2 * math.ceil(2.0 * width / replay.point_interval) + 1)
+    value[is_temporary | near_gap[indices]
+          | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:

@@ -22,6 +22,7 @@ import itertools
 from diagnosed import described as told
 from diagnosed import diagnosis_of, held, judge_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.findings import TIME_LIMIT_REMARK
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
@@ -268,6 +269,30 @@ def test_a_model_of_other_noise_is_reported(factor):
     assert names_of(found) == ['angle_random_walk'], told(log, found)
     assert found.findings[0].parameters['angle_random_walk'].estimate == pytest.approx(
         model.noise.angle_random_walk, rel=0.03)
+
+
+def test_a_random_walk_is_told_from_the_noise_of_a_model_and_not_from_its_look_alike():
+    log, = hidden_in(['rate_random_walk'], 2.0, 3, 'walk', REFERENCES[0])
+    found = diagnosis_of([log], np.random.default_rng(3))
+    assert names_of(found) == ['rate_random_walk'], told(log, found)
+    assert found.findings[0].ambiguous_with == ('bias_instability',)
+
+
+# faults of a record
+
+@pytest.mark.parametrize('seed', [1, 4])
+def test_no_slip_of_the_reference_is_named_in_a_gap_of_the_gyro(seed):
+    log, = hidden_in(['stuck_samples'], 5.0, seed, 'flicker', REFERENCES[2])
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    assert judge_diagnosis(log, found, ENCODER).is_right, told(log, found)
+
+
+@pytest.mark.parametrize('seed', [4, 8])
+def test_a_unit_is_found_where_the_motion_has_corners(seed):
+    log, = hidden_in(['unit_error'], 1.0, seed, 'white', REFERENCES[1])
+    assert log.truth['unit_error'].size == 1.024
+    quality = inspect_record(log_of(log), None)
+    assert [each.effect for each in quality.findings] == ['unit_error']
 
 
 # the extended model at work

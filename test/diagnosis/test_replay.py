@@ -191,7 +191,7 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     parts = np.column_stack([np.ones(60), 1.0 / frequency, 1.0 / frequency ** 2])
     energy = 4.0 * generator.chisquare(count)
     energy[56] *= tone
-    bands = BandEnergies(energy, count, parts, np.zeros(60))
+    bands = BandEnergies(energy, count, parts, np.zeros(60), np.empty((60, 0)))
     used = drop_tone_bands(bands)
     assert len(used.energy) == (60 if tone == 1.0 else 59)
     assert np.exp(0.5 * used.fit()[0][0]) == pytest.approx(2.0, rel=0.03)
