@@ -27,7 +27,7 @@ ORDER = re.findall(r'`(\w+)`', gyro_calibration.__doc__.partition('Reading order
 CORE = ORDER[:ORDER.index('driver')]
 FOLDERS = ['logs', 'model', 'heading', 'calibration',
            'allan', 'diagnosis', 'fleet', 'driver', 'ros']
-MAY_USE_ROS = {'demo_run.py', *(path.name for path in (PACKAGE / 'ros').glob('*.py'))}
+MAY_USE_ROS = {'demo.py', *(path.name for path in (PACKAGE / 'ros').glob('*.py'))}
 ROS = re.compile(r'rclpy|ament_\w+|launch\w*|tf2\w*|rosbag2\w*|rcl_interfaces|\w+_msgs|\w+_srvs')
 OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'threading', 'random', 'argparse'}
 

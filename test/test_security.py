@@ -46,7 +46,7 @@ PROCESSES = {'subprocess', 'pty.spawn', *(f'os.{start}{how}' for start in ('exec
 
 
 @pytest.mark.parametrize('forbidden, excepted', [
-    (NETWORK, set()), (CODE_FROM_DATA, set()), (PROCESSES, {'demo_run.py'}),
+    (NETWORK, set()), (CODE_FROM_DATA, set()), (PROCESSES, {'demo.py'}),
     ({'multiprocessing'}, {'run.py'}),  # a fleet's processes on one machine, joined by pipes
     ({'yaml.load'}, {'settings_file.py'})],
     ids=['the network', 'code from data', 'processes', 'workers', 'YAML'])
@@ -198,7 +198,7 @@ def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
 def test_only_the_calibration_and_the_demonstration_can_command_a_robot():
     makers = {path.name for path in FILES
               if re.search(r"(create_publisher|publish_on)\([^)]*'cmd_vel'", path.read_text())}
-    assert makers == {'compensation_node.py', 'demo_run.py'}
+    assert makers == {'compensation_node.py', 'demo.py'}
 
 
 def test_only_a_session_that_may_drive_sends_commands(tmp_path):

@@ -18,11 +18,52 @@ example: gyro_calibration demo --out demo
 from __future__ import annotations
 
 import argparse
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass, field
+import math
+import os
 from pathlib import Path
+import random
+import subprocess
+import sys
+import threading
+import time
 
 from gyro_calibration.cli import verb
+from gyro_calibration.cli.plots import draw_headings
 from gyro_calibration.cli.verb import Answer
-from gyro_calibration.files import InputError
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import find_protocol, Sample
+from gyro_calibration.files import InputError, write_atomically
+from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.motion import CALIBRATION_MOTION, constant_rate_motion
+from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import XV3500
+from gyro_calibration_reproduction.hong_park import TABLE_1
+import numpy as np
+from tqdm import tqdm
+
+try:
+    from geometry_msgs.msg import Twist
+    from gyro_calibration.ros.runner import SENSOR_QOS
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import Imu
+    from std_srvs.srv import Trigger
+    MISSING = ''
+except ImportError as error:
+    MISSING = str(error)
+
+PROTOCOL = 'kvh_dsp3000'
+_NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
+MAX_ATTEMPTS = 3  # to calibrate
+DRIVE_MOTION = constant_rate_motion([
+    *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -33,10 +74,248 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    try:
-        from gyro_calibration.cli.demo_run import run_demo
-    except ImportError as error:
-        raise InputError(f'the demo needs ROS 2 and matplotlib ({error}); source ROS 2, or '
-                         'install gyro_calibration[ros,plot]') from None
+    if MISSING:
+        raise InputError(f'the demo needs ROS 2 and matplotlib ({MISSING}); source ROS 2, or '
+                         'install gyro_calibration[ros,plot]')
     verb.require_folder(given.out)
     return run_demo(Path(given.out), given.seed)
+
+
+class CallRefused(OSError):
+    """A service refused a call."""
+
+
+@dataclass
+class SimulatedRobot:
+    """A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model."""
+
+    model: GyroModel
+    noise: Array  # of each sample, rad/s
+    #: Not yet applied, each with the time of its receipt, s, and the rate, rad/s.
+    commands: deque[tuple[float, float]] = field(default_factory=deque)
+    #: Of each sample the time by the clock of this machine, s, and the true heading, rad.
+    true_headings: list[tuple[float, float]] = field(default_factory=list)
+
+    def samples(self) -> Iterator[Sample]:
+        """Give the samples of the gyro, each at its time, until the noise ends."""
+        # where this process is delayed they are late, but the robot has turned meanwhile
+        command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
+        for number, noise in enumerate(self.noise):
+            due = begin + number * XV3500.interval
+            time.sleep(max(0.0, due - time.monotonic()))
+            while self.commands and self.commands[0][0] <= due:
+                command = self.commands.popleft()[1]
+            largest = 3.0 * XV3500.interval
+            change = min(max(command - rate, -largest), largest)
+            heading += XV3500.interval * (rate + 0.5 * change)
+            rate += change
+            self.true_headings.append((time.time() - (time.monotonic() - due), heading))
+            yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
+                         time=number * XV3500.interval)
+
+
+class DemoClient:
+    """Subscribes to the nodes and calls their services, spinning in a thread of its own."""
+
+    def __init__(self, robot: SimulatedRobot):
+        """Subscribe; the robot receives ``cmd_vel`` from now on."""
+        self.raw_rates: list[tuple[float, float]] = []  # s and rad/s
+        self.headings: list[tuple[float, float]] = []  # s and rad
+        self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
+
+        def add_raw(message: Imu) -> None:
+            self.raw_rates.append((_seconds(message), message.angular_velocity.z))
+
+        def add_heading(message: Imu) -> None:
+            yaw = 2.0 * math.atan2(message.orientation.z, message.orientation.w)
+            self.headings.append((_seconds(message), yaw))
+
+        def add_command(message: Twist) -> None:
+            robot.commands.append((time.monotonic(), message.angular.z))
+
+        self._node.create_subscription(Imu, 'imu/data_raw', add_raw, SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', add_heading, SENSOR_QOS)
+        self._node.create_subscription(Twist, 'cmd_vel', add_command, 10)
+        self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._stop.is_set():
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def call_service(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
+        """Call a service, wait again and again until it answers, and return its message."""
+        client = self._node.create_client(Trigger, name)
+        if not client.wait_for_service(20.0):
+            raise OSError(f'the service {name} did not appear within 20 s')
+        answer, deadline = client.call_async(Trigger.Request()), time.monotonic() + timeout
+        while not answer.done():
+            if time.monotonic() > deadline:
+                raise OSError(f'{name} did not answer within {timeout:g} s')
+            wait()
+        if not answer.result().success:
+            raise CallRefused(f'{name}: {answer.result().message}')
+        return answer.result().message
+
+    def is_ready(self) -> bool:
+        """Return whether gyro and heading are received and another node commands the robot."""
+        return (bool(self.raw_rates and self.headings)
+                and self._node.count_publishers('cmd_vel') > 1)
+
+    def command_rate(self, rate: float) -> None:
+        """Command a rate, rad/s."""
+        command = Twist()
+        command.angular.z = rate
+        self._velocity.publish(command)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stop.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+
+def _seconds(message: Imu) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+@contextmanager
+def _node_process(module: str, **parameters: object) -> Iterator[None]:
+    arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    ros_options = ['-r', f'__ns:=/{_NAMESPACE}', '--log-level', 'error']
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}',
+                                '--ros-args', *arguments, *ros_options])
+    try:
+        yield
+    finally:
+        process.terminate()
+        try:
+            process.wait(20.0)
+        except subprocess.TimeoutExpired:  # a busy machine
+            process.kill()
+            process.wait()
+
+
+def run_demo(out: Path, seed: int) -> Answer:
+    """
+    Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
+
+    The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
+    motion of the robot; driver and compensation run as processes of their own, as on a robot. The
+    compensation drives the calibration, then a drive follows.
+
+    Raise `OSError` where a node does not answer, or the folder cannot be written to.
+
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
+                                          out.absolute() / 'gyro')
+    calibration_file.unlink(missing_ok=True)
+    # The graph is separate from the network of a robot and from other graphs on this machine, so
+    # it needs no permissions in a secured one.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                      ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
+    write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
+    robot = SimulatedRobot(XV3500.model, simulate_noise(
+        XV3500.noise, 30000, XV3500.interval, np.random.default_rng(seed)))
+    with ExitStack() as stack:
+        stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
+                                     wait_for_reader=True))
+        stack.enter_context(_node_process('driver_node', port=port, protocol=PROTOCOL))
+        stack.enter_context(_node_process('compensation_node', model_file=model_file,
+                                          calibration_file=calibration_file,
+                                          **{'calibration.drive': True}))
+        rclpy.init()
+        stack.callback(rclpy.try_shutdown)
+        client = DemoClient(robot)
+        stack.callback(client.close)
+        begin = _calibrate_and_drive(client)
+    return _evaluate(out, robot, client, begin, seed)
+
+
+def _calibrate_and_drive(client: DemoClient) -> float:
+    """Calibrate and drive; return the time at which the drive began, s."""
+    total = round(CALIBRATION_MOTION.duration + 4.0 + DRIVE_MOTION.duration)
+    with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
+              disable=None) as bar:
+        bar.set_description('starting driver and compensation')
+        deadline = time.monotonic() + 60.0
+        while not client.is_ready():
+            if time.monotonic() > deadline:
+                raise OSError('driver and compensation were not ready within 60 s; stop other '
+                              'programs, and run the demo again')
+            time.sleep(0.02)
+        bar.set_description('calibrating on the motion profile')
+        calibrate(client, bar)
+        client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
+        bar.set_description('driving')
+        begin, started = time.time(), time.monotonic()
+        while (elapsed := time.monotonic() - started) < DRIVE_MOTION.duration:
+            client.command_rate(float(DRIVE_MOTION.rate_at(np.array(elapsed))))
+            _wait(bar, 0.02)
+        client.command_rate(0.0)
+        _wait(bar, 0.5)
+    return begin
+
+
+def calibrate(client: DemoClient, bar: tqdm) -> None:
+    """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        try:
+            client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
+            return
+        except CallRefused as refusal:
+            if attempt == MAX_ATTEMPTS:
+                raise
+            bar.total += CALIBRATION_MOTION.duration + 4.0
+            bar.write(f'{refusal}; the run is repeated', file=sys.stderr)
+            _wait(bar, 2.0)  # until the robot stands
+
+
+def _wait(bar: tqdm, seconds: float) -> None:
+    time.sleep(seconds)
+    bar.update(seconds)
+
+
+def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float,
+              seed: int) -> Answer:
+    """Compare five headings of the drive with the truth, with the values of Hong and Park."""
+    clock, truth = np.array(robot.true_headings).T
+    time_, raw = np.array([pair for pair in client.raw_rates if pair[0] >= begin]).T
+    stamp, yaw = np.array([pair for pair in client.headings if pair[0] >= begin]).T
+    true = np.interp(time_, clock, truth)
+    true -= true[0]
+    calibration = read_model(out / 'calibration.yaml').self_calibration
+    assert calibration is not None  # calibrate succeeded, so it is stored
+    corrected, threshold = calibration.correct(raw), Threshold()
+    headings = {
+        'pure integration': integrate(time_, raw),
+        'self-calibration': integrate(time_, corrected),
+        'threshold filter': integrate(time_, filter_rates(threshold, time_, raw)),
+        'both': integrate(time_, filter_rates(threshold, time_, corrected)),
+        'rests tracked': np.interp(time_, stamp, np.unwrap(yaw) - yaw[0])}
+    draw_headings(out / 'heading.png', time_ - begin, true, headings)
+    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0], reference_heading=true))
+    errors = {name: np.abs(heading - true) / DEGREE for name, heading in headings.items()}
+    means = {name: float(error.mean()) for name, error in errors.items()}
+    lines = ['| heading | mean error | standard deviation | off pure integration '
+             '| Hong and Park, table 1 |', '|---|---|---|---|---|']
+    for name, error in errors.items():
+        theirs = ''
+        if name in TABLE_1:
+            mean, deviation = TABLE_1[name]
+            gain = 100 * (1 - mean / TABLE_1['pure integration'][0])
+            theirs = f'{mean:.3f} deg, {deviation:.3f} deg, {gain:.0f} %'
+        gain = round(100 * (1 - means[name] / means['pure integration']))
+        lines.append(f'| {name} | {means[name]:.3f} deg | {error.std():.3f} deg | {gain} % '
+                     f'| {theirs} |')
+    table = '\n'.join(lines) + '\n'
+    write_atomically(out / 'table.md', table.encode())
+    text = (f'{table}\nSelf-calibration: {calibration}.\n'
+            f'Seed {seed}. Picture, table and log are in {out}.')
+    return Answer([text], {'seed': seed, **calibration.to_dict(), 'mean_error_deg': means})
