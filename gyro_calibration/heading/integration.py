@@ -32,6 +32,7 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.stamps import SHORT_RATIO
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -42,9 +43,8 @@ TIME_TOLERANCE = 1e-6
 MAX_RATE = 1e4
 #: Number of intervals in the memory, and least number for the detection of a gap.
 _MAX_INTERVALS, _MIN_INTERVALS = 256, 16
-#: Ratio to the usual interval of a short one, as in a burst or after a late sample, and share of
-#: short intervals above which stamps come in bursts.
-_SHORT_RATIO, _MIN_BURST_SHARE = 0.5, 0.1
+#: Share of short intervals in the memory above which stamps come in bursts.
+_MIN_BURST_SHARE = 0.1
 
 
 class Intervals:
@@ -100,7 +100,7 @@ class Intervals:
             self.lost_samples += self._late_samples
             self.longest_gap = max(self.longest_gap, interval)
             return self._late_samples
-        if self._late_samples and interval < _SHORT_RATIO * self.usual_interval:  # late, not lost
+        if self._late_samples and interval < SHORT_RATIO * self.usual_interval:  # late, not lost
             self._late_samples -= 1
             self.lost_samples -= 1
         else:
@@ -113,12 +113,12 @@ class Intervals:
         steps = sorted(self._history)
         mean = sum(steps) / len(steps)
         usual = self._even_interval = steps[len(steps) // 2]
-        if steps[int(_MIN_BURST_SHARE * len(steps))] < _SHORT_RATIO * mean:
+        if steps[int(_MIN_BURST_SHARE * len(steps))] < SHORT_RATIO * mean:
             # the longest may be gaps
             self._even_interval = steps[-1 - len(steps) // 100]
             usual = sum(min(step, self._even_interval) for step in steps) / len(steps)
         self.usual_interval = max(usual, MIN_SAMPLE_INTERVAL)
-        self._gap_limit = self._even_interval + _SHORT_RATIO * self.usual_interval
+        self._gap_limit = self._even_interval + SHORT_RATIO * self.usual_interval
 
 
 def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[int]:
@@ -205,19 +205,10 @@ class ThresholdFilter:
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
         if not self.settings.rate:
             return rate
-        window = self._window
-        window.append((time, min(max(rate, -MAX_RATE), MAX_RATE)))
-        while window[0][0] <= time - self.settings.window and len(window) > 1:
-            window.popleft()
-        # not a running sum, which would accumulate rounding errors
-        rates = [each for _, each in window]
-        mean = sum(rates) / len(rates)
-        if not abs(mean) < self.settings.rate:
-            return rate
-        # motion if the window varies by more than the noise
-        explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
-        variance = sum(each * each for each in rates) / len(rates) - mean * mean
-        return rate if 0.0 < explained < variance * (time - window[0][0]) else 0.0
+        self._window.append((time, rate))
+        while self._window[0][0] <= time - self.settings.window and len(self._window) > 1:
+            self._window.popleft()
+        return float(filter_rates(self.settings, *np.array(self._window).T)[-1])
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
@@ -245,6 +236,7 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
                      for values in (bounded, bounded * bounded))
     mean = sums / count
+    # motion if a window varies by more than the noise
     variance = squares / count - mean * mean
     explained = 9.0 * settings.angle_random_walk ** 2 * count
     shakes = (explained > 0.0) & (explained < variance * (time - time[begin]))

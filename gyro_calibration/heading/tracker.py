@@ -64,6 +64,7 @@ from gyro_calibration.heading.stationary import (
 from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from scipy.special import ndtri
 
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
@@ -79,7 +80,7 @@ _BIAS_MARGIN_SIGMAS = 4.0
 _WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
 #: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
 #: which on it is used, and factor of the thresholds of means.
-_NOISE_TOLERANCE = 1.25
+NOISE_TOLERANCE = 1.25
 #: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
 #: it is attributed to the bias after this time, s.
 _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
@@ -87,8 +88,6 @@ _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
 #: States of a rest in memory.
 _MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 1
-#: Sigmas of a power of 95 %, for the slowest detectable turn.
-_POWER_SIGMAS = 1.645
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ class HeadingTracker:
         self._block, self._wheels_moved = Block(), False
         self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._detects_rest
                                        else settings.threshold)
-        self._sigmas = {lag: _NOISE_TOLERANCE * mean_threshold_sigmas(lag, settings.false_alarms)
+        self._sigmas = {lag: NOISE_TOLERANCE * mean_threshold_sigmas(lag, settings.false_alarms)
                         for lag in (WINDOW_DURATION, *MEAN_LAGS)} if self._detects_rest else {}
         self._begin_anew()
 
@@ -878,7 +877,7 @@ class HeadingTracker:
             self._rebuild_state()
         walk = self._model_noise.angle_random_walk * (
             self._energy.noise_factor
-            if self._detects_rest and self._energy.noise_factor > _NOISE_TOLERANCE else 1.0)
+            if self._detects_rest and self._energy.noise_factor > NOISE_TOLERANCE else 1.0)
         if walk != self._state.noise.angle_random_walk:
             self._state = replace(
                 self._state, noise=replace(self._model_noise, angle_random_walk=walk))
@@ -950,6 +949,7 @@ class HeadingTracker:
         """Return the slowest turn, rad/s, that is detected in 95 % of cases; nan if unknown."""
         turns = ([(lag, replace(self._zero_integral, duration=lag)) for lag in MEAN_LAGS]
                  if self._detects_rest else [])
-        return min(((self._sigmas[lag] + _POWER_SIGMAS)
+        power_sigmas = -float(ndtri(0.05))
+        return min(((self._sigmas[lag] + power_sigmas)
                     * math.sqrt(self._state.expected_rest_angle(turn)[1]) / lag
                     for lag, turn in turns), default=math.nan)

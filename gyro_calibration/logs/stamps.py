@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 
 Integers = NDArray[np.integer]
 
-#: Steps below this fraction of the usual interval are those of delayed samples; above this share
-#: of such steps, stamps are taken to come in bursts.
-_BURST_STEP_RATIO, _MIN_BURST_SHARE = 0.5, 0.02
+#: Ratio to the usual interval of a short one, as in a burst or after a late sample.
+SHORT_RATIO = 0.5
+#: Share of short intervals in a log above which its stamps are taken to come in bursts.
+_MIN_BURST_SHARE = 0.02
 
 #: Least number of windows in a record. Windows do not cross gaps of more than 1 / LONG of the
 #: record, and longer windows do not show a motion.
@@ -74,7 +75,7 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     """Fit an even grid to stamps, or raise `DataRefused` where there is none."""
     steps = np.diff(time)
     usual = _typical_interval(time, steps)
-    bursts = float((steps < _BURST_STEP_RATIO * usual).mean()) > _MIN_BURST_SHARE
+    bursts = float((steps < SHORT_RATIO * usual).mean()) > _MIN_BURST_SHARE
     lost = _count_lost_per_step(time, steps, usual, bursts)
     number = _number_samples(lost)
     interval = float(np.polyfit(number, time - time[0], 1)[0])
@@ -137,7 +138,7 @@ def _count_lost_per_step(time: Array, steps: Array, interval: float, has_bursts:
     # samples within which delayed stamps catch up, and the least loss beyond their jitter
     span, least = (300, 10) if has_bursts else (10, 1)
     late = (time - time[0]) / interval - np.arange(len(time))
-    due = np.append(np.flatnonzero(steps >= _BURST_STEP_RATIO * interval), len(steps))
+    due = np.append(np.flatnonzero(steps >= SHORT_RATIO * interval), len(steps))
     for step in np.nonzero(steps > (least + 0.5) * interval)[0].tolist():
         late[done:step + 1] -= shift
         done = step + 1

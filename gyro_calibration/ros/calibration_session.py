@@ -70,7 +70,7 @@ FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 SAMPLE_TIMEOUT = 5.0
 DRIVE_SAMPLE_TIMEOUT = 0.25  # s; likewise of a drive; four intervals of a slower gyro
 STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
-_MIN_TURN_ANGLE = 1.0 * DEGREE  # rad; least change of the odometry heading that shows a turn
+MIN_TURN_ANGLE = 1.0 * DEGREE  # rad; least change of the odometry heading that shows a turn
 _MAX_NODE_PAUSE = 1.0  # s; after a longer one in a drive the base has stopped, or turned on
 
 ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
@@ -487,7 +487,7 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
             at, headings, rates = np.array(run.odometry).T
             turned = max(float(np.mean(rates) * np.ptp(at)),
                          float(np.unwrap(headings)[-1] - headings[0]), key=abs)
-        if abs(turned) > _MIN_TURN_ANGLE:
+        if abs(turned) > MIN_TURN_ANGLE:
             raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
                               f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
                               'odom to an odometry of the wheels')
@@ -532,7 +532,7 @@ def _odometry_motion(run: CalibrationRun) -> tuple[float, Motion]:
             'increasing stamps over most of the run are needed: check the odometry')
     time, heading, rate = rows.T
     heading = np.unwrap(heading)
-    turned = np.ptp(heading) > _MIN_TURN_ANGLE
+    turned = np.ptp(heading) > MIN_TURN_ANGLE
     motion = (motion_from_headings(time, heading) if turned
               else motion_from_rates(time - time[0], rate))
     return float(time[0]), motion

@@ -11,7 +11,7 @@
 """
 Tests of the noise and the bias of a gyro at rest against its model.
 
-Samples are collected in stretches of `STRETCH_DURATION` s with a steady rate, as at rest. In each
+Samples are collected in stretches of `REST_DURATION` s with a steady rate, as at rest. In each
 stretch the mean square of differences of neighbouring blocks is tested against the noise of the
 model, and the mean rate against zero. The levels of both tests follow from a stated rate of false
 alarms.
@@ -25,7 +25,9 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.files import MAX_MAGNITUDE
+from gyro_calibration.heading.bias_table import REST_DURATION
 from gyro_calibration.heading.integration import Intervals, RECENT_DURATION
+from gyro_calibration.heading.tracker import NOISE_TOLERANCE
 from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
@@ -34,8 +36,7 @@ from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_TURN_RATE
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-STRETCH_DURATION, _PART_DURATION = 10.0, 1.0  # s; of a stretch, and of its parts that are compared
-_MAX_NOISE_RATIO = 1.25  # largest accepted one to the noise of the model; figures change
+_PART_DURATION = 1.0  # s; of the parts of a stretch that are compared
 #: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
@@ -205,7 +206,7 @@ class HealthMonitor:
         """
         self._noise, self.standstill_rate = noise, standstill_rate
         # Four tests: noise and bias, upwards and downwards.
-        self._level = 0.25 * false_alarm_rate * STRETCH_DURATION / 3600.0
+        self._level = 0.25 * false_alarm_rate * REST_DURATION / 3600.0
         self._samples: list[tuple[float, float, float]] = []
         self._rests: list[RestResult] = []
         self._step = math.inf
@@ -233,7 +234,7 @@ class HealthMonitor:
         if self._samples and not 0.0 < time - self._samples[-1][0] <= 0.5:
             self.restart()
         self._samples.append((time, output, rate))
-        return time - self._samples[0][0] >= STRETCH_DURATION
+        return time - self._samples[0][0] >= REST_DURATION
 
     def examine_stretch(self, bias_variance: float, age: float,
                         is_announced: bool = False) -> RestResult | None:
@@ -311,11 +312,11 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     samples = np.bincount(part)
     means = (np.bincount(part, rate) / np.maximum(samples, 1))[samples > 0.5 * samples.max()]
     explained = (spectrum / _PART_DURATION
-                 + noise.mean_change_variance(STRETCH_DURATION, _PART_DURATION))
+                 + noise.mean_change_variance(REST_DURATION, _PART_DURATION))
     if len(means) < 2 or not means.var(ddof=1) <= 6.0 * explained:
         return None
 
-    too_much = (chdtrc(count, count * measured / ((claimed + rounding) * _MAX_NOISE_RATIO ** 2))
+    too_much = (chdtrc(count, count * measured / ((claimed + rounding) * NOISE_TOLERANCE ** 2))
                 < level)
     too_little = (not hidden
                   and chdtr(count, count * measured * _MAX_NOISE_REDUCTION ** 2 / claimed) < level)
@@ -349,7 +350,7 @@ def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: 
     for name, size, text, variance in (
             ('scale factor error', change, f'{100.0 * change:.3f} %', scale),
             ('bias', turned, f'{turned / DEGREE:.4f} deg/s',
-             bias + noise.mean_change_variance(age, STRETCH_DURATION))):
+             bias + noise.mean_change_variance(age, REST_DURATION))):
         sigmas = float(np.abs(size) / np.sqrt(variance))
         if math.erfc(sigmas / math.sqrt(2.0)) < 0.5 * level:
             found.append(f'the {name} changed by {text} ({sigmas:.1f} sigma)')

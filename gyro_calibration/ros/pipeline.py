@@ -49,6 +49,7 @@ from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
     CalibrationSession,
     DRIVE_SAMPLE_TIMEOUT,
+    MIN_TURN_ANGLE,
     REST,
     ROS_TIME_PAUSED,
 )
@@ -117,8 +118,6 @@ _MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits 
 _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
-#: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill.
-_MAX_HEADING_CHANGE_AT_REST = 1.0 * DEGREE
 _INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several publishers
 
 
@@ -265,9 +264,9 @@ class Pipeline:
         if velocity.is_moving:
             self._heading_at_rest = math.nan
         elif abs(math.remainder(heading - self._heading_at_rest,
-                                math.tau)) > _MAX_HEADING_CHANGE_AT_REST:
+                                math.tau)) > MIN_TURN_ANGLE:
             self._contradiction_time, self._heading_at_rest = now, heading
-            self.estimator.tracker.add_unknown_turn(_MAX_HEADING_CHANGE_AT_REST)
+            self.estimator.tracker.add_unknown_turn(MIN_TURN_ANGLE)
         elif math.isnan(self._heading_at_rest):
             self._heading_at_rest = heading
         # A late message is not used, and a contradictory one does not show standstill.

@@ -14,6 +14,7 @@ import math
 import re
 
 from chance import fewest, mean_bound, most
+from gyro_calibration.heading.bias_table import REST_DURATION
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import ROBOT_MOTION
@@ -22,7 +23,6 @@ from gyro_calibration.ros.health_monitor import (
     describe_change,
     examine_stretch,
     HealthMonitor,
-    STRETCH_DURATION,
 )
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ SELDOM = 2e-5  # false alarms an hour: one in 40 000 of these tests, with an hou
 
 def stretches(noise, hours, generator, scale=1.0):
     """Return outputs at rest in stretches, (n, samples), less the mean of one 600 s before."""
-    size, before = round(STRETCH_DURATION / INTERVAL), round(600.0 / INTERVAL)
+    size, before = round(REST_DURATION / INTERVAL), round(600.0 / INTERVAL)
     count = round(hours * 3600.0 / INTERVAL) // size * size
     whole = simulate_noise(Noise(scale * noise.angle_random_walk, noise.bias_instability,
                                  noise.rate_random_walk), before + count, INTERVAL, generator)
@@ -45,10 +45,10 @@ def stretches(noise, hours, generator, scale=1.0):
 def examined(outputs, noise, false_alarms, step=0.0):
     """Examine each stretch alone, at the level of a health monitor, and return the results."""
     time = np.arange(outputs.shape[1]) * INTERVAL
-    level = 0.25 * false_alarms * STRETCH_DURATION / 3600.0
-    variance = noise.angle_random_walk ** 2 / STRETCH_DURATION
+    level = 0.25 * false_alarms * REST_DURATION / 3600.0
+    variance = noise.angle_random_walk ** 2 / REST_DURATION
     return [examine_stretch(time, output, output, noise, level, step, variance,
-                            600.0 + STRETCH_DURATION * number)
+                            600.0 + REST_DURATION * number)
             for number, output in enumerate(outputs)]
 
 
@@ -70,8 +70,8 @@ def test_single_stretches_give_false_alarms_no_more_often_than_stated(noise, run
 
 def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
     """White noise, and a bias drawn with the stated deviation, which gets half of the alarms."""
-    stated, generator, size = 40.0, np.random.default_rng(12), round(STRETCH_DURATION / INTERVAL)
-    level, time, deviation = (0.25 * stated * STRETCH_DURATION / 3600.0,
+    stated, generator, size = 40.0, np.random.default_rng(12), round(REST_DURATION / INTERVAL)
+    level, time, deviation = (0.25 * stated * REST_DURATION / 3600.0,
                               np.arange(size) * INTERVAL, 1e-4)
     outputs = (generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), (4000, size))
                + generator.normal(0.0, deviation, (4000, 1)))
@@ -137,7 +137,7 @@ def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
 def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
     generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
     covariance, alarms, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
-    wander = math.sqrt(MEMS.mean_change_variance(age, STRETCH_DURATION))
+    wander = math.sqrt(MEMS.mean_change_variance(age, REST_DURATION))
     for _ in range(2000):
         first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(),
                                          covariance) for _ in range(2))
