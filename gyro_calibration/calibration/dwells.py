@@ -166,10 +166,9 @@ def require_output(log: Log) -> Array:
     return log.output
 
 
-def format_list(items: Sequence[str], limit: int = 5) -> str:
-    """Return the first words, separated by commas, and the number of further ones."""
-    return ', '.join(items[:limit]) + (
-        f' and {len(items) - limit} more' if len(items) > limit else '')
+def format_list(items: Sequence[str]) -> str:
+    """Return the first five words, separated by commas, and the number of further ones."""
+    return ', '.join(items[:5]) + (f' and {len(items) - 5} more' if len(items) > 5 else '')
 
 
 # rate tables

@@ -48,8 +48,8 @@ import numpy as np
 from scipy.optimize import differential_evolution
 from scipy.special import ndtri
 
-#: Cells in which the noise is counted, in one block of the fit; points of the motion in one cell.
-_CELLS_PER_BLOCK, _POINTS_PER_CELL = 5, 5
+#: Cells in which the noise is counted, in one block of the fit, and points of the motion in each.
+_CELLS_PER_BLOCK = 5
 #: Largest number of cells of the drive, of 1 s or longer.
 _MAX_DRIVE_CELLS = 600
 #: Median of the absolute value of a normal variable, standard deviations.
@@ -185,7 +185,7 @@ class CalibrationForecast:
         Then their covariance by errors of gyro and robot that the fit does not determine, (2, 2).
 
         """
-        count = blocks * _CELLS_PER_BLOCK * _POINTS_PER_CELL
+        count = blocks * _CELLS_PER_BLOCK ** 2
         point = (np.arange(count) + 0.5) * self._duration / count
         rate = motion.rate_at(point)
         known = np.column_stack([motion.heading_at(point), point, rate, np.gradient(rate, point)])
@@ -393,11 +393,21 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
         return math.inf if motion is None else forecast.search_error(motion)
     found = differential_evolution(cost, _AXIS_BOUNDS, maxiter=generations, popsize=10, tol=0.0,
                                    seed=generator, polish=False)
-    motion = family.motion_at(found.x)
-    if motion is None:
+    if (motion := family.motion_at(found.x)) is None:
         raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: '
                           'allow more seconds or a larger angle')
-    return require_credible(Plan(motion, forecast.predict(motion)))
+    plan, limits = Plan(motion, forecast.predict(motion)), RunLimits()
+    # a self-calibration by it would be refused
+    deviation = plan.prediction.scale_deviation
+    spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
+    if deviation > limits.max_scale_deviation or spread < limits.min_rate_spread:
+        raise DataRefused(
+            f'the best motion of {motion.duration:g} s determines the scale factor to '
+            f'{100.0 * deviation:.2g} %, and its rate varies by {spread / DEGREE:.2g} deg/s; '
+            f'needed are {100.0 * limits.max_scale_deviation:g} % and '
+            f'{limits.min_rate_spread / DEGREE:g} deg/s: allow more seconds, a larger angle or '
+            'faster turns')
+    return plan
 
 
 #: Bounds of the axes of `_MotionFamily`.
@@ -417,21 +427,6 @@ def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
         raise DataRefused(f'the headings allow a turn of {heading_span / DEGREE:.3g} deg, and at '
                           f'the slowest smooth rate the ramps alone need {angle / DEGREE:.3g} '
                           'deg: allow a larger angle or more acceleration')
-
-
-def require_credible(plan: Plan, limits: RunLimits | None = None) -> Plan:
-    """Return the plan, or refuse one whose self-calibration would be refused."""
-    limits, motion = limits or RunLimits(), plan.motion
-    deviation = plan.prediction.scale_deviation
-    spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
-    if deviation > limits.max_scale_deviation or spread < limits.min_rate_spread:
-        raise DataRefused(
-            f'the best motion of {motion.duration:g} s determines the scale factor to '
-            f'{100.0 * deviation:.2g} %, and its rate varies by {spread / DEGREE:.2g} deg/s; '
-            f'needed are {100.0 * limits.max_scale_deviation:g} % and '
-            f'{limits.min_rate_spread / DEGREE:g} deg/s: allow more seconds, a larger angle or '
-            'faster turns')
-    return plan
 
 
 def plain_motion(robot: RobotLimits, duration: float) -> Motion:

@@ -548,10 +548,10 @@ class Bin:
     rms: float  # of the residual, rad/s
 
 
-def bin_errors(fit: Calibration, values: Array, max_bins: int = 8) -> list[Bin]:
+def bin_errors(fit: Calibration, values: Array) -> list[Bin]:
     """Return the errors over one quantity, shape (n,), in non-empty bins of equal width."""
     dwells, found = fit.dwells, []
-    for low, high, within in equal_bins(values, max_bins):
+    for low, high, within in equal_bins(values, 8):
         chosen = within & fit.scatter.inliers
         if chosen.any():
             part, residual = select_dwells(dwells, chosen), fit.residual[chosen]

@@ -48,7 +48,8 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
-#: Probability of taking an effect that is not there, in one calibration.
+#: Probability of taking an effect that is not there, in one calibration, and of an alarm in a
+#: fleet without outliers, changes and missing effects.
 FALSE_ALARM_RATE = 0.01
 #: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
 #: one of thirty thousand calibrations.

@@ -152,7 +152,7 @@ METHODS = {'likelihood': fit_likelihood, 'heading': fit_heading, 'rate': fit_rat
 
 
 def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'likelihood',
-                   limits: RunLimits | None = None, noise: Noise | None = None,
+                   limits: RunLimits = RunLimits(), noise: Noise = Noise(),
                    reference: ReferenceErrors | None = None, output: Array | None = None,
                    prior: Array | None = None) -> ScaleBiasFit:
     """
@@ -177,7 +177,6 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     DataRefused : with the reason and the remedy
 
     """
-    limits = limits or RunLimits()
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
@@ -192,10 +191,10 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     # errors not observable in a run: wander of the bias, and errors of the reference with the
     # slip that all turns have; the root mean square of slips between zero and a largest one is
     # twice their standard deviation
-    scale, bias_floor = 1.0 + fit.scale_factor_error, 0.0 if noise is None else noise.allan_floor
+    scale = 1.0 + fit.scale_factor_error
     unobservable = np.diag(
         [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
-         bias_floor ** 2 + (scale * reference.rate_deviation) ** 2])
+         noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2])
     fit = replace(fit, covariance=fit.covariance + unobservable,
                   goodness=_goodness_of_fit(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
@@ -208,17 +207,11 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     return fit
 
 
-def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise | None) -> None:
-    """
-    Refuse a reference that follows the noise of the gyro: it is computed from this gyro.
-
-    The noise is the lesser of that of the model and that of the samples, `white_noise`, rad/√s.
-
-    """
-    if noise is None or not noise.angle_random_walk or not fit.dof:
-        return
+def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) -> None:
+    """Refuse a reference that follows the noise of the gyro: it is computed from this gyro."""
+    # that of the model, if it is known, or less by the samples, `white_noise`, rad/√s
     own = min(noise.angle_random_walk, white_noise) ** 2
-    if own and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-MIN_SLIP_SIGMAS):
+    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-MIN_SLIP_SIGMAS):
         raise DataRefused(
             'the reference is computed from this gyro, since they differ by '
             f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
@@ -255,9 +248,9 @@ def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
 
 
 def _goodness_of_fit(fit: ScaleBiasFit, reference: ReferenceErrors,
-                     noise: Noise | None) -> GoodnessOfFit | None:
+                     noise: Noise) -> GoodnessOfFit | None:
     """Compare the residual with the known noise of means over neighbouring blocks."""
-    if noise is None or not noise.angle_random_walk or not fit.dof:
+    if not noise.angle_random_walk or not fit.dof:
         return None
     block = float(np.median(np.diff(fit.influence[:, 2])))
     known = (noise.allan_variance(block) * block
@@ -434,8 +427,8 @@ class RestCheck:
     fit: ScaleBiasFit  # the calibration, with its bias updated by the rest
 
 
-def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None = None,
-               limits: RunLimits | None = None, false_refusal_rate: float = 1e-3) -> RestCheck:
+def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise(),
+               limits: RunLimits = RunLimits(), false_refusal_rate: float = 1e-3) -> RestCheck:
     """
     Check a calibration by a rest after its run, and refuse it if the gyro still drifts.
 
@@ -452,14 +445,12 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None 
     DataRefused : too few samples, motion, or drift
 
     """
-    limits = limits or RunLimits()
     duration = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     if duration < 0.75 * limits.rest_duration or len(time) < 10:
         raise DataRefused(f'after the run {duration:.1f} s of rest came, '
                           f'wanted {limits.rest_duration:g} s: leave the robot at rest after it')
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
-    noise, white_deviation, mean = (noise or Noise(), _deviation_of_mean(corrected),
-                                    float(corrected.mean()))
+    white_deviation, mean = _deviation_of_mean(corrected), float(corrected.mean())
     half_difference = _half_difference(corrected)
     variance = rest_variance(noise, duration, white_deviation, half_difference)
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
@@ -483,8 +474,8 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None 
 
 
 def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
-              noise: Noise | None = None, reference: ReferenceErrors | None = None,
-              limits: RunLimits | None = None) -> ScaleBiasFit:
+              noise: Noise = Noise(),
+              reference: ReferenceErrors | None = None) -> ScaleBiasFit:
     """
     Return a calibration by a profile whose log has too short a rest after it for `check_rest`.
 
@@ -507,7 +498,7 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     DataRefused : the robot turned throughout the motion, or goes on turning after it
 
     """
-    limits, noise = limits or RunLimits(), noise or Noise()
+    limits = RunLimits()
     reference = default_reference_errors(motion) if reference is None else reference
     end = motion.duration + max(fit.time_offset, 0.0)
     duration = float(time[-1]) - end
@@ -596,7 +587,7 @@ def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[
 
 
 def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
-                    limits: RunLimits | None = None) -> slice | None:
+                    limits: RunLimits = RunLimits()) -> slice | None:
     """
     Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
@@ -610,7 +601,6 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     rate : of the gyro as it went into the fit, rad/s, shape (n,)
 
     """
-    limits = limits or RunLimits()
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
     begins = np.arange(begin, latest + 1e-9, 0.25)
@@ -653,8 +643,8 @@ def _deviation_of_mean(rate: Array) -> float:
     return white_noise_deviation(rate, 1) / math.sqrt(len(rate))
 
 
-def calibrate_bias(time: Array, rate: Array, limits: RunLimits | None = None,
-                   noise: Noise | None = None, output: Array | None = None) -> tuple[float, float]:
+def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
+                   noise: Noise = Noise(), output: Array | None = None) -> tuple[float, float]:
     """
     Return the bias of a gyro at rest and its standard deviation, rad/s.
 
@@ -673,7 +663,6 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits | None = None,
     DataRefused : too few samples, a dead gyro, motion, or a mean that is no bias
 
     """
-    limits = limits or RunLimits()
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     parts = np.array_split(rate, 10)
@@ -691,7 +680,6 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits | None = None,
         raise DataRefused('the gyro was moved: its mean changed by '
                           f'{significant_changes.max() / DEGREE:.2f} '
                           'deg/s within the rest; keep it still and run again')
-    noise = noise or Noise()
     # the standard deviation of ten blocks may by chance be half of the true one
     mean_variance = max(blocks.var(ddof=1) / 10.0,
                         noise.angle_random_walk ** 2 / float(time[-1] - time[0]))

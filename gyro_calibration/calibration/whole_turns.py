@@ -59,7 +59,7 @@ class TurnCalibration:
 
 
 def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
-                    limits: RunLimits | None = None, noise: Noise | None = None,
+                    limits: RunLimits = RunLimits(), noise: Noise = Noise(),
                     mark_deviation: float = MARK_DEVIATION,
                     output: Array | None = None) -> TurnCalibration:
     """
@@ -84,7 +84,6 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     DataRefused : with the reason and the remedy
 
     """
-    limits, noise = limits or RunLimits(), noise or Noise()
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)

@@ -33,17 +33,17 @@ from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
-from gyro_calibration.diagnosis.words import readable_name
+from gyro_calibration.diagnosis.words import display_unit, readable_name
 from gyro_calibration.files import InputError
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.noise import NOISE_TERMS
 import numpy as np
 
 #: Symbol -> usual unit, and the factor from SI to it.
-DISPLAY_UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),
-                 'K': ('deg/h/√h', 216000.0 / DEGREE), 'Q': ('arcsec', 3600.0 / DEGREE),
-                 'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
+DISPLAY_UNITS = {**{part.symbol: display_unit(part.unit, part.name) for part in NOISE_TERMS},
+                 'Q': ('arcsec', 3600.0 / DEGREE), 'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -28,6 +28,7 @@ import re
 from typing import Any
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
@@ -46,7 +47,6 @@ from gyro_calibration.fleet.summary import (
     build_models,
     COMPONENT_LABELS,
     describe_type,
-    FALSE_ALARM_RATE,
     render_report,
     summarize_types,
     table_files,

@@ -41,8 +41,8 @@ import numpy as np
 if TYPE_CHECKING:
     from gyro_calibration.diagnosis.findings import Diagnosis
 
-#: Lines that are distinguished without colour.
-_LINE_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
+#: Lines that are distinguished without colour; further ones are thinner.
+_LINE_STYLES = ('-', '--', '-.', ':')
 #: Colour maps of values with a sign, symmetric about zero, and of others; both are suitable for
 #: the colour-blind.
 _DIVERGING_COLORMAP, _SEQUENTIAL_COLORMAP = 'RdBu_r', 'cividis'
@@ -53,9 +53,11 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
     """Draw headings, rad, against a reference, and their errors (figure 10 of Hong and Park)."""
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1.3))
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='reference')
-    for (name, heading), style in zip(headings.items(), _LINE_STYLES * len(headings)):
-        above.plot(time, heading / DEGREE, linestyle=style, linewidth=1)
-        below.plot(time, (heading - true) / DEGREE, linestyle=style, label=name)
+    for number, (name, heading) in enumerate(headings.items()):
+        repeats, style = divmod(number, len(_LINE_STYLES))
+        line = {'linestyle': _LINE_STYLES[style], 'linewidth': 1.5 / (1 + 2 * repeats)}
+        above.plot(time, heading / DEGREE, **line)
+        below.plot(time, (heading - true) / DEGREE, **line, label=name)
     above.set(ylabel='heading [deg]', title='Heading of the robot by its gyro')
     above.legend(loc='upper right')
     below.axhline(0.0, color='black', linewidth=0.5)
@@ -136,7 +138,7 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
                 label='sum of the parts')
     lowest, highest = 0.4 * float(chart.lower.min()), 2.5 * float(chart.upper.max())
     for each, style in zip((each for each in fit.figures.values() if each.value),
-                           _LINE_STYLES[1:]):
+                           _LINE_STYLES[1:] + _LINE_STYLES):
         line = each.value * np.sqrt(each.term.allan_variance(times))
         shown = (line > lowest) & (line < highest)
         axes.loglog(times[shown], line[shown] * hour, linestyle=style, linewidth=1.2,

@@ -25,6 +25,7 @@ import io
 import math
 from typing import Any
 
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
 from gyro_calibration.diagnosis.report import (
     Chart,
@@ -66,8 +67,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-#: Probability of an alarm in a fleet without outliers, changes and missing effects.
-FALSE_ALARM_RATE = 0.01
 COMPONENT_LABELS = {UNITS: 'between units', POWER_ONS: 'between power-ons',
                     DRIVES: 'common to a drive'}
 Record = Mapping[str, Any]
