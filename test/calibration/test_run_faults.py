@@ -115,7 +115,7 @@ def test_a_motion_that_ends_early_or_begins_late_is_reported_by_when(time, moved
         self_calibrate(time, moved, CALIBRATION_MOTION, noise=XV3500.noise)
 
 
-@pytest.mark.parametrize('noise', [None, XV3500.noise], ids=['noise unknown', 'noise known'])
+@pytest.mark.parametrize('noise', [Noise(), XV3500.noise], ids=['noise unknown', 'noise known'])
 @pytest.mark.parametrize('limit', [25, 35, 42])
 def test_a_robot_that_does_not_reach_the_rates_of_the_profile_is_refused_by_its_limit(
         limit, noise):

@@ -67,7 +67,7 @@ def rms(error):
 
 
 @cache
-def calibrated(path, seconds, noise=None):
+def calibrated(path, seconds, noise=Noise()):
     """Return for every start a fit, or None if refused, and time, output and heading."""
     log, found = read(path), []
     for start in STARTS:
