@@ -205,10 +205,19 @@ class ThresholdFilter:
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
         if not self.settings.rate:
             return rate
-        self._window.append((time, rate))
-        while self._window[0][0] <= time - self.settings.window and len(self._window) > 1:
-            self._window.popleft()
-        return float(filter_rates(self.settings, *np.array(self._window).T)[-1])
+        window = self._window
+        window.append((time, min(max(rate, -MAX_RATE), MAX_RATE)))
+        while window[0][0] <= time - self.settings.window and len(window) > 1:
+            window.popleft()
+        # not a running sum, which would accumulate rounding errors
+        rates = [each for _, each in window]
+        mean = sum(rates) / len(rates)
+        if not abs(mean) < self.settings.rate:
+            return rate
+        # motion if the window varies by more than the noise
+        explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
+        variance = sum(each * each for each in rates) / len(rates) - mean * mean
+        return rate if 0.0 < explained < variance * (time - window[0][0]) else 0.0
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
