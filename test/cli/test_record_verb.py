@@ -251,7 +251,7 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
 def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, number):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / name, '--json'))
-        wait_until(lambda: holds(tmp_path / name, 300), 60.0, 'samples')
+        wait_until(lambda: holds(tmp_path / name, 1000), 60.0, 'samples')
         code, out, _ = recording.end(number)
     answer, log = json.loads(out), read(tmp_path / name)
     assert code == 0
