@@ -583,7 +583,7 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
     # of the deviations from a solution without priors, of which rounding leaves more digits
     start = np.linalg.lstsq(matrix, weighted.T @ data.gyro_increments, rcond=1e-14)[0]
     rest = data.gyro_increments - data.columns @ start
-    gradient, residual, dof = weighted.T @ rest, rest, count - len(prior) - 1.0
+    gradient, residual, dof = weighted.T @ rest, rest, max(count - len(prior) - 1.0, 1.0)
     for _ in range(3):
         rate_variance = max(float(residual @ noise.solve(residual)) / dof,
                             _min_rate_variance(data))
@@ -594,7 +594,7 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
         inverse = np.linalg.inv(scaled) / np.outer(size, size)
         change = inverse @ (gradient - precision * (start - data.prior_mean))
         # the values that the priors leave open, and the ratio of the noises
-        dof = count - 1.0 - float(np.trace(inverse @ matrix))
+        dof = max(count - 1.0 - float(np.trace(inverse @ matrix)), 3.0)
         residual = rest - data.columns @ change
     values = start + change
     log_likelihood = -0.5 * (
