@@ -71,7 +71,7 @@ from gyro_calibration.calibration.reference_noise import (
     rate_noise_share,
 )
 from gyro_calibration.calibration.run_faults import refuse_unit_error
-from gyro_calibration.calibration.selection import select_effects, Selection
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, select_effects, Selection
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION,
     fit_rate,
@@ -115,8 +115,6 @@ _GYRO_LAG_DEVIATION = 2e-4
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
-#: Chance by which an axis that is parallel is stated to be oblique.
-_MISALIGNMENT_LEVEL = 0.01
 #: Share of the largest differences that show their tail, and the probability that noise alone
 #: exceeds the limit of a jump in a log.
 _TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
@@ -523,7 +521,7 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
                'their stamps not of one clock: check them before the model is used')
     if fit.misalignment.size:
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
-        if chance < _MISALIGNMENT_LEVEL:
+        if chance < FALSE_ALARM_RATE:
             yield (f'the axis of the gyro is oblique to that of the attitude by '
                    f'{angle / DEGREE:.2f} +- {half / DEGREE:.2f} deg (95 %), so that parts of the '
                    f'rotations about other axes are in the output: {MISALIGNMENT_REMEDY}')

@@ -720,19 +720,20 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     offset, data, averages, averaged_covariance, estimate = _fit_offset(
         alignment, largest_time_offset)
     values, covariance = estimate.values[:2], averaged_covariance[:2, :2]
+    start = math.nan, math.nan
     found, edges, inside, noise_deviation = _find_stretch_of_fit(estimate, data)
     if alignment.is_measured:
         # noise during turns only, such as slip of wheels, exceeds its robust estimate
         noise_deviation = max(noise_deviation,
                               math.sqrt(max(found.remaining_squares, 0.0) / (len(inside) - 4.0)))
+        start = _start_heading(data, estimate)
+        alone = estimate
     else:
-        values = averages[:2]
-        probability, stretch_values, stretch_covariance = _weigh_stretch(
-            estimate, data, found, inside, noise_deviation)
-        change = stretch_values - values
-        covariance = ((1.0 - probability) * covariance + probability * stretch_covariance
-                      + probability * (1.0 - probability) * np.outer(change, change))
-        values = values + probability * change
+        values, covariance = _average_over_stretch(
+            averages[:2], covariance, estimate, data, found, inside, noise_deviation)
+        # a profile itself has no noise, so that the ratio of the noises is not estimated
+        white = _IncrementCovariance(data, 0.0)
+        alone = _solve_weighted(data, white, white.solve(data.columns), estimate.prior_deviation)
     scale, bias = values.tolist()
     # with a slip, first the columns of the differences between turns, then of the ends of turns
     slips = averages[data.prior_deviation == slip_deviation]
@@ -740,10 +741,6 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
     of_axes = slice(4, 4 + cross_rotation.shape[1])
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
-    # a profile itself has no noise, so that the ratio of the noises is not estimated
-    alone_noise = _IncrementCovariance(data, 0.0)
-    alone = estimate if alignment.is_measured else _solve_weighted(
-        data, alone_noise, alone_noise.solve(data.columns), estimate.prior_deviation)
     residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
     dof = alone.dof + (not alignment.is_measured)
     reference_noise = (math.sqrt(estimate.rate_variance * estimate.noise.ratio)
@@ -753,8 +750,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         (abs(found.excess_rate) * float(inside.sum()),
          math.sqrt(found.explained_squares) / noise_deviation),
         math.sqrt(averaged_covariance[2, 2]),
-        np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end),
-        *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
+        np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end), *start,
         residual_squares, dof, slip_deviation=slip, misalignment=estimate.values[of_axes],
         misalignment_covariance=averaged_covariance[of_axes, of_axes])
 
@@ -871,9 +867,11 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     return found, edges, steps[:, found.first] - steps[:, found.last], noise_deviation
 
 
-def _weigh_stretch(estimate: _Estimate, data: _Increments, found: DeviatingStretch,
-                   stretch_column: Array, noise_deviation: float) -> tuple[float, Array, Array]:
-    """Return the probability of a stretch with a turn of its own, and (1 + s, b) with it."""
+def _average_over_stretch(
+        values: Array, covariance: Array, estimate: _Estimate, data: _Increments,
+        found: DeviatingStretch, stretch_column: Array,
+        noise_deviation: float) -> tuple[Array, Array]:
+    """Return (1 + s, b) and covariance, averaged over a stretch with a turn of its own or none."""
     total_squares = max(found.remaining_squares + found.explained_squares, 1e-300)
     logarithms = -0.5 * (
         (estimate.dof - 1.0) * np.log1p(-np.minimum(
@@ -885,7 +883,10 @@ def _weigh_stretch(estimate: _Estimate, data: _Increments, found: DeviatingStret
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
     other = _solve_weighted(widened, estimate.noise, estimate.noise.solve(widened.columns),
                             np.insert(estimate.prior_deviation, 4, EXCESS_RATE_DEVIATION))
-    return odds / (1.0 + odds), other.values[:2], other.covariance[:2, :2]
+    probability, change = odds / (1.0 + odds), other.values[:2] - values
+    return values + probability * change, (
+        (1.0 - probability) * covariance + probability * other.covariance[:2, :2]
+        + probability * (1.0 - probability) * np.outer(change, change))
 
 
 def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> DeviatingStretch:

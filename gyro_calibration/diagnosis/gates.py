@@ -46,6 +46,7 @@ from gyro_calibration.calibration.reference_noise import (
     step_evenness,
 )
 from gyro_calibration.calibration.run_faults import fit_scale
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -471,8 +472,6 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: Least residual over the longest spans, and least rotation of the reference, rad, for which
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
-#: Chance by which the white noise of a gyro is taken for turns of its own.
-_NOISE_LEVEL = 0.01
 #: Relative difference of mean rates over spans that is rounding.
 _EQUAL_RATES = 1e-9
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
@@ -695,7 +694,7 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
     deviation = math.sqrt(
         left / max(kept.sum() - 2, 1) / max(variance_of(gyro) / scale ** 2, 1e-300))
     noise_share = (white * float(steps[kept].mean()) / max(variance_of(gyro), 1e-300)
-                   * float(stats.chi2.isf(_NOISE_LEVEL, kept.sum())) / kept.sum())
+                   * float(stats.chi2.isf(FALSE_ALARM_RATE, kept.sum())) / kept.sum())
     return Agreement(float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left),
                      min(noise_share, 1.0))
 

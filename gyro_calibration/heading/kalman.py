@@ -53,8 +53,15 @@ class RateIntegral:
     #: be added to others.
     is_unobserved: bool = False
 
-    def __add__(self, other: RateIntegral, sign: int = 1) -> RateIntegral:
+    def __add__(self, other: RateIntegral) -> RateIntegral:
         """Return the integral over both, one after the other."""
+        return self._combine(other, 1)
+
+    def __sub__(self, other: RateIntegral) -> RateIntegral:
+        """Return the rest of this integral after another with which it begins."""
+        return self._combine(other, -1)
+
+    def _combine(self, other: RateIntegral, sign: int) -> RateIntegral:
         return RateIntegral(
             self.duration + sign * other.duration, self.angle + sign * other.angle,
             self.sensitivity + sign * other.sensitivity,
@@ -62,10 +69,6 @@ class RateIntegral:
             self.extra_noise_variance + sign * other.extra_noise_variance,
             block_count=self.block_count + sign * other.block_count,
             block_square_sum=self.block_square_sum + sign * other.block_square_sum)
-
-    def __sub__(self, other: RateIntegral) -> RateIntegral:
-        """Return the rest of this integral after another with which it begins."""
-        return self.__add__(other, -1)
 
 
 @dataclass(frozen=True)
