@@ -220,3 +220,13 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
             errors.append(bias)
             refused += 1
     assert refused >= 10 and np.sqrt(np.mean(np.square(errors))) < 0.1 * DEGREE
+
+
+def test_a_short_command_has_fewer_blocks_than_values_and_is_answered():
+    """Four turns one way in 20 s: 39 increments, 38 values with the wander of the bias."""
+    time = np.arange(0.0, 20.0, 0.01)
+    rate = 40.0 * DEGREE * (np.mod(time, 5.0) > 2.0)
+    noise = 0.05 * DEGREE * np.random.default_rng(1).standard_normal(len(time))
+    fit = calibrate_encoder(Log(output=1.01 * rate + 0.1 * DEGREE + noise, time=time,
+                                reference_rate=rate), 'likelihood').fit
+    assert abs(fit.scale_factor_error - 0.01) < 4.0 * np.sqrt(fit.covariance[0, 0]) < 0.04
