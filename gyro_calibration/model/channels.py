@@ -91,7 +91,9 @@ class _Block:
     def signal(self, channel: str) -> Number:
         """Return a channel."""
         if channel == 'vibration' and channel not in self._signals:
-            ahead = self.lag_difference('specific_force', 1.0)  # deviation from its mean over 1 s
+            # a second high-pass filter of 1 s, since after one a tilt within seconds still counts
+            self._signals['fast_force'] = self.lag_difference('specific_force', 1.0)
+            ahead = self.lag_difference('fast_force', 1.0)
             self._signals[channel] = ahead * ahead
         return self._signals.get(channel, 0.0)
 
