@@ -36,7 +36,11 @@ from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
+from gyro_calibration.driver.protocols.protocol import (
+    ASSUMED_FORCE_NOISE,
+    ASSUMED_NOISE,
+    TRISTATE,
+)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
@@ -50,7 +54,6 @@ from tqdm import tqdm
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
 #: Time, s, for which the header of a log waits for values that come seldom: with and without a
@@ -85,7 +88,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                       help='axis of a gyro with three; default: z')
     port.add_argument('--invert', action='store_true', default=None,
                       help='the gyro reports clockwise turns as positive')
-    port.add_argument('--increments', choices=list(_INCREMENT_OPTIONS), default='default',
+    port.add_argument('--increments', choices=list(TRISTATE), default='default',
                       help='the gyro sends angles, not rates; default: that of the protocol')
     port.add_argument('--sample-rate', type=verb.positive_number, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
@@ -340,7 +343,7 @@ class _PortSession:
         try:
             self._settings = Settings(
                 sensitivity=given.sensitivity, invert=given.invert, axis=given.axis,
-                columns=columns, increments=_INCREMENT_OPTIONS[given.increments],
+                columns=columns, increments=TRISTATE[given.increments],
                 sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
                                           self._settings, on_change=self._report_state)

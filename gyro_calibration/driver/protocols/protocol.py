@@ -42,6 +42,9 @@ ASSUMED_NOISE = math.radians(0.5)
 #: Standard deviation of a specific force, m/s²: 0.01 g, beyond the noise of any such unit.
 ASSUMED_FORCE_NOISE = 0.1
 
+#: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
+TRISTATE = {'default': None, 'always': True, 'never': False}
+
 _PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
 _MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
 
