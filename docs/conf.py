@@ -11,6 +11,8 @@
 """Sphinx builds these pages with `make docs`; rosdoc2 builds the same for docs.ros.org."""
 
 from contextlib import redirect_stdout, suppress
+from dataclasses import is_dataclass
+import inspect
 import io
 import math
 from pathlib import Path
@@ -74,6 +76,27 @@ def _split_entry(line):
             else [line])
 
 
+def describe_fields(app, what, name, obj, options, lines):
+    """Append what the comments of a record state of its fields."""
+    if what != 'class' or not is_dataclass(obj):
+        return
+    entries, before = [], ''  # a comment in lines before a field holds for the next ones, too
+    is_continued = False
+    for line in inspect.getsource(obj).splitlines():
+        if re.match(' +(@|def )', line):
+            break
+        field = re.match(r'    (\w+): .*?(?:  # (.*))?$', line)
+        comment = re.match(r'    #:? (.*)', line)
+        if field and not field[1].startswith('_'):
+            before = '' if field[2] else before
+            entries += [field[1], f'    {field[2] or before}']
+        elif comment:
+            before = f'{before} {comment[1]}' if is_continued else comment[1]
+        is_continued = bool(comment)
+    if entries:
+        lines += ['', 'Parameters', '----------', *entries, '']
+
+
 def describe_formats(app, docname, source):
     """Append the numbers of each wire format, and what its module states of it, to their page."""
     if docname != 'reference/wire_formats':
@@ -100,4 +123,5 @@ def setup(app):
     """Write pages; describe before napoleon (priority 500) reads the sections."""
     app.connect('builder-inited', write_verbs)
     app.connect('autodoc-process-docstring', describe_entries, priority=400)
+    app.connect('autodoc-process-docstring', describe_fields, priority=450)
     app.connect('source-read', describe_formats)

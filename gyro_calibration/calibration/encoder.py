@@ -523,8 +523,10 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
         if chance < FALSE_ALARM_RATE:
             yield (f'the axis of the gyro is oblique to that of the attitude by '
-                   f'{angle / DEGREE:.2f} +- {half / DEGREE:.2f} deg (95 %), so that parts of the '
+                   f'{angle / DEGREE:.3g} +- {half / DEGREE:.2g} deg (95 %), so that parts of the '
                    f'rotations about other axes are in the output: {MISALIGNMENT_REMEDY}')
+        yield ('the scale factor error is that of rotations about the axis of the attitude which '
+               '--axis names, not about the own axis of the gyro')
     if method == 'course':
         if fit.reference_drift is not None:
             rate, half = (each / DEGREE for each in fit.reference_drift)

@@ -287,8 +287,9 @@ def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None
 
 def refuse_one_speed(motion: Motion, limits: RunLimits) -> None:
     """Refuse a motion whose rate varies too little to separate scale and bias."""
-    headings = motion.heading_at(np.arange(0.0, motion.duration, 0.5))
-    spread = float(np.std(np.diff(headings) / 0.5))
+    step = min(0.5, 0.25 * motion.duration)  # s
+    headings = motion.heading_at(np.arange(0.0, motion.duration, step))
+    spread = float(np.std(np.diff(headings) / step))
     if spread < limits.min_rate_spread:
         raise DataRefused(f'the {motion.name} turns at one speed (its rate varies by '
                           f'{spread / DEGREE:.2f} deg/s), so scale and bias cannot be separated: '

@@ -36,21 +36,24 @@ from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
+from gyro_calibration.driver.protocols.protocol import (
+    ASSUMED_FORCE_NOISE,
+    ASSUMED_NOISE,
+    TRISTATE,
+)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
-from gyro_calibration.logs.recording import read_recording, topic_type_fault, Topics
+from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message, METADATA_NAME
 from tqdm import tqdm
 
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
 #: Time, s, for which the header of a log waits for values that come seldom: with and without a
@@ -70,7 +73,6 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help=f'default: {_DEFAULT_TOPICS["temperature"]}')
     topics.add_argument('--reference-topic', metavar='TOPIC', action='append', default=[],
                         help='topic of a reference; several are possible with .mcap')
-    topics.add_argument('--all', action='store_true', help='all topics, with .mcap')
     port = parser.add_argument_group('from the port, without ROS 2')
     port.add_argument('--port', metavar='PORT', help='port of the gyro, or a pattern such as '
                       '"/dev/serial/by-id/*A9003XYZ*"')
@@ -86,7 +88,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                       help='axis of a gyro with three; default: z')
     port.add_argument('--invert', action='store_true', default=None,
                       help='the gyro reports clockwise turns as positive')
-    port.add_argument('--increments', choices=list(_INCREMENT_OPTIONS), default='default',
+    port.add_argument('--increments', choices=list(TRISTATE), default='default',
                       help='the gyro sends angles, not rates; default: that of the protocol')
     port.add_argument('--sample-rate', type=verb.positive_number, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
@@ -181,7 +183,7 @@ class McapRecorder(_Recorder):
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
-        self._writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
+        self.writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample as messages on the topics of the driver; the stamp is in ns."""
@@ -195,25 +197,20 @@ class McapRecorder(_Recorder):
              [0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE, 0.0, 0.0, sample.output,
               *cdr.z_axis_covariance(self.variance), 0.0, 0.0, force or 0.0, *of_force]))
         for topic, kind, numbers in messages:
-            data = cdr.serialize(stamp, 'gyro', numbers)
-            self.add_message(Message(topic, kind, stamp, data), cdr.DEFINITIONS[kind])
-
-    def add_message(self, message: Message, definition: str) -> None:
-        """Add a message with the definition of its kind, as text."""
-        self._writer.add(message.topic, message.kind, definition, message.received, message.data)
+            self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
 
     def flush(self, is_due: bool = False) -> None:
         """Write the messages so far as a chunk."""
-        if self._writer.pending_bytes:
-            head = b'' if self.size else self._writer.pack_header(
+        if self.writer.pending_bytes:
+            head = b'' if self.size else self.writer.pack_header(
                 f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
-            self.append(head + self._writer.pack_chunk())
+            self.append(head + self.writer.pack_chunk())
 
     def finish(self) -> None:
         """Write the last chunk and the index."""
         self.flush()
         if self.size:
-            self.append(self._writer.pack_summary())
+            self.append(self.writer.pack_summary())
 
     def close(self) -> None:
         """Close the file, on a full disk with an end that readers understand."""
@@ -336,7 +333,7 @@ class _PortSession:
     remedy = 'check the port, the power and the wires of the gyro'
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
-        if given.topic or given.temperature_topic or given.reference_topic or given.all:
+        if given.topic or given.temperature_topic or given.reference_topic:
             raise InputError('--port and topics were both given; record one of them, '
                              'or the topics of a driver on that port')
         if not 0 <= given.baud <= MAX_BAUD:
@@ -346,7 +343,7 @@ class _PortSession:
         try:
             self._settings = Settings(
                 sensitivity=given.sensitivity, invert=given.invert, axis=given.axis,
-                columns=columns, increments=_INCREMENT_OPTIONS[given.increments],
+                columns=columns, increments=TRISTATE[given.increments],
                 sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
                                           self._settings, on_change=self._report_state)
@@ -429,7 +426,7 @@ class _TopicSession:
             raise InputError('options of a port were given without --port; '
                              'give --port or omit them')
         self._is_mcap = given.out.endswith('.mcap')
-        if not self._is_mcap and (given.all or len(given.reference_topic) > 1):
+        if not self._is_mcap and len(given.reference_topic) > 1:
             raise InputError(f'{given.out}: a log has one gyro and one reference; '
                              'record several topics into .mcap')
         try:
@@ -438,24 +435,19 @@ class _TopicSession:
             raise InputError(f'topics need ROS 2, which is not available ({error}); '
                              'source it, or record from --port') from None
         self._take_messages = take_messages
-        names = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
-                 'temperature': given.temperature_topic or _DEFAULT_TOPICS['temperature'],
-                 **dict(zip(('reference',), given.reference_topic))}
-        self._roles = {'/' + topic.lstrip('/'): role for role, topic in names.items()}
-        if len(self._roles) < len(names):
-            raise InputError(f'one topic was named twice, of {", ".join(names.values())}; '
-                             f'name one each for {", ".join(names)}')
-        self._topics = [*self._roles, *given.reference_topic[1:]]
-        self._messages, self._samples, self._is_waiting = 0, 0, True
-        self._received: set[str] = set()  # topics
-        self._unknown_topics: dict[str, str] = {}
-        self._previous, self._intervals = (0, 0), Intervals()
-        self._damaged, self._clock_steps, self._misfits = 0, 0, dict[str, str]()
+        roles = [(given.topic or _DEFAULT_TOPICS['gyro'], 'gyro'),
+                 (given.temperature_topic or _DEFAULT_TOPICS['temperature'], 'temperature'),
+                 *((topic, 'reference') for topic in given.reference_topic)]
+        self._roles = {'/' + topic.lstrip('/'): role for topic, role in roles}
+        if len(self._roles) < len(roles):
+            raise InputError('one topic was named twice, of '
+                             f'{", ".join(topic for topic, _ in roles)}; name one for each')
+        self._messages, self._samples, self._damaged, self._is_waiting = 0, 0, 0, True
+        self._received: dict[str, str] = {}  # role -> topic
+        self._previous, self._intervals, self._clock_steps = (0, 0), Intervals(), 0
         self._given, self._stop, self._start_time = given, stop, time.monotonic()
-        self.recorder = McapRecorder(
-            given.out if self._is_mcap else f'{given.out}.mcap',
-            lambda: recording_notes(
-                topics='everything' if given.all else ', '.join(self._topics)))
+        self.recorder = McapRecorder(given.out if self._is_mcap else f'{given.out}.mcap',
+                                     lambda: recording_notes(topics=', '.join(self._roles)))
 
     def counts(self) -> tuple[int, int]:
         samples = self._samples or (self._messages if self._is_mcap else 0)
@@ -464,7 +456,6 @@ class _TopicSession:
     def record(self, on_chunk: Callable[[], None]) -> None:
         def tick(node: Any) -> None:
             on_chunk()
-            self._unknown_topics = node.unknown_topics
             if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
                 self._is_waiting = False
                 if missing := node.missing_topics:
@@ -477,21 +468,15 @@ class _TopicSession:
         stdout_copy = os.dup(1)
         os.dup2(2, 1)
         try:
-            self._take_messages(self._topics, self._given.all, self._add_message, tick, self._stop)
+            self._take_messages(self._roles, self._add_message, tick, self._stop)
         finally:
             os.dup2(stdout_copy, 1)
             os.close(stdout_copy)
 
-    def _add_message(self, message: Message, definition: str) -> None:
-        role = self._roles.get(message.topic)
-        if role and (wrong := topic_type_fault(role, message.topic, message.kind)):
-            if not self._is_mcap:
-                raise LogError(wrong)
-            self._misfits[message.topic], role = wrong, None
+    def _add_message(self, role: str, message: Message) -> None:
         self._messages += 1
-        self.recorder.add_message(message, definition)
-        if role:
-            self._received.add(message.topic)
+        self.recorder.writer.add(message)
+        self._received[role] = message.topic
         if role == 'gyro':
             try:
                 stamp = cdr.parse(message.data, cdr.LAYOUTS[message.kind])[0] or message.received
@@ -512,19 +497,15 @@ class _TopicSession:
         """Write the log; the recording is kept where that fails."""
         recording, out = self.recorder.path, self._given.out
         if not self._is_mcap:
-            topics = {self._roles[topic]: topic for topic in self._received}
             try:
                 if os.path.exists(out):
                     raise LogError(f'{out}: another program has created it meanwhile')
-                write_log(out, read_recording(recording, Topics(**topics)))
+                write_log(out, read_recording(recording, Topics(**self._received)))
             except (InputError, OSError) as error:
                 raise DataRefused(f'{error}; what was recorded is in {recording}') from None
             os.unlink(recording)
-        remarks = [f'{topic}: {reason}; it was not recorded.'
-                   for topic, reason in self._unknown_topics.items()]
-        remarks += [f'{wrong}; it was recorded as it is.' for wrong in self._misfits.values()]
-        if self._damaged:
-            remarks.append(f'{self._damaged} messages of the gyro could not be read.')
+        remarks = ([f'{self._damaged} messages of the gyro could not be read.']
+                   if self._damaged else [])
         if self._clock_steps:
             remarks.append(f'The clock of the stamps was set {self._clock_steps} times.')
         return {'messages': self._messages}, remarks

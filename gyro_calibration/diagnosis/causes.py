@@ -133,7 +133,9 @@ def untestable_causes(testable: Collection[str], missing: Collection[str],
     """
     found = {}
     for name, cause in CAUSES.items():
-        lacks = ' and no '.join(sorted(cause.required_channels & {*missing}))
+        lacks = ' and no '.join(
+            {'cross_axis_1': 'attitude', 'supply': 'supply voltage'}.get(each, each)
+            for each in sorted(cause.required_channels & {*missing}))
         if name not in testable and (why := f'the logs have no {lacks}'.replace('_', ' ')
                                      if lacks else reason(cause)):
             found[name] = why

@@ -48,15 +48,13 @@ class Emulator:
     The speed is a factor of real time; inf is the speed of the reader. Up to 1, bytes that are not
     read are lost, as on a real line; above 1 the emulator waits for the reader. A symbolic link to
     the pseudo-terminal, whose name differs from run to run, is removed at the end. Raise
-    `ValueError` where the speed is not above 0, or settings that the protocol needs are missing.
+    `ValueError` where settings that the protocol needs are missing.
 
     """
 
     def __init__(self, protocol: Protocol, samples: Iterable[Sample],
                  settings: Settings | None = None, speed: float = 1.0,
                  link: str | Path | None = None, wait_for_reader: bool = False):
-        if not speed > 0.0:
-            raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
         self._settings = settings or Settings()
         protocol.check_settings(self._settings)
         self._protocol, self._samples, self._speed = protocol, samples, speed
@@ -90,9 +88,7 @@ class Emulator:
         self._send(self._protocol.preamble)
         encode, start, begin = self._protocol.encoder(self._settings), time.monotonic(), None
         for number, sample in enumerate(self._samples):
-            if sample.time is None:
-                raise ValueError('a sample has no time at which to send it: set Sample.time in '
-                                 'seconds')
+            assert sample.time is not None
             due = sample.time / self._speed
             begin = due if begin is None else begin
             wait = start + due - begin - time.monotonic()

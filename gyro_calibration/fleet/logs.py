@@ -65,6 +65,7 @@ from gyro_calibration.files import (
     write_atomically,
 )
 from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.columns import find_delimiter
 from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES, read_log
 from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
 from gyro_calibration.logs.recording import read_recording
@@ -205,14 +206,9 @@ def _read_header(path: str) -> list[str]:
             line = file.readline(_MAX_NOTE_BYTES).decode('utf-8-sig', 'replace')
     except OSError:  # reported where the log is read
         return []
-    columns = [name.strip().strip('"').lower() for name in line.split(_find_separator(line))]
+    columns = [name.strip().strip('"').lower() for name in line.split(find_delimiter(line))]
     is_log = any(name.startswith(('time', 'gyro')) for name in columns)
     return columns if 'log' in columns or set(ENTRY_KEYS) & set(columns) and not is_log else []
-
-
-def _find_separator(line: str) -> str:
-    """Return the separator of values, as in a log: comma, semicolon or tab."""
-    return max(',;\t', key=line.count)
 
 
 def _resolve_log_path(path: str, log: str) -> str:
@@ -227,7 +223,7 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
                          f'{", ".join(ENTRY_KEYS)}, each once')
     first, *lines = _read_text(path).splitlines()
-    for number, row in enumerate(csv.reader(lines, delimiter=_find_separator(first)), 2):
+    for number, row in enumerate(csv.reader(lines, delimiter=find_delimiter(first)), 2):
         if not any(map(str.strip, row)):
             continue
         if len(row) != len(columns):

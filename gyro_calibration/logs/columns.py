@@ -156,6 +156,11 @@ def _strip_axis(name: str, axis: str) -> str:
     return f'{first}_{rest}' if rest and first in ('gyro', 'acceleration') else name
 
 
+def find_delimiter(line: str) -> str:
+    """Return the delimiter of the values of a line: comma, semicolon or tab."""
+    return max(',;\t', key=line.count)
+
+
 def is_header(header: Sequence[str], user_columns: Mapping[str, str], axis: str) -> bool:
     """Tell whether a row contains at least one known column name."""
     named = {text for names in user_columns.values() for name in (names, *names.split('/'))

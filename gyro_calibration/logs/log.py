@@ -51,6 +51,7 @@ from gyro_calibration.logs.columns import (
     COLUMNS,
     DEGREE,
     find_columns,
+    find_delimiter,
     is_header,
     QUANTITIES,
     ROTATIONS,
@@ -299,7 +300,7 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
     while line.startswith('#'):
         notes.append(line[1:].strip())
         line = next(lines, '')
-    delimiter = max((',', ';', '\t'), key=line.count)
+    delimiter = find_delimiter(line)
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):

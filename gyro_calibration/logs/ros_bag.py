@@ -388,12 +388,13 @@ class McapWriter:
         self._offset = len(head + metadata)
         return head + metadata
 
-    def add(self, topic: str, kind: str, definition: str, received: int, data: bytes) -> None:
-        """Add a message, in CDR, to the next chunk; the time is in ns."""
+    def add(self, message: Message) -> None:
+        """Add a message of a type of `DEFINITIONS` to the next chunk."""
+        kind, topic, received = message.kind, message.topic, message.received
         if kind not in self._schemas:
             schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H', len(self._schemas) + 1),
                                   _pack_sized(kind), _pack_sized('ros2msg'),
-                                  _pack_sized(definition))
+                                  _pack_sized(DEFINITIONS[kind]))
             self._schemas[kind] = len(self._schemas) + 1, schema
             self._records += schema
         if topic not in self._channels:
@@ -405,7 +406,7 @@ class McapWriter:
         number = self._channels[topic][0]
         self._indexes[number].append((received, len(self._records)))
         head = struct.pack('<HIQQ', number, 0, received, received)
-        self._records += _pack_record(_RecordCode.MESSAGE, head, data)
+        self._records += _pack_record(_RecordCode.MESSAGE, head, message.data)
 
     def pack_chunk(self) -> bytes:
         """Return the messages since the last chunk as a chunk with index; b'' without any."""

@@ -149,7 +149,7 @@ class GyroModel:
     # calibrated range of the fit, rad/s and degC
     rate_range: tuple[float, float] = (-math.inf, math.inf)
     temperature_range: tuple[float, float] = (-math.inf, math.inf)
-    reference_temperature: float = 25.0
+    reference_temperature: float = 25.0  # where no temperature is known, degC
     noise: Noise = Noise()  # its noise figures
     # name, serial_number, technology, as text
     gyro: Mapping[str, str] = field(default_factory=dict)

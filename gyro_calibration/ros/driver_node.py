@@ -33,7 +33,7 @@ from gyro_calibration.driver.connection import (
     SampleMean,
 )
 from gyro_calibration.driver.protocols import AUTO, Sample, Settings
-from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, TRISTATE
 from gyro_calibration.driver.timestamps import (
     NodeTimeConverter,
     read_clock_pair,
@@ -55,9 +55,6 @@ from gyro_calibration.ros.runner import (
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
 
-# not yes and no, which YAML reads as booleans
-_TRISTATE = {'default': None, 'always': True, 'never': False}
-
 PARAMETERS = (
     Parameter('port', '/dev/ttyUSB0',
               'Serial port of the gyro, or a pattern that finds it under any name: '
@@ -71,10 +68,10 @@ PARAMETERS = (
     Parameter('axis', 'z', 'Axis to read of a gyro with three.', choices=('x', 'y', 'z')),
     Parameter('invert', 'default',
               'Whether the gyro counts clockwise turns positive; default is that of the protocol.',
-              choices=tuple(_TRISTATE)),
+              choices=tuple(TRISTATE)),
     Parameter('increments', 'default',
               'Whether the gyro sends angles, not rates; default is that of the protocol.',
-              choices=tuple(_TRISTATE)),
+              choices=tuple(TRISTATE)),
     Parameter('sensitivity', 0.0, 'Rate of one count of the gyro; 0 is that of the protocol.',
               'rad/s', (0.0, 100.0)),
     Parameter('sample_rate', 0.0,
@@ -305,9 +302,9 @@ class SampleMessages:
 
 def settings_from_parameters(values: SimpleNamespace) -> Settings:
     """Return the settings of a gyro; raise `ValueError` where they do not fit together."""
-    return Settings(values.sensitivity or None, _TRISTATE[values.invert], values.axis,
+    return Settings(values.sensitivity or None, TRISTATE[values.invert], values.axis,
                     tuple(values.columns), values.full_scale or None,
-                    _TRISTATE[values.increments], values.sample_rate or None)
+                    TRISTATE[values.increments], values.sample_rate or None)
 
 
 def main() -> int:

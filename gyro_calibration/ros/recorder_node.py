@@ -11,25 +11,23 @@
 """
 A node that receives serialized messages from topics, for the verb record.
 
-Types come from the graph, so that any message whose package is installed can be recorded. A
-subscription requests the offered QoS: best effort publishers are received, and reliable ones lose
-nothing. Publishers may start late, stop, and start again with another QoS.
+A subscription requests the offered QoS: best effort publishers are received, and reliable ones
+lose nothing. Publishers may start late, stop, and start again with another QoS.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import importlib
 import os
-import re
 import threading
 import time
-from typing import Any
 
 from gyro_calibration.driver.timestamps import read_steady_clock
-from gyro_calibration.logs.cdr import DEFINITION_SEPARATOR, NSEC_PER_SEC
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
+from gyro_calibration.logs.recording import topic_type_fault
 from gyro_calibration.logs.ros_bag import Message
 from gyro_calibration.ros.runner import call_every, SENSOR_QOS
 import rclpy
@@ -39,25 +37,23 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
-_TYPE_ALIASES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
-
 
 class RecorderNode(Node):
-    """Subscribes to topics as they appear, and hands over each message with its definition."""
+    """Subscribes to topics as they appear, and hands over each message."""
 
-    def __init__(self, topics: Sequence[str], all_topics: bool,
-                 on_message: Callable[[Message, str], None], context: rclpy.Context):
+    def __init__(self, roles: Mapping[str, str], on_message: Callable[[str, Message], None],
+                 context: rclpy.Context):
+        """Subscribe to topics by their roles; `LogError` for a name or a type that is wrong."""
         super().__init__('gyro_calibration_recorder', context=context,
                          start_parameter_services=False, enable_rosout=False)
         try:
-            self.topics = [self.resolve_topic_name(topic) for topic in topics]
+            self._roles = {self.resolve_topic_name(topic): role for topic, role in roles.items()}
         except (RuntimeError, ValueError) as error:
-            raise LogError(f'{", ".join(topics)}: no topic name ({_describe_error(error)}); '
+            raise LogError(f'{", ".join(roles)}: no topic name ({_describe_error(error)}); '
                            'give another') from None
-        self.unknown_topics: dict[str, str] = {}  # with a type that is not installed: the reason
         self.message_count = 0
-        self._all_topics, self._on_message = all_topics, on_message
-        self._taken: dict[str, Subscription | None] = {}  # topics; None for an unknown type
+        self._on_message = on_message
+        self._taken: dict[str, Subscription] = {}  # topics
         self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         self.poll()
         call_every(self, 0.3, self.poll)
@@ -65,35 +61,33 @@ class RecorderNode(Node):
     @property
     def missing_topics(self) -> list[str]:
         """Return the requested topics without a publisher so far."""
-        return [topic for topic in self.topics if topic not in self._taken]
+        return [topic for topic in self._roles if topic not in self._taken]
 
     def poll(self) -> None:
         """Subscribe to new topics in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
-            if ((topic in self.topics or self._all_topics)
-                    and topic not in self.unknown_topics
-                    and (publishers := self.get_publishers_info_by_topic(topic))):
-                quality = _compatible_quality([each.qos_profile for each in publishers])
-                before = self._taken.get(topic)
-                if before is None or _wants_more(before.qos_profile, quality):
-                    if before is not None:
-                        self.destroy_subscription(before)
-                    self._taken[topic] = self._subscribe(topic, kinds[0], quality)
+            if topic not in self._roles or not (
+                    publishers := self.get_publishers_info_by_topic(topic)):
+                continue
+            if fault := topic_type_fault(self._roles[topic], topic, kinds[0]):
+                raise LogError(fault)
+            quality = _compatible_quality([each.qos_profile for each in publishers])
+            before = self._taken.get(topic)
+            if before is None or _wants_more(before.qos_profile, quality):
+                if before is not None:
+                    self.destroy_subscription(before)
+                self._taken[topic] = self._subscribe(topic, kinds[0], quality)
 
-    def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> Subscription | None:
-        try:
-            definition = _build_definition(kind)
-        except (ImportError, AttributeError) as error:
-            self.unknown_topics[topic] = f'{kind} is not installed here ({error})'
-            return None
-
+    def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> Subscription:
         # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
             self.message_count += 1
-            self._on_message(Message(topic, kind, self._clock_offset
-                                     + round(read_steady_clock() * NSEC_PER_SEC), bytes(data)),
-                             definition)
-        return self.create_subscription(load_message_class(kind), topic, take, quality, raw=True)
+            received = self._clock_offset + round(read_steady_clock() * NSEC_PER_SEC)
+            self._on_message(self._roles[topic], Message(topic, kind, received, bytes(data)))
+        # of a type that `topic_type_fault` has accepted: other nodes choose no module
+        package, _, name = kind.split('/')
+        message_class = getattr(importlib.import_module(f'{package}.msg'), name)
+        return self.create_subscription(message_class, topic, take, quality, raw=True)
 
 
 def _compatible_quality(offered: Sequence[QoSProfile]) -> QoSProfile:
@@ -117,49 +111,14 @@ def _describe_error(error: Exception) -> str:
     return str(error).partition(', at /')[0]
 
 
-def load_message_class(kind: str) -> Any:
-    """Return the class of a message type such as ``sensor_msgs/msg/Imu``."""
-    # other nodes name the types, so only modules of the form ``package.msg`` are imported
-    if not re.fullmatch(r'\w+/msg/\w+', kind):
-        raise ImportError(f'{kind} is no kind of messages')
-    package, _, name = kind.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
-
-
-def _build_definition(kind: str) -> str:
-    """Return the definition of a type with its nested types, in the format of ROS 2."""
-    kinds, parts = [kind], []
-    for each in kinds:
-        fields = load_message_class(each).get_fields_and_field_types()
-        head = ('' if each == kind
-                else f'{DEFINITION_SEPARATOR}\nMSG: {each.replace("/msg/", "/")}\n')
-        parts.append(head + ''.join(f'{_format_field_type(text)} {name}\n'
-                                    for name, text in fields.items()))
-        inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/')
-                 for text in fields.values()]
-        kinds += [found for found in dict.fromkeys(inner) if '/' in found and found not in kinds]
-    return ''.join(parts)
-
-
-def _format_field_type(text: str) -> str:
-    """Return the type of a field in a definition: ``float64[<=3]`` for ``sequence<double, 3>``."""
-    if text.startswith('sequence<'):
-        inner, _, most = text.removeprefix('sequence<').removesuffix('>').partition(', ')
-        return f'{_format_field_type(inner)}[{f"<={most}" if most else ""}]'
-    word, bracket, length = text.partition('[')
-    word = re.sub(r'<(\d+)>', r'<=\1', word)
-    return _TYPE_ALIASES.get(word, word) + bracket + length
-
-
-def take_messages(topics: Sequence[str], all_topics: bool,
-                  on_message: Callable[[Message, str], None], tick: Callable[[RecorderNode], None],
-                  stop: threading.Event) -> None:
+def take_messages(roles: Mapping[str, str], on_message: Callable[[str, Message], None],
+                  tick: Callable[[RecorderNode], None], stop: threading.Event) -> None:
     """
-    Receive the messages of these topics, or of all, until an event is set.
+    Receive the messages of topics, each with a role of `topic_type_fault`, until an event is set.
 
-    `on_message` is called with each message and its definition, and `tick` at least every 50 ms
-    with the node. Raise `LogError` where a topic name is not valid, or ROS 2 cannot be started, as
-    with an invalid ROS_DOMAIN_ID.
+    `on_message` is called with the role and each message, and `tick` at least every 50 ms with the
+    node. Raise `LogError` where a topic name is not valid, a topic has another type than its role
+    wants, or ROS 2 cannot be started, as with an invalid ROS_DOMAIN_ID.
 
     """
     context = rclpy.Context()
@@ -173,7 +132,7 @@ def take_messages(topics: Sequence[str], all_topics: bool,
                        'check its environment variables') from None
     executor = SingleThreadedExecutor(context=context)
     try:
-        node = RecorderNode(topics, all_topics, on_message, context)
+        node = RecorderNode(roles, on_message, context)
         executor.add_node(node)
         try:
             while not stop.is_set():

@@ -381,7 +381,9 @@ ODD = {
         ('samples far apart', 'time_s,gyro_dps,reference_rate_dps',
          lambda k: f'{k * 1e10},{k % 7},{k % 5}\n'),
         ('heat', 'gyro_dps,reference_rate_dps,temperature_degc',
-         lambda k: f'{k},{k},{(k % 3) * 1e19}\n'))},
+         lambda k: f'{k},{k},{(k % 3) * 1e19}\n'),
+        ('a reference of 0.2 s', 'time_s,gyro_rad_s,reference_rate_rad_s',
+         lambda k: f'{k / 100},{(k * k % 7) / 9},{k / 99 if k < 20 else ""}\n'))},
     'two samples': b'time_s,gyro_dps\n1e10,1\n2e10,-1e20\n',
 }
 
@@ -408,6 +410,7 @@ def no_constant(name):
     raise AssertionError(f'{name} is no JSON')
 
 
+@pytest.mark.filterwarnings('error::RuntimeWarning')
 @pytest.mark.parametrize('verb', VERBS)
 def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
     """Finite data give finite numbers, and a refusal leaves no file."""

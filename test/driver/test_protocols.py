@@ -247,11 +247,6 @@ def test_every_protocol_has_an_assumed_noise_and_a_full_scale_at_which_it_satura
 
 
 @pytest.mark.parametrize(('name', 'values', 'message'), [
-    ('csv', {'sensitivity': -1.0}, 'set invert'),
-    ('csv', {'sensitivity': math.nan}, 'above 0'),
-    ('csv', {'full_scale': math.inf}, 'above 0'),
-    ('csv', {'sample_rate': 0.0}, 'above 0'),
-    ('csv', {'axis': 'w'}, 'x, y or z'),
     ('csv', {'columns': ('time_s',)}, 'exactly one'),
     ('csv', {'columns': ('gyro_dps', 'gyro_counts')}, 'exactly one'),
     ('csv', {'columns': ('gyro_dps', 'time_s', 'time_s')}, 'only once'),

@@ -42,6 +42,9 @@ ASSUMED_NOISE = math.radians(0.5)
 #: Standard deviation of a specific force, m/s²: 0.01 g, beyond the noise of any such unit.
 ASSUMED_FORCE_NOISE = 0.1
 
+#: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
+TRISTATE = {'default': None, 'always': True, 'never': False}
+
 _PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
 _MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
 
@@ -64,7 +67,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Settings:
-    """Mounting and scaling of a gyro; None is the default of its protocol."""
+    """Mounting and scaling of a gyro, above 0; None is the default of its protocol."""
 
     sensitivity: float | None = None  # rad/s per count, or per unit of the device
     invert: bool | None = None  # whether the device counts clockwise turns positive
@@ -76,13 +79,6 @@ class Settings:
     sample_rate: float | None = None  # Hz; an angle times this rate is the rate of turn
 
     def __post_init__(self) -> None:
-        for name in ('sensitivity', 'full_scale', 'sample_rate'):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f'{name} is {value}, but must be above 0; for the other sense of '
-                                 'rotation set invert')
-        if self.axis not in ('x', 'y', 'z'):
-            raise ValueError(f'axis is {self.axis!r}, but must be x, y or z')
         object.__setattr__(self, 'columns', tuple(self.columns))
         named = f'columns are {", ".join(self.columns)}, but'
         if sum(self.columns.count(name) for name in GYRO_COLUMNS) != 1:
