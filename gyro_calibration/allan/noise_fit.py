@@ -269,7 +269,7 @@ class Ranking:
         return [best, *(each for each in self.fits if each.deviance
                         < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
-    def lower_bound_with_process(self, index: int) -> float:
+    def lower_bound_beside_process(self, index: int) -> float:
         """Return that of a coefficient of the best fit if a process is in the record too."""
         # as for other combinations with more terms; a process has two figures
         best = self.best
@@ -451,7 +451,7 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
             each.coefficient_bounds(index) for each in possible if index in each.active_terms)]
         lower, upper = min(low for low, _ in ends), max(high for _, high in ends)
         if index == _B:
-            lower = min(lower, ranking.lower_bound_with_process(index))
+            lower = min(lower, ranking.lower_bound_beside_process(index))
     if not value or index in (_B, _K) and ranking.is_replaceable(index):
         lower = 0.0
     unit = interval ** -part.slope

@@ -163,9 +163,8 @@ def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
             'remarks': list(record.remarks), **figures,
             'floor': {**chart.floor, 'reached': fit.is_floor_reached},
             'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
-            'alternatives': list(fit.alternatives),
-            'gauss_markov': None if fit.process is None else {
-                'standard_deviation': fit.process.standard_deviation,
-                'correlation_time_s': fit.process.correlation_time},
+            'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
+            else {'standard_deviation': fit.process.standard_deviation,
+                  'correlation_time_s': fit.process.correlation_time},
             'chart': {name: values.tolist() for name, values in columns.items()},
             'picture': given.picture, 'out': given.out}

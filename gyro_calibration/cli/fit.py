@@ -208,8 +208,8 @@ def _dwell_data(selection: Selection) -> dict[str, Any]:
                      'left_out_with_rad_s': choice.error_with, 'chance': choice.p_value,
                      'reason': choice.reason} for choice in selection.choices],
         'look_alikes': [{'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
-                         'distinguishable': pair.is_distinguishable,
-                         'distinguishing_rate_rad_s': pair.distinguishing_rate,
+                         'parted': pair.is_distinguishable,
+                         'parting_rate_rad_s': pair.distinguishing_rate,
                          'reason': pair.reason} for pair in selection.confounders],
         'by_rate': [_bin_data(part, 'rad_s') for part in bin_errors(fit, table.rate)],
         'by_temperature': [] if table.temperature is None else
