@@ -111,6 +111,9 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 _WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
 #: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
 _GYRO_LAG_DEVIATION = 2e-4
+#: Prior standard deviation of the smoothing of a heading without steps, half the variance of the
+#: times over which it is a mean, s²: that of a mean over 0.2 s, which may cause no delay.
+_SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
 #: Places of a shaft in a revolution whose errors are independent.
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
@@ -236,18 +239,19 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     refuse_dead(output)
     _refuse_turn_in_hole(time, output, motion)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
+    has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
     fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
            fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
-                          lag_deviation=_GYRO_LAG_DEVIATION, cross_rotation=crossing,
-                          bias_wanders=True))
-    response_variance = 0.0
+                          lag_deviation=(_GYRO_LAG_DEVIATION if has_steps
+                                         else _SMOOTHING_DEVIATION),
+                          cross_rotation=crossing, bias_wanders=True))
     if motion.rate is not None and method == 'likelihood':
         # the variance of the times by which a motion is late is seldom above their mean squared
         exact = fit.scale_factor_error
         fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
             0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION), bias_wanders=True)
         # the shape of the response is not known: what it changes is uncertain
-        response_variance = (fit.scale_factor_error - exact) ** 2
+        fit = replace(fit, response_deviation=abs(fit.scale_factor_error - exact))
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
     refuse_scale(fit.scale_factor_error, 'reference',
                  'give or omit --invert, or turn the gyro over')
@@ -264,6 +268,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
                           f'{drift.deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
                           'heading: turn more slowly, with rests, or for longer')
     fit = _apply_drift(fit, drift, motion)
+    response_variance = fit.response_deviation ** 2
     deviation = math.sqrt(fit.covariance[0, 0])
     if deviation > limits.max_scale_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
@@ -273,7 +278,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     if method == 'rate':
         return replace(fit, angle_random_walk=drift.angle_random_walk), {}
     # the steps of an encoder hide white noise
-    if encoder_step(motion.heading) >= MAX_ROUNDING_STEP:
+    if has_steps:
         return replace(fit, angle_random_walk=min(fit.angle_random_walk, drift.walk_bounds[1])), {}
     low, high = fit.angle_random_walk / np.sqrt(
         stats.chi2.ppf([0.975, 0.025], fit.dof) / fit.dof)
@@ -485,7 +490,8 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
     # what the prior of the lag leaves open
-    covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(fit.covariance[0, 0])))
+    covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(
+        fit.covariance[0, 0] - fit.response_deviation ** 2)))
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
         covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
     # the components of a misalignment scatter as the scale factor error does
@@ -504,6 +510,8 @@ def _scatter_between(group: NDArray[np.intp], influence: Array) -> Array:
 
 def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidual:
     error = np.interp(motion.time, time, integrate(time, rate)) - motion.heading
+    covered = (motion.time >= time[0]) & (motion.time <= time[-1])
+    error = np.interp(motion.time, motion.time[covered], error[covered])
     for begin, end in _find_holes(time):  # the gyro's heading begins anew after it
         after = motion.time >= 0.5 * (begin + end)
         if after.any() and not after.all():  # by medians, as single references may be wrong

@@ -98,6 +98,9 @@ class ScaleBiasFit:
     # 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
     reference_adds_up: bool = False  # whether the reference adds up its errors, as odometry
+    # standard deviation of s by a lag or a smoothing that the motion does not determine; part of
+    # the covariance
+    response_deviation: float = 0.0
     # components of the axis of the gyro along the cross axes of the reference, rad, shape (k,),
     # and their covariance, shape (k, k); k is 2 where it shows the rotation about these, else 0
     misalignment: Array = field(default_factory=lambda: np.empty(0))
@@ -171,15 +174,12 @@ class _Increments:
     # block, then the turn of the gyro
     start_offsets: Array
     # the change by a lag with accelerations by gyro and reference over `acceleration_time`, s,
-    # rad/s², shape (n, 2); empty for a profile
-    accelerations: Array = field(default_factory=lambda: np.empty((0, 2)))
+    # rad/s², and by a term of the fourth order, rad/s⁴, shape (n, 3); empty for a profile
+    accelerations: Array = field(default_factory=lambda: np.empty((0, 3)))
     acceleration_time: float = 0.0
     wander_count: int = 0  # number of the last columns, of a wandering bias
 
 
-#: Factors of the prior standard deviation of a measured lag, for its wide tails, as of Student's
-#: law with two degrees of freedom: a reference may have been smoothed.
-_LAG_FACTORS = (1.0, 4.0)
 #: Sizes of a rate random walk of the bias that are possible, rad/s/√s.
 _RATE_RANDOM_WALKS = np.geomspace(1e-7, 1e-2, 6)
 #: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
@@ -201,9 +201,10 @@ class _RunAlignment:
                  slip_deviation: float, excess_turn: tuple[float, float] | None,
                  cross_rotation: Array, bias_wanders: bool):
         self._time, self._rate = time, rate
-        self._prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
+        self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
         self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
+        self._acceleration_time = self._smoothing_time
         self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
@@ -220,11 +221,15 @@ class _RunAlignment:
         points, constant = self._points, math.sqrt(2.0 * lag)
         gyro_time = points.time + offset - constant
         is_covered = (gyro_time >= self._time[0]) & (gyro_time <= self._time[-1])
+        start = np.flatnonzero(is_covered)[:1]
+        base = self._block_duration
+        if self.is_measured:  # accelerations need a heading before and after
+            for at, known in ((points.time, points.time), (gyro_time, self._time)):
+                is_covered &= (at >= known[0] + base) & (at <= known[-1] - base)
         time, weight = points.time[is_covered], 1.0 / points.variance[is_covered]
         if len(time) < 2:
             return _Increments(np.empty((0, 4)), *np.empty((9, 0)))
-        begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block_duration + 1e-6),
-                                        prepend=-1.0))
+        begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / base + 1e-6), prepend=-1.0))
         precision = np.add.reduceat(weight, begins)
         weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
         known = np.column_stack([points.heading[is_covered], time,
@@ -232,11 +237,8 @@ class _RunAlignment:
                                  points.shared[is_covered]])
         means = np.add.reduceat(weight[:, None] * known, begins)
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
-        prior = np.append(self._prior_deviation, points.shared_deviation)
+        prior = np.append(self.prior_deviation, points.shared_deviation)
         prior_factors = np.insert(points.prior_factors, [0] * 4, 1.0, axis=1)
-        if self.is_measured:
-            prior_factors = np.repeat(prior_factors, len(_LAG_FACTORS), axis=0)
-            prior_factors[:, 3] = np.resize(_LAG_FACTORS, len(prior_factors))
         count = 0
         if self._bias_wanders:
             wander, (part,) = bias_wander_columns(means[:, 1], bias_instability=None)
@@ -247,15 +249,23 @@ class _RunAlignment:
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
-        accelerations, base = np.empty((0, 2)), self._block_duration
+        accelerations = np.empty((0, 3))
         if self.is_measured:
+            whole, half = (_second_difference(self._integral_at, gyro_time[is_covered], each)
+                           for each in (base, 0.5 * base))
             accelerations = np.diff(np.add.reduceat(weight[:, None] * np.column_stack([
-                _second_difference(self._integral_at, gyro_time[is_covered], base),
-                _second_difference(self._reference_at, time, base)]), begins), axis=0)
-        start_offsets = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
-                                        [means[0, 4] - known[0, 4]]])
+                whole, _second_difference(self._reference_at, time, base),
+                16.0 * (whole - half) / base ** 2]), begins), axis=0)
+        start_offsets = np.concatenate([
+            [means[0, 0], means[0, 1] - points.time[start[0]]], means[0, 5:],
+            means[0, 4] - self._rate_and_integral(gyro_time[start], constant)[2]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
                            1.0 / precision, means[:, 1], start_offsets, accelerations, base, count)
+
+    def set_lag(self, lag: float) -> None:
+        """Compute accelerations as in a Gaussian window of a lag, s² (Gauss and Hermite)."""
+        self._acceleration_time = max(self._smoothing_time, min(
+            math.sqrt(6.0 * abs(lag)), self._block_duration))
 
     def require_increments(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""
@@ -275,7 +285,7 @@ class _RunAlignment:
         base = self._smoothing_time
         integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
         rate = 0.5 * (later - earlier) / base
-        acceleration = (later - 2.0 * integral + earlier) / base ** 2
+        acceleration = _second_difference(self._integral_at, at, self._acceleration_time)
         return rate + constant * acceleration, acceleration, integral + constant * rate
 
     def _integral_at(self, at: Array) -> Array:
@@ -625,7 +635,6 @@ def _average_over_noise(data: _Increments,
     logarithms, values, covariances = (
         np.array([getattr(each, name) for each in estimates])
         for name in ('log_likelihood', 'values', 'covariance'))
-    logarithms -= 2.0 * np.log(np.tile(prior_factors[:, 3], len(noises)))
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     return (weights @ values, np.tensordot(weights, covariances, 1)
@@ -651,8 +660,36 @@ def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
     if len(data.accelerations):
         base = data.acceleration_time
         share = base / (base + 2.0 * noise.ratio * float(np.median(data.reference_variance)))
-        columns[:, 3] = data.accelerations @ [1.0 - share, share]
+        columns[:, 3] = data.accelerations[:, :2] @ [1.0 - share, share]
     return columns
+
+
+def _lag_prior(data: _Increments, estimate: _Estimate, possible: float) -> tuple[float, float]:
+    """
+    Return the prior standard deviation of a lag, and that of the scale by what is not known of it.
+
+    The motion determines a lag by the part of the acceleration that the other columns do not
+    explain, as gyro and reference both show it, since their noise is no information; less two
+    standard deviations. If it does so more narrowly than what is `possible`, s², or than the lag
+    that is found, there is no prior; what a lag adds to the fourth order is that of a Gaussian
+    window, or by a fifth less, of a mean over a time. Else the lag is 0, as in a swing of one
+    frequency, and what it may do to the scale is uncertain.
+
+    """
+    others = np.arange(data.columns.shape[1]) != 3
+    columns = np.vstack([estimate.noise.whiten(data.columns[:, others]), np.diag(
+        math.sqrt(estimate.rate_variance) / estimate.prior_deviation[others])])
+    whole = np.pad(estimate.noise.whiten(data.accelerations), ((0, int(others.sum())), (0, 0)))
+    scales = np.linalg.lstsq(columns, whole, rcond=1e-14)[0]
+    left = whole - columns @ scales
+    products = left.T @ left / estimate.rate_variance
+    information = products[0, 1] - 2.0 * math.sqrt(
+        products[0, 0] * products[1, 1] / len(data.accelerations))
+    of_lag, lag = scales[0, :2].mean(), float(estimate.values[3])
+    if information * max(possible, abs(lag) / NORMAL_QUANTILE_975) ** 2 > 1.0:
+        of_fourth = scales[0, 2] - products[1, 2] / products[0, 1] * of_lag
+        return math.inf, 0.2 * lag ** 2 * abs(float(of_fourth))
+    return 1e-9, possible * abs(float(of_lag))
 
 
 def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
@@ -717,9 +754,10 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         cross_rotation = np.empty((len(motion.time), 0))
     alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn,
                               cross_rotation, bias_wanders)
-    offset, data, averages, averaged_covariance, estimate = _fit_offset(
+    offset, data, averages, averaged_covariance, estimate, response_deviation = _fit_offset(
         alignment, largest_time_offset)
-    values, covariance = estimate.values[:2], averaged_covariance[:2, :2]
+    values = estimate.values[:2]
+    covariance = averaged_covariance[:2, :2] + np.diag([response_deviation ** 2, 0.0])
     start = math.nan, math.nan
     found, edges, inside, noise_deviation = _find_stretch_of_fit(estimate, data)
     if alignment.is_measured:
@@ -751,23 +789,38 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
          math.sqrt(found.explained_squares) / noise_deviation),
         math.sqrt(averaged_covariance[2, 2]),
         np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end), *start,
-        residual_squares, dof, slip_deviation=slip, misalignment=estimate.values[of_axes],
+        residual_squares, dof, slip_deviation=slip, response_deviation=response_deviation,
+        misalignment=estimate.values[of_axes],
         misalignment_covariance=averaged_covariance[of_axes, of_axes])
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
-        float, _Increments, Array, Array, _Estimate]:
+        float, _Increments, Array, Array, _Estimate, float]:
     """
     Return the time offset, s, the increments there, and their fits.
 
-    First values and covariance averaged over the noise, then the estimate at the likeliest one.
+    First values and covariance averaged over the noise, then the estimate at the likeliest one,
+    and the standard deviation of the scale by a lag that the motion does not determine.
+
+    A measured heading, or the gyro, may be late since it was smoothed. Then half the variance of
+    the times by which it is late is from 0, of a delay, to half the square of their mean, of a
+    first-order lag.
 
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
     data = alignment.require_increments(offset, lag)
+    possible, response_deviation = float(alignment.prior_deviation[3]), 0.0
+    estimate: _Estimate | None = None
     for prior_factors in (data.prior_factors[:1], data.prior_factors, data.prior_factors):
         before = offset
+        if alignment.is_measured:
+            alignment.prior_deviation[3] = math.inf
+            if estimate is not None:
+                alignment.prior_deviation[3], response_deviation = _lag_prior(
+                    data, estimate, max(possible, offset ** 2 / math.sqrt(12.0)))
+                alignment.set_lag(float(estimate.values[3]))
+            data = alignment.require_increments(offset, lag)
         values, covariance, estimate = _average_over_noise(data, prior_factors)
         for _ in range(8):
             if alignment.is_measured:
@@ -784,7 +837,8 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
         if (len(prior_factors) == len(data.prior_factors)
                 and abs(offset - before) < _OFFSET_TOLERANCE):
             break
-    return offset, data, values, covariance, estimate
+    assert estimate is not None
+    return offset, data, values, covariance, estimate, response_deviation
 
 
 #: The noise is estimated again where the offset changed by more than this, s.
