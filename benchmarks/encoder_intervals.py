@@ -13,6 +13,7 @@ Measure the coverage of 95 % intervals of scale factor error and bias with a wan
 
     python benchmarks/encoder_intervals.py [RUNS]
     python benchmarks/encoder_intervals.py motions [RUNS]
+    python benchmarks/encoder_intervals.py smoothings [RUNS]
 
 Ten minutes at 20 Hz to and fro, an encoder of 0.088 deg, s = 2 %, b = 0.3 deg/s at the beginning,
 white noise of 0.3 deg/sqrt(h). Prints a table in Markdown. The true bias is the one at the
@@ -22,6 +23,10 @@ is the best for a model without a term for it.
 With `motions`, two minutes at 100 Hz of a robot, by hand, of a wheel, and of swings of one
 frequency, beside references of several kinds, with a bias that wanders as a Gauss-Markov process
 of 2 to 20 s; b is compared with its mean. The simulator shares nothing with the package.
+
+With `smoothings`, 30 s of swings of one frequency (0.05 to 0.6 Hz) and of a robot, beside a
+reference with noise of 0.003 deg that was delayed or smoothed before, or an encoder of such a
+shaft.
 
 """
 
@@ -166,8 +171,60 @@ def table_of_motions(runs: int) -> Iterator[str]:
                    f'| {np.isnan(found[:, 0, 0]).sum()} of {runs} |')
 
 
+SMOOTHINGS = {
+    'none': lambda heading: heading,
+    'delay, 0.1 s': lambda heading: np.roll(heading, 10),
+    'mean, 0.2 s': lambda heading: lfilter(np.full(20, 0.05), [1.0], heading),
+    'mean, 0.4 s': lambda heading: lfilter(np.full(40, 0.025), [1.0], heading),
+    'first order, 0.1 s': lambda heading: lfilter([0.1], [1.0, -0.9], heading),
+    'mean, 0.2 s, no delay': lambda heading: uniform_filter1d(heading, 20),
+    'Gaussian, 0.1 s, no delay': lambda heading: gaussian_filter1d(heading, 10.0),
+    'Gaussian, 0.2 s, no delay': lambda heading: gaussian_filter1d(heading, 20.0)}
+
+
+def run_smoothing(case: tuple[str, str, str, int]) -> Array:
+    """Return error and standard deviation of s of one run, nan if refused, shape (2,)."""
+    motion, smoothing, reference, seed = case
+    generator = np.random.default_rng([seed, 7, *map(ord, motion + smoothing + reference)])
+    kind = (motion if motion != 'swing'
+            else f'{np.exp(generator.uniform(np.log(0.05), np.log(0.6))):f}')
+    rate = moved(kind, 3600, generator)
+    heading = np.append(0.0, np.cumsum(0.005 * (rate[1:] + rate[:-1])))
+    heading = SMOOTHINGS[smoothing](heading)[300:3300]
+    s = generator.uniform(-0.02, 0.02)
+    output = ((1.0 + s) * rate[300:3300] + 0.1 * DEGREE
+              + 0.05 * DEGREE * generator.standard_normal(3000))
+    try:
+        fit = calibrate_encoder(Log(output=output, time=np.arange(3000) * 0.01,
+                                    reference_heading=referred(reference, heading, generator)),
+                                'likelihood').fit
+    except DataRefused:
+        return np.full(2, np.nan)
+    return np.array([fit.scale_factor_error - s, np.sqrt(fit.covariance[0, 0])])
+
+
+def table_of_smoothings(runs: int) -> Iterator[str]:
+    yield ('| motion | reference | smoothing | rms error of s | stated, median | within '
+           '| standardized, largest | refused |')
+    yield '|---|---|---|---|---|---|---|---|'
+    with ProcessPoolExecutor(initializer=warnings.simplefilter, initargs=('ignore',)) as pool:
+        for motion in ('swing', 'robot'):
+            for reference in ('fine', 'encoder'):
+                for smoothing in SMOOTHINGS:
+                    error, stated = np.array(list(pool.map(run_smoothing, [
+                        (motion, smoothing, reference, seed) for seed in range(runs)]))).T
+                    ratio = np.abs(error / stated)[np.isfinite(error)]
+                    yield (f'| {motion} | {reference} | {smoothing} '
+                           f'| {100.0 * np.sqrt(np.nanmean(error ** 2)):.4f} % '
+                           f'| {100.0 * np.nanmedian(stated):.4f} % '
+                           f'| {100.0 * np.mean(ratio < 1.96):.0f} % | {ratio.max():.1f} '
+                           f'| {np.isnan(error).sum()} of {runs} |')
+
+
 if __name__ == '__main__':
-    of_motions = sys.argv[1:2] == ['motions']
-    counts = [int(word) for word in sys.argv[1 + of_motions:2 + of_motions]]
-    for line in table_of_motions(*counts or [12]) if of_motions else table(*counts or [400]):
+    tables = {'motions': (table_of_motions, 12), 'smoothings': (table_of_smoothings, 12)}
+    asked = sys.argv[1:2] if sys.argv[1:2] and sys.argv[1] in tables else []
+    rows, usual = tables[asked[0]] if asked else (table, 400)
+    counts = [int(word) for word in sys.argv[1 + len(asked):2 + len(asked)]]
+    for line in rows(*counts or [usual]):
         print(line, flush=True)

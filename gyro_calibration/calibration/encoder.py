@@ -353,8 +353,9 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
         motion = motion_from_rates(log.time[reference_known], rate[reference_known])
     motion = replace(motion, name='reference')
     if motion.duration < 10.0:
-        raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: '
-                          'record longer')
+        # not rounded up to the 10 s that are needed
+        raise DataRefused(f'the log lasts {math.floor(10.0 * motion.duration) / 10.0:g} s; at '
+                          'least 10 s are needed: record longer')
     if motion.duration > 1e8:  # three years
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
                           'check that time_s is in s, or give --rate')
@@ -484,14 +485,17 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     """
     scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence)
     slope = scatter[0, 1] / scatter[1, 1]
-    widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation)
+    # the drift is that of a heading with the scale of the fit, whose error is one of the bias too
+    own_variance = max(float(np.nan_to_num(fit.covariance[0, 0]))
+                       - fit.response_deviation ** 2, 0.0)
+    of_scale = fit.covariance[0, 1] / math.sqrt(own_variance) if own_variance else 0.0
+    widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation, of_scale)
                          / math.sqrt(scatter[1, 1])])
     covariance = scatter * np.outer(widening, widening)
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
     # what the prior of the lag leaves open
-    covariance[0, 0] = max(covariance[0, 0], float(np.nan_to_num(
-        fit.covariance[0, 0] - fit.response_deviation ** 2)))
+    covariance[0, 0] = max(covariance[0, 0], own_variance)
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
         covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
     # the components of a misalignment scatter as the scale factor error does
@@ -527,6 +531,12 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
         yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
+    if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
+        yield ('the motion hardly distinguishes a scale factor error from a smoothing of the '
+               'reference or a lag, as where it has one frequency; '
+               f'{100.0 * fit.response_deviation:.2g} % of the standard deviation are for that, '
+               'as far as the delay shows it. A reference that was smoothed without a delay may '
+               'err by more: turn at several speeds, with stops')
     if fit.misalignment.size:
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
         if chance < FALSE_ALARM_RATE:

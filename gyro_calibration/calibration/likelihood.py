@@ -802,9 +802,9 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     First values and covariance averaged over the noise, then the estimate at the likeliest one,
     and the standard deviation of the scale by a lag that the motion does not determine.
 
-    A measured heading, or the gyro, may be late since it was smoothed. Then half the variance of
-    the times by which it is late is from 0, of a delay, to half the square of their mean, of a
-    first-order lag.
+    A measured heading, or the gyro, may be late since it was smoothed. Half the variance of the
+    times by which it is late is from 0, of a delay, to half the square of their mean, of a
+    first-order lag, which is 1.5 standard deviations of the prior.
 
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
@@ -818,7 +818,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
             alignment.prior_deviation[3] = math.inf
             if estimate is not None:
                 alignment.prior_deviation[3], response_deviation = _lag_prior(
-                    data, estimate, max(possible, offset ** 2 / math.sqrt(12.0)))
+                    data, estimate, max(possible, offset ** 2 / 3.0))
                 alignment.set_lag(float(estimate.values[3]))
             data = alignment.require_increments(offset, lag)
         values, covariance, estimate = _average_over_noise(data, prior_factors)

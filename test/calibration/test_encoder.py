@@ -17,7 +17,7 @@ What was put in is found, with true intervals, on simulated logs and on measured
 from dataclasses import replace
 
 from chance import fewest
-from encoder_intervals import run
+from encoder_intervals import run, run_smoothing
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_rates
@@ -81,8 +81,9 @@ REFUSED = {'no heading': (replace(CLEAN, reference_heading=None), 'reference_hea
                'a value in 50 of 10000 samples; at least 100 are needed: record longer, 198 s'),
            'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)),
                          'the gyro has a value in 10'),
-           'short': (log_of(SWING, 5.0), 'at least 10 s'), 'one speed': (
-               log_of(REST, 100.0), 'in both senses, or at another speed too, or with a rest'),
+           'short': (log_of(SWING, 5.0), 'at least 10 s'),
+           'nearly long enough': (log_of(SWING, 10.0), 'lasts 9.9 s; at least 10 s'),
+           'one speed': (log_of(REST, 100.0), 'in both senses, or at another speed too, or with a rest'),
            'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'),
            'dead': (replace(CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead')}
 
@@ -164,6 +165,37 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
     assert (within >= fewest(runs, 0.95)).all(), within
     assert (found[:, 1].mean(axis=0)
             < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
+
+
+@pytest.mark.parametrize('reference', ['fine', 'encoder'])
+@pytest.mark.parametrize('smoothing', ['none', 'delay, 0.1 s', 'mean, 0.2 s', 'mean, 0.4 s',
+                                       'first order, 0.1 s'])
+def test_a_swing_of_one_frequency_does_not_take_a_smoothing_for_a_scale(smoothing, reference):
+    """Without a smoothing, s is found better than its interval says, which allows for one."""
+    error, stated = np.array([run_smoothing(('swing', smoothing, reference, seed))
+                              for seed in range(3)]).T
+    assert (np.abs(error) < 2.5 * stated).all()
+    if smoothing in ('none', 'delay, 0.1 s'):
+        assert np.abs(error).max() < 2e-4
+
+
+@pytest.mark.parametrize('smoothing', ['mean, 0.2 s', 'mean, 0.2 s, no delay',
+                                       'Gaussian, 0.1 s, no delay'])
+def test_turns_and_stops_show_a_smoothing(smoothing):
+    error, stated = np.array([run_smoothing(('robot', smoothing, 'fine', seed))
+                              for seed in range(3)]).T
+    assert (np.abs(error) < 3.5 * stated).all()
+    assert stated.max() < 3e-4
+
+
+def test_turns_in_one_direction_leave_the_bias_as_uncertain_as_the_scale():
+    generator, time = np.random.default_rng(2), np.arange(2000) * INTERVAL
+    rate = 40.0 * DEGREE * (1.0 - np.cos(2.0 * np.pi * time / 2.5)) * (time > 1.0)
+    motion = motion_from_rates(time, rate)
+    found = calibrate_encoder(log_of(motion, 20.0, Noise(8e-5, 0.0, 0.05 * DEGREE), generator))
+    s, b = np.sqrt(np.diag(found.fit.covariance))
+    assert b > 0.9 * s * rate.mean()
+    assert abs(found.fit.scale_factor_error - S) < 2.5 * s
 
 
 def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():
