@@ -83,7 +83,8 @@ REFUSED = {'no heading': (replace(CLEAN, reference_heading=None), 'reference_hea
                          'the gyro has a value in 10'),
            'short': (log_of(SWING, 5.0), 'at least 10 s'),
            'nearly long enough': (log_of(SWING, 10.0), 'lasts 9.9 s; at least 10 s'),
-           'one speed': (log_of(REST, 100.0), 'in both senses, or at another speed too, or with a rest'),
+           'one speed': (log_of(REST, 100.0),
+                         'in both senses, or at another speed too, or with a rest'),
            'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'),
            'dead': (replace(CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead')}
 
