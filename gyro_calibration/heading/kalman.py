@@ -197,6 +197,16 @@ class HeadingState:
         return replace(self, mean=mean, covariance=covariance)
 
 
+@dataclass(frozen=True)
+class TrackStep:
+    """A part of the drive: state before it, integral of the rates, rest or motion, end in s."""
+
+    state_before: HeadingState
+    rate_integral: RateIntegral
+    is_resting: bool
+    end_time: float
+
+
 def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
                   age: float | None = None) -> HeadingState:
     """

@@ -159,9 +159,13 @@ def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
     heading, variance = np.array(
         [(state.mean[HEADING_INDEX], state.covariance[HEADING_INDEX, HEADING_INDEX])
          for state in states]).T
+    # share of the rates in the heading: 1 in motion, in a rest that of a straight drive
+    share = np.array([1.0 if not step.is_resting else step.rate_integral.wander_variance / (
+        step.rate_integral.wander_variance + step.state_before.noise.angle_random_walk ** 2
+        * step.rate_integral.duration) for step in steps] or [1.0])
+    place = np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(share) - 1)
     turned = integrate(time, _remove_spikes(time, rate))
-    rested = np.array([step.is_resting for step in steps] or [False])
-    resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
-    moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
-    return (np.where(resting, np.interp(time, ends, heading), moved),
+    followed = turned - np.interp(time, ends, np.interp(ends, time, turned))
+    resting = np.array([step.is_resting for step in steps] or [False])[place]
+    return (np.interp(time, ends, heading) + share[place] * followed,
             np.interp(time, ends, variance), resting)

@@ -31,6 +31,7 @@ from gyro_calibration.heading.kalman import (
     heading_variances,
     HeadingState,
     RateIntegral,
+    TrackStep,
 )
 from gyro_calibration.logs.log import Array, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
@@ -53,7 +54,7 @@ _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: windows beyond that of the energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
-                        for shared in (0.0, 0.25, 0.5, 0.75) for fast in (0.0, 1.0, 4.0))]).T
+                        for shared in (0.0, 0.5, 0.75, 0.9) for fast in (0.0, 1.0, 4.0))]).T
 _MAX_SCATTER_RATIO = 64.0
 #: The same of sums of many means, relative to that of white noise, for a process of first order.
 _SUM_RATIOS = SCATTER_RATIOS * (1.0 + SCATTER_CORRELATIONS) / (1.0 - SCATTER_CORRELATIONS)
@@ -192,11 +193,11 @@ class Snapshot:
     state: HeadingState
     rate_integral: RateIntegral  # since the rest began
     deleted_heading: float  # until then, rad
-    step_count: int
-    #: Deviation of the last angle from the mean of this rest before it, or at first from the
-    #: state, rad, and its variance by noise, rad².
-    innovation: float = 0.0
-    variance: float = math.inf
+    step_count: int  # of all steps until then
+    step: TrackStep | None = None  # the last one until then
+    #: Scatter of the last mean and bias, rad/s, and their covariance, shape (5, k), by
+    #: `SCATTER_RATIOS`.
+    scatter_state: Array | None = None
     scatter: float = 0.0  # median of `SCATTER_RATIOS` by the innovations; 0 before the first
     #: Of the innovations since the rest began, by `SCATTER_RATIOS`, shape (k,).
     log_likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTER_RATIOS)))
@@ -234,6 +235,30 @@ class RestScatter:
         kept = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
         self._learned = kept * self._learned + self.probabilities(last.log_likelihood)
         self._retention *= kept
+
+
+def update_scatter(state: Array, rate: float, noise: float, white: float) -> tuple[Array, Array]:
+    """
+    Return `Snapshot.scatter_state` after a mean rate, and its log-likelihood, shape (k,).
+
+    The scatter of means over 1 s is a process of first order, stationary at first. Given are the
+    state before, (5, 1) or (5, k), the rate, rad/s, and the variances of its noise and of the
+    white noise over 1 s, (rad/s)².
+
+    """
+    variance, shared = SCATTER_RATIOS * white, SCATTER_CORRELATIONS
+    scatter, bias, own, joint, of_bias = state
+    if len(scatter) == 1:
+        own = variance
+    scatter, joint = shared * scatter, shared * joint
+    own = variance + shared ** 2 * (own - variance)
+    seen, seen_bias = own + joint, joint + of_bias
+    total = seen + seen_bias + noise
+    innovation = (rate - scatter - bias) / total
+    return (np.array([scatter + seen * innovation, bias + seen_bias * innovation,
+                      own - seen ** 2 / total, joint - seen * seen_bias / total,
+                      of_bias - seen_bias ** 2 / total]),
+            -0.5 * (innovation ** 2 * total + np.log(total / noise)))
 
 
 @dataclass

@@ -41,6 +41,7 @@ from gyro_calibration.heading.kalman import (
     HeadingState,
     initial_state,
     RateIntegral,
+    TrackStep,
     WALK_INDEX,
 )
 from gyro_calibration.heading.stationary import (
@@ -54,11 +55,10 @@ from gyro_calibration.heading.stationary import (
     mean_threshold_sigmas,
     RestScatter,
     Samples,
-    SCATTER_CORRELATIONS,
-    SCATTER_RATIOS,
     SETTLING_TIME,
     SlowTurn,
     Snapshot,
+    update_scatter,
     WINDOW_DURATION,
 )
 from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
@@ -99,16 +99,6 @@ class Settings:
     false_alarms: float = 0.1
     threshold: Threshold = Threshold(0.0)
     maximum_gap: float = MAX_GAP  # longest gap in the stamps that is integrated, s
-
-
-@dataclass(frozen=True)
-class TrackStep:
-    """A part of the drive: state before it, integral of the rates, rest or motion, end in s."""
-
-    state_before: HeadingState
-    rate_integral: RateIntegral
-    is_resting: bool
-    end_time: float
 
 
 class HeadingTracker:
@@ -643,7 +633,7 @@ class HeadingTracker:
             return False
         if self._keeps_steps:
             assert self._last_sample is not None
-            del self.steps[suspected.snapshot.step_count:]
+            self._restore_steps(suspected.snapshot)
             self.steps.append(
                 TrackStep(start, self._with_still_sensitivity(suspected.rate_integral), True,
                           self._last_sample[0] - self._block_integral.duration - held.duration))
@@ -718,7 +708,7 @@ class HeadingTracker:
             self._rest_scatter.learn(self._snapshots[-1])
         self._state, self.deleted_heading = snapshot.state, snapshot.deleted_heading
         self._open_integral = turn
-        del self.steps[snapshot.step_count:]
+        self._restore_steps(snapshot)
         self._enter_motion(max(lag, WINDOW_DURATION))
         self._advance_state()
 
@@ -748,7 +738,7 @@ class HeadingTracker:
         quiet = sum(blocks[1:last], blocks[0])
         while self._snapshots[-1] is not snapshot:
             self._snapshots.pop()
-        del self.steps[snapshot.step_count:]
+        self._restore_steps(snapshot)
         self._state = snapshot.state
         self._rest_integral = snapshot.rate_integral + self._zero_integral
         self.deleted_heading = (snapshot.deleted_heading + quiet.angle
@@ -816,36 +806,53 @@ class HeadingTracker:
 
     def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""
-        before, past, share = self._snapshots[-1], self._rest_integral, 1.0
-        white = self._state.noise.angle_random_walk ** 2 * turn.duration
-        if past.duration > 0.0:  # an error of the bias at the begin of the rest is no scatter
-            share += turn.duration / past.duration
-            expected, variance = turn.duration * past.angle / past.duration, share * white
-        else:
+        # A rest is one step of at most `MEAN_LAGS[-1]` s, extended and computed again with what is
+        # known of its scatter: the parts of a straight drive are alike, and confirm each other.
+        before, noise = self._snapshots[-1], self._state.noise
+        white = noise.angle_random_walk ** 2
+        if before.scatter_state is None:
             expected, variance = self._state.expected_rest_angle(turn)
-        innovation, wander = turn.angle - expected, SCATTER_RATIOS * white
-        shared = SCATTER_CORRELATIONS * wander
-        gain = shared / (before.variance + wander)
-        spread = variance + share * wander - gain * shared
+            scatter_state = np.array([
+                [0.0], [expected / turn.duration], [0.0], [0.0],
+                [max(variance / turn.duration ** 2 - white / turn.duration, 0.0)]])
+        else:
+            # a random walk whose estimate has the Allan deviation of the floor, for the flicker
+            walk = noise.rate_random_walk ** 2 + noise.allan_floor ** 4 / white
+            scatter_state = before.scatter_state + np.array(
+                [[0.0], [0.0], [0.0], [0.0], [walk * turn.duration]])
+        scatter_state, likelihood = update_scatter(
+            scatter_state, turn.angle / turn.duration, white / turn.duration, white)
         # of the blocks about their mean
         scatter = turn.block_square_sum - turn.angle ** 2 / turn.duration
         blocks = scatter * turn.duration / (
             self._energy.noise_factor ** 2 * self._model_noise.angle_random_walk ** 2
             * turn.duration + turn.extra_noise_variance + turn.lost_variance)
-        likelihood = before.log_likelihood - 0.5 * (
-            (innovation - gain * before.innovation) ** 2 / spread + np.log(spread / variance)
-            + (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
+        likelihood += before.log_likelihood - 0.5 * (
+            (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
             - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS))
-        scatter, median = self._rest_scatter.mean_and_median(likelihood)
-        turn.wander_variance = 0.0 if self._wheels_stand else scatter * white
-        self._propagate_state(turn,
-                              self._last_time - self._block_integral.duration - remaining.duration)
+        start, part, count, last = self._state, turn, len(self.steps), before.step
+        if (last is not None and last.rate_integral.duration < MEAN_LAGS[-1] - TIME_TOLERANCE
+                and self._wheels_stand == (last.rate_integral.wander_variance == 0.0)):
+            start, part = replace(last.state_before, noise=noise), last.rate_integral + turn
+            count = before.step_count - 1
+        ratio, median = self._rest_scatter.mean_and_median(likelihood)
+        part.wander_variance = 0.0 if self._wheels_stand else ratio * white * part.duration
+        step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
+                         - remaining.duration)
+        self._state = start.advance_at_rest(part)
         self._rest_integral += turn
         self._snapshots.append(Snapshot(
             self._state, self._rest_integral,
-            self.deleted_heading - self._corrected_angle(self._block_integral), len(self.steps),
-            innovation, variance, median, likelihood))
+            self.deleted_heading - self._corrected_angle(self._block_integral), count + 1, step,
+            scatter_state, median, likelihood))
+        self._restore_steps(self._snapshots[-1])
         del self._snapshots[:-_MAX_SNAPSHOTS]
+
+    def _restore_steps(self, snapshot: Snapshot) -> None:
+        """Keep the steps until a state during a rest."""
+        if self._keeps_steps:
+            last = [] if snapshot.step is None else [snapshot.step]
+            self.steps[snapshot.step_count - len(last):] = last
 
     def _propagate_state(self, turn: RateIntegral, end: float) -> None:
         """Propagate the state over an integral that ends at a time, s."""

@@ -20,6 +20,11 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     smooth_states,
 )
+from gyro_calibration.heading.stationary import (
+    SCATTER_CORRELATIONS,
+    SCATTER_RATIOS,
+    update_scatter,
+)
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
@@ -28,7 +33,7 @@ from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_track import track
 import numpy as np
 import pytest
-from scipy.stats import poisson
+from scipy.stats import multivariate_normal, poisson
 
 XV3500 = presets.XV3500.noise
 #: Standard deviations of scale factor error and bias after 20 s of it.
@@ -368,3 +373,20 @@ def test_errors_are_as_large_as_stated_and_hindsight_and_rests_help(drives):
                    axis=0) == pytest.approx(np.ones(2), abs=4.0 * math.sqrt(2.0 / drives) / 2.0)
     pure, live, later = np.mean(sizes, axis=0)
     assert later < live < 0.9 * pure, (pure, live, later)
+
+
+def test_the_scatter_of_a_rest_has_the_likelihood_of_its_joint_distribution():
+    """Means over 1 s: bias, a process of first order, and white noise."""
+    count, white, bias_variance = 12, 1e-4, 4e-5
+    rates = np.random.default_rng(5).normal(0.0, 0.03, count)
+    state, likelihood = np.array([[0.0], [0.01], [0.0], [0.0], [bias_variance]]), 0.0
+    for rate in rates:
+        state, added = update_scatter(state, rate, white, white)
+        likelihood = likelihood + added
+    lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    for place in (0, 1, 10, 20, 30):
+        covariance = (white * np.eye(count) + bias_variance
+                      + white * SCATTER_RATIOS[place] * SCATTER_CORRELATIONS[place] ** lags)
+        expected = multivariate_normal(np.full(count, 0.01), covariance).logpdf(rates)
+        assert likelihood[place] == pytest.approx(
+            expected + 0.5 * count * math.log(2.0 * math.pi * white), rel=1e-9)
