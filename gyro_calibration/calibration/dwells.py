@@ -56,8 +56,8 @@ OUTLIER_THRESHOLD = 6.0
 #: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
 MIN_TEMPERATURE_SPREAD = 1.0
 #: Minimum share of a log in dwells, as a swing is steady for short times only; and share up to
-#: which another method is proposed.
-_MIN_DWELL_SHARE, _FEW_DWELLS_SHARE = 0.05, 0.25
+#: which another method is the default, since few short dwells hide their scatter.
+MIN_DWELL_SHARE, FEW_DWELLS_SHARE = 0.05, 0.25
 #: Duration of the blocks in which the heading is averaged, s, and how many of them show a ramp.
 _BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
 
@@ -83,7 +83,7 @@ class Dwells:
         return len(self.rate)
 
 
-def extract_dwells(log: Log, name: str = '') -> Dwells:
+def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE) -> Dwells:
     """
     Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
@@ -91,13 +91,14 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
     ----------
     log : with output, and a reference rate or a reference heading
     name : of the file, put before the places and the remarks
+    min_share : of a log in time in dwells, 1
 
     Raises
     ------
     DataRefused : output or reference are missing or in another unit, or nothing is steady
 
     """
-    found = dwells_from_table(log) if log.time is None else find_dwells(log)
+    found = dwells_from_table(log) if log.time is None else find_dwells(log, min_share)
     if log.time is not None and not name:  # several logs may have a rate each
         _refuse_narrow_range(log, found.rate)
     unexplained, scale = fit_scale(found.output, found.rate)
@@ -360,7 +361,7 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
 
 # dwells of a log in time
 
-def find_dwells(log: Log) -> Dwells:
+def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     """
     Find the dwells of a log in time by its reference heading, or else by its reference rate.
 
@@ -399,13 +400,13 @@ def find_dwells(log: Log) -> Dwells:
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells], len(time))
     remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
-    if share < _MIN_DWELL_SHARE:
+    if share < min_share:
         raise NothingSteady(
             'the reference turns at a constant rate (its heading is a straight line to '
             f'{_MAX_DEVIATION / DEGREE:g} deg), for {_MIN_DURATION:g} s at a time without the '
             f'settling, in {100.0 * share:.0f} % of the log; hold each rate for longer, or use '
             '--method likelihood')
-    if share <= _FEW_DWELLS_SHARE:
+    if share <= FEW_DWELLS_SHARE:
         remarks.append(f'only {100.0 * share:.0f} % of the time is in dwells; '
                        '--method likelihood uses all of it')
     rate, output, deviation = _average(samples, dwells)

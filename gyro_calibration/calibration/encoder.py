@@ -34,10 +34,12 @@ from pathlib import Path
 from gyro_calibration.calibration.dwells import (
     Dwells,
     extract_dwells,
+    FEW_DWELLS_SHARE,
     few_values_remedy,
     format_list,
     interpolate_reference,
     join_dwells,
+    MIN_DWELL_SHARE,
     NothingSteady,
 )
 from gyro_calibration.calibration.heading_regression import (
@@ -582,7 +584,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     Calibrate by the dwells of logs, by their paths, or by the heading of a single log.
 
     The options are those of `api.fit`. A log in time whose only reference is a heading is
-    calibrated by it, and so is one with a reference rate that is hardly ever steady.
+    calibrated by it, and so is one with a reference rate that is seldom steady.
 
     """
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
@@ -592,7 +594,9 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         is_settled = effects or method or len(logs) > 1
         try:
             table = join_dwells([_extract_named_dwells(path, log) if len(logs) > 1
-                                 else extract_dwells(log) for path, log in logs.items()])
+                                 else extract_dwells(log, min_share=(
+                                     MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE))
+                                 for path, log in logs.items()])
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
                 return (Selection(fit_effects(table, effects), (), ()) if effects
@@ -608,9 +612,10 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
     return found if log.reference_heading is not None else replace(found, remarks=(
-        f'the log has a reference rate, and fewer than {_MIN_DWELLS} stretches of constant rate; '
-        'so the rate is integrated, and headings are compared. For other effects than bias and '
-        'scale factor error, hold each rate for some seconds', *found.remarks))
+        f'the log has a reference rate, which is constant {_MIN_DWELLS - 1} times at most, or for '
+        f'up to {100.0 * FEW_DWELLS_SHARE:g} % of the time; so the rate is integrated, and '
+        'headings are compared. For other effects than bias and scale factor error, hold each '
+        'rate for some seconds', *found.remarks))
 
 
 def _extract_named_dwells(path: str, log: Log) -> Dwells:

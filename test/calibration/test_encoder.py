@@ -15,15 +15,18 @@ What was put in is found, with true intervals, on simulated logs and on measured
 """
 
 from dataclasses import replace
+import math
 
 from chance import fewest
 from encoder_intervals import run, run_smoothing
-from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.dwells import find_dwells
+from gyro_calibration.calibration.encoder import calibrate, calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 
 S, B = 0.02, 0.3 * DEGREE
 INTERVAL = 0.01
@@ -263,3 +266,21 @@ def test_a_short_command_has_fewer_blocks_than_values_and_is_answered():
     fit = calibrate_encoder(Log(output=1.01 * rate + 0.1 * DEGREE + noise, time=time,
                                 reference_rate=rate), 'likelihood').fit
     assert abs(fit.scale_factor_error - 0.01) < 4.0 * np.sqrt(fit.covariance[0, 0]) < 0.04
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_late_rate_that_is_seldom_steady_is_compared_as_a_heading(seed):
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, 120.0, 0.02)
+    rates = generator.uniform(-40.0, 40.0, 60) * DEGREE
+    places = 2.0 * np.arange(60) + 4.0 * (np.arange(60) // 8)  # every eighth is held for 4 s
+    held = np.arange(7, 60, 8)
+    rate = np.interp(time, np.insert(places, held + 1, places[held] + 4.0),
+                     np.insert(rates, held + 1, rates[held]))
+    late = np.interp(time - 0.2, time, uniform_filter1d(rate, 15))
+    log = Log(time=time, reference_rate=late + 0.1 * DEGREE * generator.standard_normal(len(time)),
+              output=1.002 * rate + (0.4 + 0.05 * generator.standard_normal(len(time))) * DEGREE)
+    assert len(find_dwells(log)) >= 3
+    found = calibrate({'': log})
+    assert abs(found.fit.scale_factor_error - 0.002) < 3.0 * math.sqrt(found.fit.covariance[0, 0])
+    assert abs(found.fit.bias - 0.4 * DEGREE) < 3.0 * math.sqrt(found.fit.covariance[1, 1])
