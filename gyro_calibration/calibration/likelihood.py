@@ -251,16 +251,21 @@ class _RunAlignment:
         walk = _random_walk_covariance(time, weight, begins)
         accelerations = np.empty((0, 3))
         if self.is_measured:
-            whole, half = (_second_difference(self._integral_at, gyro_time[is_covered], each)
-                           for each in (base, 0.5 * base))
-            accelerations = np.diff(np.add.reduceat(weight[:, None] * np.column_stack([
-                whole, _second_difference(self._reference_at, time, base),
-                16.0 * (whole - half) / base ** 2]), begins), axis=0)
+            accelerations = np.diff(np.add.reduceat(weight[:, None] * self._accelerations(
+                time, gyro_time[is_covered]), begins), axis=0)
         start_offsets = np.concatenate([
             [means[0, 0], means[0, 1] - points.time[start[0]]], means[0, 5:],
             means[0, 4] - self._rate_and_integral(gyro_time[start], constant)[2]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
                            1.0 / precision, means[:, 1], start_offsets, accelerations, base, count)
+
+    def _accelerations(self, time: Array, gyro_time: Array) -> Array:
+        """Return those by gyro and reference over a block, and the 4th order, shape (n, 3)."""
+        base = self._block_duration
+        whole, half = (_second_difference(self._integral_at, gyro_time, each)
+                       for each in (base, 0.5 * base))
+        return np.column_stack([whole, _second_difference(self._reference_at, time, base),
+                                16.0 * (whole - half) / base ** 2])
 
     def set_lag(self, lag: float) -> None:
         """Compute accelerations as in a Gaussian window of a lag, s² (Gauss and Hermite)."""
@@ -773,10 +778,6 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         white = _IncrementCovariance(data, 0.0)
         alone = _solve_weighted(data, white, white.solve(data.columns), estimate.prior_deviation)
     scale, bias = values.tolist()
-    # with a slip, first the columns of the differences between turns, then of the ends of turns
-    slips = averages[data.prior_deviation == slip_deviation]
-    slips = slips[:len(slips) // 2]
-    slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
     of_axes = slice(4, 4 + cross_rotation.shape[1])
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
@@ -789,9 +790,18 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
          math.sqrt(found.explained_squares) / noise_deviation),
         math.sqrt(averaged_covariance[2, 2]),
         np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end), *start,
-        residual_squares, dof, slip_deviation=slip, response_deviation=response_deviation,
+        residual_squares, dof, slip_deviation=_rms_slip(data, averages, slip_deviation),
+        response_deviation=response_deviation,
         misalignment=estimate.values[of_axes],
         misalignment_covariance=averaged_covariance[of_axes, of_axes])
+
+
+def _rms_slip(data: _Increments, values: Array, slip_deviation: float) -> float:
+    """Return the root mean square of the slips of turns with a prior deviation, 0 without any."""
+    # first the columns of the differences between turns, then of the ends of turns
+    slips = values[data.prior_deviation == slip_deviation]
+    slips = slips[:len(slips) // 2]
+    return math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
