@@ -740,8 +740,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     rate : output of the gyro, rad/s, shape (n,)
     motion : of the gyro
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
-    lag_deviation : prior standard deviation of the lag, s²; a sine does not separate it from the
-        scale
+    lag_deviation : prior standard deviation of the lag, s²; with a measured motion only where it
+        does not determine the lag, as a sine does not
     slip_deviation : largest standard deviation of the slip of each turn of a profile, as a
         fraction of it
     excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides a profile;
