@@ -92,9 +92,10 @@ from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct, idct
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.stats import t as student
 from scipy.stats import ttest_1samp
 
@@ -124,6 +125,8 @@ MIN_STRETCHES = 3.0
 _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
+#: Cosines over which the power spectrum of a rate is averaged: that of white noise to 14 %.
+_SPECTRUM_BINS = 101
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
 #: vibration.
 _MAX_VEHICLE_WALK = 5e-4
@@ -342,23 +345,33 @@ class Spans:
         return self.is_measured * turned - (1.0 + self.clock_rate) * self.span_integrals(
             self.log.output)
 
+    @cached_property
+    def smooth_rate(self) -> Array:
+        """
+        Return the rate by a Wiener filter of its cosines, rad/s, shape (m,).
+
+        The changes of the rate from point to point, in which a delay shows, are mostly white noise
+        in a slow motion; as a column it would pass for information.
+
+        """
+        rate = np.asarray(self.channels.rate)
+        cosines = dct(rate, norm='ortho')
+        power = uniform_filter1d(cosines ** 2, _SPECTRUM_BINS)
+        share = 1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300)
+        return np.asarray(idct(np.maximum(share, 0.0) * cosines, norm='ortho'))
+
+    def rate_columns(self) -> Array:
+        """Return the columns of scale factor error and bias, shape (n + r, 2)."""
+        rate = np.asarray(self.channels.rate)
+        return np.column_stack([-self.span_integrals(each) for each in (rate, np.ones_like(rate))])
+
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
-        time, output = np.asarray(self.log.time), np.asarray(self.log.output)
-        rate = np.asarray(self.channels.rate)
-        turned = (np.asarray(self.channels.heading) if self.treatment.is_fine
-                  else integrate_with_curvature(time, output))
-        # the rate as a mean over two samples
-        half = float(np.median(np.diff(time)))
-        forth, back = (np.interp(time + way, time, turned) for way in (half, -half))
-        return np.column_stack([-self.span_integrals(rate),
-                                -self.span_integrals(np.ones_like(rate)),
-                                self.span_changes((forth - back) / (2.0 * half))])
+        return np.column_stack([self.rate_columns(), self.span_changes(self.smooth_rate)])
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
-        time, output, heading = map(np.asarray, (self.log.time, self.log.output,
-                                                 self.channels.heading))
+        time, heading = np.asarray(self.log.time), np.asarray(self.channels.heading)
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
@@ -373,10 +386,11 @@ class Spans:
             return self.span_changes((time >= cause.shapes[0]).astype(float))[:, None]
         if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
-            return -self.span_changes(np.gradient(output, time))[:, None]
+            return -self.span_changes(np.gradient(self.smooth_rate, time))[:, None]
         if cause.cause == 'clock_rate':
             rate = np.asarray(self.channels.rate)
-            return (self.span_integrals(rate) - self.span_changes(time * rate))[:, None]
+            return (self.span_integrals(rate)
+                    - self.span_changes(time * self.smooth_rate))[:, None]
         columns = CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)
         return np.column_stack([-self.span_integrals(np.asarray(each)) for each in columns])
 
@@ -661,7 +675,7 @@ def find_delay(spans: Spans) -> float:
     def disagreement(delay: float) -> float:
         """Return the robust difference of gyro and reference over a span at a delay, rad."""
         moved = replace(spans, delay=delay)
-        left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
+        left = _robust_least_squares(moved.rate_columns(), moved.observed, prior[:2])[1]
         return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
 
     most = int(spans.treatment.largest_delay / _DELAY_STEP + 1e-6)
