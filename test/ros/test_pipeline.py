@@ -83,15 +83,17 @@ def test_a_short_gap_is_bridged_and_after_a_jump_of_the_stamps_integration_begin
     assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
 
 
-def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path):
+@pytest.mark.parametrize('rate', [0.5, 0.0])
+def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path, rate):
     rig = Rig(tmp_path, model=CERTAIN)
     before = rig.feed(np.full(100, 0.01))[-1]
     for _ in range(300):
         rig.skip(-INTERVAL, steady=0.0)
-        assert rig.feed([0.5]) == [None]
+        assert rig.feed([rate]) == [None]
     after = rig.feed([0.01])[0]
     assert after.heading == pytest.approx(before.heading, abs=1e-3)
-    assert math.sqrt(after.heading_variance) == pytest.approx(0.5 * 300 * INTERVAL, rel=0.02)
+    assert math.sqrt(after.heading_variance) == pytest.approx(rate * 300 * INTERVAL, rel=0.02,
+                                                              abs=1e-3)
     assert 'stood still for 3.0 s' in rig.journal.event
 
 
