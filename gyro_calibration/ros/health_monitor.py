@@ -178,6 +178,7 @@ class PulseDetector:
         """Start without samples."""
         self._last = math.nan, math.nan
         self._steps = deque[tuple[float, float]]()  # stamps, s, and sizes, rad/s
+        self._median_step, self._median_time = math.nan, -math.inf  # rad/s, and of when, s
         # rate before the pulse, rad/s; its begin, s, largest step, rad/s, and samples so far
         self._pulse: tuple[float, float, float, int] | None = None
         self._turn = 0.0  # by the pulse so far, rad
@@ -188,9 +189,11 @@ class PulseDetector:
         step, interval = output - before, abs(time - then)
         while self._steps and not 0.0 <= time - self._steps[0][0] <= RECENT_DURATION:
             self._steps.popleft()
-        limit, found = _MAX_DECELERATION * interval, (0.0, 0)
-        is_jump = abs(step) > limit and bool(self._steps) and abs(step) > (
-            limit + _MIN_PULSE_RATIO * float(np.median([size for _, size in self._steps])))
+        if self._steps and not 0.0 <= time - self._median_time < 0.05 * RECENT_DURATION:
+            self._median_time = time
+            self._median_step = float(np.median([size for _, size in self._steps]))
+        is_jump = abs(step) > _MAX_DECELERATION * interval + _MIN_PULSE_RATIO * self._median_step
+        found = 0.0, 0
         if self._pulse and not 0.0 <= time - self._pulse[1] <= _MIN_REPEAT_DURATION:
             self._pulse = None
         if self._pulse is None:
