@@ -462,6 +462,8 @@ class _TopicSession:
                     known = sorted(name for name, _ in node.get_topic_names_and_types())
                     verb.print_message(f'no publisher so far of {", ".join(missing)}; '
                                        f'there are {", ".join(known) or "none"}')
+                if not self._samples and next(iter(self._roles)) not in missing:
+                    verb.print_message(f'no message so far on {next(iter(self._roles))}')
 
         # prints of the middleware go to standard error; standard output is the answer
         sys.stdout.flush()

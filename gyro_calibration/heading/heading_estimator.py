@@ -108,7 +108,8 @@ class HeadingEstimator:
     `model` has the stored calibration, `current_model` the present one, by which samples are
     compensated. `covariance`, shape (m, m), is that of the temperature coefficient of the bias and
     of the uncertain values of the current model. `rate` is the last one, rad/s, zero at rest, and
-    `corrected_rate` that before the tracker. `temperature`, degC, is None before the first.
+    `corrected_rate` that before the tracker. `temperature`, degC, is None before the first. The
+    sum of `heading_before_resets` and the heading of the tracker, rad, is not changed by resets.
 
     """
 
@@ -122,7 +123,7 @@ class HeadingEstimator:
         self.rate = self.corrected_rate = 0.0
         self.last_compensated = CompensatedSamples(0.0, 0.0, 0.0, False, False)
         self.restart_count = 0
-        self._time, self._elapsed, self._heading_before_resets = -math.inf, 0.0, 0.0
+        self._time, self._elapsed, self.heading_before_resets = -math.inf, 0.0, 0.0
         self._refused_count, self.refused_temperature_count = 0, 0
         self._stretch: _RestStretch | None = None
         self._pending_stretches: deque[_RestStretch] = deque(maxlen=8)
@@ -150,12 +151,12 @@ class HeadingEstimator:
 
     def reset(self) -> None:
         """Set the heading to zero."""
-        self._heading_before_resets += self.tracker.heading
+        self.heading_before_resets += self.tracker.heading
         self.tracker.reset()
 
     def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²."""
-        self._heading_before_resets += self.tracker.heading - heading
+        self.heading_before_resets += self.tracker.heading - heading
         self.tracker.set_heading(heading, variance)
 
     def shift_clock(self, step: float) -> None:
@@ -400,7 +401,7 @@ class HeadingEstimator:
         ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
         return self._history.update(
             self._elapsed, self.temperature, force, supply,
-            heading=self._heading_before_resets + self.tracker.heading + ahead)
+            heading=self.heading_before_resets + self.tracker.heading + ahead)
 
     # A whole log
 

@@ -780,9 +780,10 @@ class HeadingTracker:
                              angle: float = 0.0) -> None:
         """Add a turn, rad, that was not measured in a time, s, after the last sample."""
         self._erroneous_turn = 0.0
-        self._propagate_state(replace(self._zero_integral, duration=duration, angle=angle,
-                                      lost_variance=variance, is_unobserved=True),
-                              self._last_time)
+        if variance or duration:  # else a measurement at rest without variance
+            self._propagate_state(replace(self._zero_integral, duration=duration, angle=angle,
+                                          lost_variance=variance, is_unobserved=True),
+                                  self._last_time)
         self._adopt_state()
 
     def _advance_to_last_sample(self) -> None:

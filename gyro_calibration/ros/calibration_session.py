@@ -58,7 +58,13 @@ from gyro_calibration.model.motion import (
 )
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
-from gyro_calibration.ros.inputs import Clock, node_time, StampDelay, Velocity
+from gyro_calibration.ros.inputs import (
+    Clock,
+    MAX_ANGULAR_ACCELERATION,
+    node_time,
+    StampDelay,
+    Velocity,
+)
 from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
@@ -261,11 +267,12 @@ class CalibrationSession:
             except MotionError as error:
                 return str(error)
             duration = motion.duration
-            fastest, limit = _max_rate(motion), self._estimator.current_model.rate_limit
+            # less than any gyro's limit; one in deg/s that was taken for rad/s is faster
+            fastest, limit = _max_rate(motion), STOPPING_DURATION * MAX_ANGULAR_ACCELERATION
             if drives and fastest > limit:
-                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro '
-                        f'measures at most {limit / DEGREE:.0f} deg/s: correct '
-                        'calibration.profile_file')
+                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but a robot is '
+                        f'expected to stop in {STOPPING_DURATION:g} s, as from '
+                        f'{limit / DEGREE:.0f} deg/s: correct calibration.profile_file')
         if drives and obstacle:
             return obstacle
         now = self._clock.steady()

@@ -37,13 +37,14 @@ import numpy as np
 from scipy.special import chdtr, chdtrc
 
 _PART_DURATION = 1.0  # s; of the parts of a stretch that are compared
+_MIN_REPEAT_DURATION = 0.25  # s; repeated values that last as long are a fault
 #: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
 _MAX_DECELERATION = 20.0  # rad/s²; of a robot
-#: Height of a spike, in medians of the steps before it, that no vibration has: 5 of 1.2 million
+#: Height of a pulse, in medians of the steps before it, that no vibration has: 5 of 1.2 million
 #: samples of cars and turntables are higher.
-_MIN_SPIKE_RATIO = 10.0
+_MIN_PULSE_RATIO = 10.0
 #: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
 #: path may vibrate for some time.
 _DECIDING_STRETCHES = 3
@@ -107,7 +108,7 @@ class RepeatedOutputDetector:
             return toggles
         self._count, self._until = self._count + 1, time
         lasts = time - self._since
-        if toggles or self._count < 20 or lasts < 0.25:
+        if toggles or self._count < 20 or lasts < _MIN_REPEAT_DURATION:
             return toggles
         if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
@@ -145,7 +146,8 @@ class RepeatedOutputDetector:
             low, high, since, count = output, output, time, 0
         self._band = low, high, since, count
         lasts = time - since
-        sample = self._noise.angle_random_walk / math.sqrt(lasts / count) if lasts > 0.25 else 0.0
+        sample = (self._noise.angle_random_walk / math.sqrt(lasts / count)
+                  if lasts > _MIN_REPEAT_DURATION else 0.0)
         return (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
                 and self._changes > 100 and sample > 0.0
                 and self._excludes_chance(2.0 * self._step, count, sample))
@@ -163,28 +165,49 @@ class RepeatedOutputDetector:
         return -count * math.log(max(stays, 1e-9)) > level
 
 
-class SpikeDetector:
-    """Detector of single samples that deviate from both neighbours as no rate of a robot does."""
+class PulseDetector:
+    """
+    Detector of samples that deviate from those before and after as no rate of a robot does.
+
+    A pulse begins with a step of more than 20 rad/s² and ten times the median one of the last 2 s,
+    and ends with such a step back, at most 0.25 s later: a fast turntable swings in 0.5 s.
+
+    """
 
     def __init__(self) -> None:
         """Start without samples."""
         self._last = math.nan, math.nan
-        self._step = 0.0  # to the last sample, rad/s
         self._steps = deque[tuple[float, float]]()  # stamps, s, and sizes, rad/s
+        self._median_step, self._median_time = math.nan, -math.inf  # rad/s, and of when, s
+        # rate before the pulse, rad/s; its begin, s, largest step, rad/s, and samples so far
+        self._pulse: tuple[float, float, float, int] | None = None
+        self._turn = 0.0  # by the pulse so far, rad
 
-    def add(self, time: float, output: float) -> float:
-        """Add a sample, s and rad/s; return the turn by the one before if it is a spike, rad."""
+    def add(self, time: float, output: float) -> tuple[float, int]:
+        """Add a sample, s and rad/s; return turn, rad, and samples of a pulse that ended."""
         (then, before), self._last = self._last, (time, output)
-        last, self._step = self._step, output - before
-        interval = abs(time - then)
+        step, interval = output - before, abs(time - then)
         while self._steps and not 0.0 <= time - self._steps[0][0] <= RECENT_DURATION:
             self._steps.popleft()
-        height = min(abs(last), abs(self._step)) if last * self._step < 0.0 else 0.0
-        is_spike = height > _MAX_DECELERATION * interval and height > (
-            _MAX_DECELERATION * interval
-            + _MIN_SPIKE_RATIO * float(np.median([size for _, size in self._steps])))
-        self._steps.append((time, abs(self._step)))
-        return math.copysign(height * interval, last) if is_spike else 0.0
+        if self._steps and not 0.0 <= time - self._median_time < 0.05 * RECENT_DURATION:
+            self._median_time = time
+            self._median_step = float(np.median([size for _, size in self._steps]))
+        is_jump = abs(step) > _MAX_DECELERATION * interval + _MIN_PULSE_RATIO * self._median_step
+        found = 0.0, 0
+        if self._pulse and not 0.0 <= time - self._pulse[1] <= _MIN_REPEAT_DURATION:
+            self._pulse = None
+        if self._pulse is None:
+            if is_jump:
+                self._pulse, self._turn = (before, time, step, 1), step * interval
+        else:
+            base, begin, first, count = self._pulse
+            if is_jump and step * first < 0.0 and abs(output - base) < 0.5 * abs(first):
+                found, self._pulse = (self._turn, count), None
+            else:
+                self._turn += (output - base) * interval
+                self._pulse = base, begin, first, count + 1
+        self._steps.append((time, abs(step)))
+        return found
 
 
 class HealthMonitor:

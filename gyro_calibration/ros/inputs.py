@@ -115,6 +115,8 @@ class StampDelay:
 
         The test compares with the delays of a window, s. A tolerance is a duration, s, the
         shortest one first, in which some samples are not late, and a change of their delay, s.
+        Both advance equally within 5 %; after two windows, a change of the pace from one window to
+        the next by more than the tolerance is of a window is a fault too.
 
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
@@ -148,14 +150,21 @@ class StampDelay:
         now = node_time(self._clock)
         # In a fast simulation the same delay is more simulated time.
         factor = 1.0 if self._clock.simulated() is None else 4.0
-        while self._earlier and not 0.0 <= now - self._earlier[0][0] <= self._window:
+        while self._earlier and not 0.0 <= now - self._earlier[0][0] <= 2.0 * self._window:
             self._earlier.popleft()
         least = [self._least_delay(duration) for duration, _ in self._tolerances]
-        for then, before in self._earlier:
+        old = [each for each in self._earlier if now - each[0] > self._window]
+        for then, before in list(self._earlier)[len(old):]:
             elapsed = now - then
-            for late, early, (_, tolerance) in zip(least, before, self._tolerances, strict=True):
-                # the clocks of gyros are up to 3 % off
-                if abs(late - early) > factor * tolerance + 0.05 * elapsed:
+            for place, (late, early, (duration, tolerance)) in enumerate(
+                    zip(least, before, self._tolerances, strict=True)):
+                # the clocks of gyros are up to 3 % off, and stay so
+                pace, unknown = 0.0, 0.05
+                if (tolerance < unknown * self._window and len(old) > 1
+                        and old[-1][0] - old[0][0] > self._window - 2.0 * duration):
+                    pace = (old[-1][1][place] - old[0][1][place]) / (old[-1][0] - old[0][0])
+                    pace, unknown = max(min(pace, unknown), -unknown), tolerance / self._window
+                if abs(late - early - pace * elapsed) > factor * tolerance + unknown * elapsed:
                     return ('this computer was busy, or the clock of the driver is wrong: the '
                             'stamps on imu/data_raw advanced by '
                             f'{elapsed - late + early:.2f} s in {elapsed:.2f} s; reduce the load, '
@@ -218,38 +227,63 @@ class Velocity:
 
 class TurnComparison:
     """
-    Comparison of the turns by the gyro with those by odometry, a radian at a time.
+    Comparison of the turns by the gyro with those by odometry or commands, a radian at a time.
 
-    Turns contradict each other where two in a row have opposite signs, or a ratio beyond the
-    geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the wheels.
+    Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
+    beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
+    wheels; a robot may be turned by others than the commands.
 
     """
 
     def __init__(self) -> None:
         """Start without turns."""
-        self.ratio = math.nan  # of the last turns
+        self.ratio, self.source = math.nan, ''  # of the last turns
         self._last = math.nan, math.nan
-        self._by_odometry = self._by_gyro = 0.0
+        self._by_wheels = self._by_gyro = 0.0
         self._contradictions = 0
+        self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
 
     @property
     def is_contradictory(self) -> bool:
         """Tell whether the last turns contradict each other."""
         return self._contradictions > 1
 
-    def add(self, time: float, rate: float, heading: float) -> None:
-        """Add time, s, and rate, rad/s, of an odometry, and the heading by the gyro, rad."""
+    @property
+    def turn_at_rest(self) -> tuple[float, float]:
+        """Return duration, s, and turn by the gyro, rad, while odometry shows standstill."""
+        # two seconds pass before a robot stands, and one until a late odometry shows its turn
+        if len(self._at_rest) < 4:
+            return 0.0, 0.0
+        (begin, before), (end, after) = self._at_rest[2], self._at_rest[-2]
+        return end - begin, abs(after - before)
+
+    def add(self, source: str, time: float, rate: float, heading: float, *,
+            stands: bool = False) -> None:
+        """
+        Add time, s, and rate, rad/s, of a source, and the heading by the gyro, rad.
+
+        The heading must not be changed by resets. Tell whether odometry shows standstill.
+
+        """
         (then, before), self._last = self._last, (time, heading)
+        is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
+        self.source = source
+        if not (is_next and stands):
+            self._at_rest.clear()
+        if stands and (not self._at_rest or time - self._at_rest[-1][0] >= MAX_VELOCITY_AGE):
+            del self._at_rest[3:-1]
+            self._at_rest.append((time, heading))
         # at slower rates the bias of a gyro may be larger
-        if not (0.0 < time - then <= MAX_VELOCITY_AGE and abs(rate) > MIN_TURN_RATE):
+        if not is_next or abs(rate) <= MIN_TURN_RATE:
             return
-        self._by_odometry += rate * (time - then)
+        self._by_wheels += rate * (time - then)
         self._by_gyro += heading - before
-        if abs(self._by_odometry) > 1.0:  # rad
-            self.ratio = self._by_gyro / self._by_odometry
-            is_wrong = not -0.5 < self.ratio < math.sqrt(180.0 / math.pi)
+        if abs(self._by_wheels) > 1.0:  # rad
+            self.ratio = self._by_gyro / self._by_wheels
+            is_wrong = (self.ratio > math.sqrt(180.0 / math.pi)
+                        or source == ODOMETRY and self.ratio < -0.5)
             self._contradictions = is_wrong * (self._contradictions + 1)
-            self._by_odometry = self._by_gyro = 0.0
+            self._by_wheels = self._by_gyro = 0.0
 
 
 class Wheels:

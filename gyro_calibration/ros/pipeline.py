@@ -55,8 +55,8 @@ from gyro_calibration.ros.calibration_session import (
 )
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor,
+    PulseDetector,
     RepeatedOutputDetector,
-    SpikeDetector,
 )
 from gyro_calibration.ros.inputs import (
     Clock,
@@ -195,13 +195,16 @@ class Pipeline:
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
         self.repeat_fault, self._repeat_detector = '', RepeatedOutputDetector(noise)
-        self._spike_detector, self._outlier_count = SpikeDetector(), 0
+        self._pulse_detector, self._outlier_count = PulseDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
         self._stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
         self._turns = TurnComparison()
+        # Time until which gyro and odometry agreed at standstill, s, whether it stands, and the
+        # possible error of the heading and the turn by the gyro since then, rad.
+        self._agreed_time, self._stood, self._false_turn = math.inf, False, (0.0, 0.0)
         self._recent_rates, self._known_beginnings = deque[tuple[float, float]](), 0
 
     # Time
@@ -209,7 +212,7 @@ class Pipeline:
     def _new_stamp_delay(self) -> StampDelay:
         """Return a comparison of stamps and clock, whose tolerance a deviation of 6 % exceeds."""
         # a busy computer delays all samples by a second for a short time
-        return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
+        return StampDelay(self._clock, 60.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
 
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
@@ -274,8 +277,27 @@ class Pipeline:
                 and (velocity.is_moving or not self.odometry_fault)):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
-            self._turns.add(time, rate, self.estimator.tracker.heading)
+            self._compare_turns(ODOMETRY, time, rate,
+                                not velocity.is_moving and not self.odometry_fault)
             self.session.add_odometry(time, heading, rate)
+
+    def _compare_turns(self, source: str, time: float, rate: float, stands: bool = False) -> None:
+        """Compare the heading with a rate by odometry or commands, and add an unknown turn."""
+        estimator, turns = self.estimator, self._turns
+        turns.add(source, time, rate,
+                  estimator.heading_before_resets + estimator.tracker.heading, stands=stands)
+        (duration, turned), (known, _) = turns.turn_at_rest, self._false_turn
+        if not duration:
+            if self._stood and not known:
+                self._agreed_time = time
+            self._stood, self._false_turn = False, (0.0, 0.0)
+            return
+        self._stood = True
+        if turned > 4.0 * estimator.tracker.bias[1] * duration + MIN_TURN_ANGLE:
+            # the bias may have changed at any time since the last rest in which both agreed
+            unknown = max(turned / duration * max(time - self._agreed_time, duration), known)
+            self._false_turn = unknown, turned
+            estimator.tracker.add_unknown_turn(math.sqrt(unknown ** 2 - known ** 2))
 
     @property
     def odometry_fault(self) -> str:
@@ -287,14 +309,25 @@ class Pipeline:
 
     @property
     def turn_fault(self) -> str:
-        """Return that the turns by the gyro and by odometry contradict each other; ''."""
-        return (f'the gyro turns by {self._turns.ratio:.1f} times what odom shows: check the unit '
-                'and the sense of rotation of the gyro, and those of odom'
-                if self._turns.is_contradictory else '')
+        """Return that the turns by the gyro and by odometry or commands do not agree; ''."""
+        turns = self._turns
+        return (f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check the '
+                f'unit and the sense of rotation of the gyro, and those of {turns.source}'
+                if turns.is_contradictory else '')
+
+    @property
+    def standstill_fault(self) -> str:
+        """Return that the gyro shows a turn while odometry shows standstill; ''."""
+        return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
+                'the robot stands: if it stands, call calibrate_bias, else check odom'
+                if self._false_turn[1] else '')
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel, also one of this node."""
-        self.wheels.add(COMMAND, velocity, self._clock.steady())
+        now = self._clock.steady()
+        self.wheels.add(COMMAND, velocity, now)
+        if self.wheels.is_moving(now, (ODOMETRY,)) is None:
+            self._compare_turns(COMMAND, self._last_time, velocity.angular[2])
         self.session.add_command(velocity)
 
     def add_sample(self, stamp: int, output: float, specific_force: float | None = None,
@@ -447,17 +480,17 @@ class Pipeline:
         return found
 
     def _check_repeats(self, time: float, output: float, now: float) -> None:
-        """Detect repeated values and spikes, and add an unknown turn to the heading."""
+        """Detect repeated values and pulses, and add an unknown turn to the heading."""
         outliers, self._outlier_count = self._outlier_count, self.estimator.tracker.outlier_count
-        spike = self._spike_detector.add(time, output)
+        pulse, size = self._pulse_detector.add(time, output)
         is_repeated = self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
                                                 self.monitor.has_noise_at_rest)
         if not is_repeated:
             if self._outlier_count > outliers:  # the tracker has not used the sample
-                spike = 0.0
-            unseen = math.hypot(self._repeat_detector.unseen_turn, spike)
-            if unseen and not self.repeat_fault:
-                self.estimator.tracker.add_unknown_turn(unseen, -spike)
+                pulse = 0.0
+            unseen = math.hypot(self._repeat_detector.unseen_turn, pulse)
+            if unseen and not self.repeat_fault:  # several samples may be a turn
+                self.estimator.tracker.add_unknown_turn(unseen, -pulse if size == 1 else 0.0)
             self.repeat_fault = ''
         elif not self.repeat_fault:
             self.repeat_fault = (f'the gyro repeats the rate {output:g} rad/s: it is dead or '

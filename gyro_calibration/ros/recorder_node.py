@@ -46,11 +46,13 @@ class RecorderNode(Node):
         """Subscribe to topics by their roles; `LogError` for a name or a type that is wrong."""
         super().__init__('gyro_calibration_recorder', context=context,
                          start_parameter_services=False, enable_rosout=False)
-        try:
-            self._roles = {self.resolve_topic_name(topic): role for topic, role in roles.items()}
-        except (RuntimeError, ValueError) as error:
-            raise LogError(f'{", ".join(roles)}: no topic name ({_describe_error(error)}); '
-                           'give another') from None
+        self._roles = {}
+        for topic, role in roles.items():
+            try:
+                self._roles[self.resolve_topic_name(topic)] = role
+            except (RuntimeError, ValueError) as error:
+                raise LogError(f'{topic}: no topic name ({_describe_error(error)}); '
+                               'give another') from None
         self.message_count = 0
         self._on_message = on_message
         self._taken: dict[str, Subscription] = {}  # topics

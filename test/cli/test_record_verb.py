@@ -549,7 +549,7 @@ def test_a_topic_of_another_kind_is_refused(ros, record, tmp_path, name):
 
 
 @pytest.mark.parametrize(('topic', 'domain', 'ended', 'sentence'), [
-    ('a b', None, 2, '/a b, /imu/temperature: no topic name (failed to resolve name'),
+    ('a b', None, 2, 'gyro_calibration: /a b: no topic name (failed to resolve name'),
     ('imu', 'x', 2, 'ROS 2 cannot be started (failed to initialize rcl: '
      'ROS_DOMAIN_ID is not an integral number)'),
     ('imu', '999', 2, 'ROS_DOMAIN_ID is 999, but must be from 0 to 232'),

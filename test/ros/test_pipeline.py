@@ -83,15 +83,17 @@ def test_a_short_gap_is_bridged_and_after_a_jump_of_the_stamps_integration_begin
     assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
 
 
-def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path):
+@pytest.mark.parametrize('rate', [0.5, 0.0])
+def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path, rate):
     rig = Rig(tmp_path, model=CERTAIN)
     before = rig.feed(np.full(100, 0.01))[-1]
     for _ in range(300):
         rig.skip(-INTERVAL, steady=0.0)
-        assert rig.feed([0.5]) == [None]
+        assert rig.feed([rate]) == [None]
     after = rig.feed([0.01])[0]
     assert after.heading == pytest.approx(before.heading, abs=1e-3)
-    assert math.sqrt(after.heading_variance) == pytest.approx(0.5 * 300 * INTERVAL, rel=0.02)
+    assert math.sqrt(after.heading_variance) == pytest.approx(rate * 300 * INTERVAL, rel=0.02,
+                                                              abs=1e-3)
     assert 'stood still for 3.0 s' in rig.journal.event
 
 
@@ -201,6 +203,21 @@ def test_single_samples_that_deviate_do_not_turn_the_heading(tmp_path, size):
     assert abs(error) < 0.1 * abs(size * 50 * INTERVAL)
 
 
+@pytest.mark.parametrize('size, count', [(0.3, 20), (-1.0, 5), (2.0, 2)])
+def test_several_samples_that_deviate_are_in_the_variance_and_a_turn_of_a_robot_is_not(
+        tmp_path, size, count):
+    rig = rested(tmp_path, model=CERTAIN, robot=Robot(bias=0.01, scale_factor_error=0.0))
+    rig.robot.command(0.7)
+    rig.go(0.4)  # the robot has begun to turn
+    rig.go(2.6)
+    assert rig.error()[1] < 0.1 * DEGREE
+    numbers = iter(range(10 ** 6))
+    rig.robot.distort = lambda output: output + size * (100 <= next(numbers) < 100 + count)
+    rig.go(3.0)
+    error, deviation = rig.error()
+    assert 0.7 * abs(size * count * INTERVAL) < abs(error) < 1.5 * deviation
+
+
 @pytest.mark.parametrize('value, begin', [(None, 220), (None, 231), (0.0, 236)],
                          ids=['before a turn', 'as it begins', 'zero in the turn'])
 def test_a_turn_while_one_value_is_held_for_a_short_time_is_in_the_variance(
@@ -256,6 +273,41 @@ def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill
     assert rig.pipeline.wheels.is_moving(rig.clock.now) is None
     error, deviation = rig.error(begin)
     assert abs(error) < 4.0 * deviation, (error, deviation)
+
+
+@pytest.mark.parametrize('moved, wheels', [(1.5, 'none'), (3.0, 'odom'), (0.0, 'odom')])
+def test_a_turn_by_the_gyro_alone_while_odometry_stands_is_a_warning_and_in_the_variance(
+        tmp_path, reported, moved, wheels):
+    """As of a bias that changed in the drive before, or of odometry that has stopped."""
+    rig = rested(tmp_path, model=CERTAIN, seconds=12.0, wheels=wheels,
+                 robot=Robot(bias=0.01, scale_factor_error=0.0))
+    rig.robot.command(0.3)
+    rig.go(3.0)
+    rig.robot.bias += moved * DEGREE
+    rig.go(10.0)
+    rig.robot.command(0.0)
+    rig.go(10.0)
+    rig.pipeline.reset_heading() if not moved else None
+    rig.go(2.0)
+    level, message, _ = reported(rig)
+    assert ('deg while odom shows that the robot stands' in message) == (level == WARN) == (
+        moved > 0.0), message
+    if moved:
+        error, deviation = rig.error()
+        assert 10.0 * DEGREE < abs(error) < 2.0 * deviation < 4.0 * abs(error)
+
+
+@pytest.mark.parametrize('unit, warns', [(1.0 / DEGREE, True), (1.0, False), (-1.0, False)])
+def test_without_odometry_turns_are_compared_with_commands(tmp_path, reported, unit, warns):
+    """Where others turn the robot the other way, commands show nothing."""
+    rig = rested(tmp_path)
+    rig.odometry = lambda stamp, reading: None
+    rig.robot.distort = lambda output: unit * output
+    rig.other = 0.4
+    rig.go(20.0)
+    level, message, _ = reported(rig)
+    assert ('times what cmd_vel shows: check the unit' in message) == warns, message
+    assert (rig.error()[1] > math.tau) == warns
 
 
 @pytest.mark.parametrize('gyro, wheels, warns', [
@@ -608,6 +660,19 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
     level, message, _ = reported(rig)
     assert (level == WARN and 'stamps on imu/data_raw advanced by' in message) == warns, message
     assert (rig.error(first)[1] > math.tau) == warns
+
+
+@pytest.mark.parametrize('usual, pace, warns', [
+    (1.0, 0.98, True), (1.0, 1.05, True), (0.97, 1.0, True), (1.03, 1.03, False)])
+def test_a_change_of_the_rate_of_the_stamps_is_noticed_once_it_is_known(
+        tmp_path, usual, pace, warns):
+    """Clocks of gyros may be 3 % off, but they stay so; one that is being set does not."""
+    rig = Rig(tmp_path, model='')
+    for known, seconds, fault in ((usual, 130.0, False), (pace, 30.0, warns)):
+        for _ in range(round(25.0 * seconds)):
+            rig.skip(0.04 * (known - 1.0), steady=0.0)
+            rig.feed([0.0], SLOW)
+        assert bool(rig.pipeline.clock_fault) == fault, known
 
 
 def test_a_count_is_a_warning_only_while_it_grows(tmp_path, reported):
