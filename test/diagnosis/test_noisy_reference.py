@@ -12,7 +12,7 @@
 
 from dataclasses import replace
 
-from chance import evidence, seeds
+from chance import evidence, rms_bounds, seeds
 from diagnosed import judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import (
@@ -26,7 +26,13 @@ from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
+from gyro_calibration.logs.log import (
+    DataRefused,
+    DEGREE,
+    Log,
+    NORMAL_QUANTILE_975,
+    select_rows,
+)
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
@@ -358,6 +364,16 @@ def test_noise_is_no_effect_of_a_motion_in_which_effects_look_alike(seed):
     assert not [each
                 for each in found.findings if each.status == 'established'], terminal_lines(found)
     assert value(found.model, 'scale_factor_error') == pytest.approx(0.01, abs=0.004)
+
+
+def test_noise_is_no_information_on_a_delay_of_a_slow_motion():
+    # from point to point the rate changes less by the swing than by noise
+    errors = []
+    for seed in range(10):
+        fit = fit_spans(lay_out_spans(
+            swing(seed, lambda time: 0.08 * np.cos(time / 7.0), 6e-4), 'rate_command'))
+        errors.append(fit.values[2] / (fit.half_width(2) / NORMAL_QUANTILE_975))
+    assert np.sqrt(np.mean(np.square(errors))) < rms_bounds(len(errors))[1], errors
 
 
 def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
