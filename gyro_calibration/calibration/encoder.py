@@ -236,7 +236,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
 def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
-    limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET)
+    limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET, max_heading_error=15.0 * DEGREE)
     refuse_one_speed(motion, limits)
     refuse_dead(output)
     _refuse_turn_in_hole(time, output, motion)

@@ -75,8 +75,8 @@ class RunLimits:
     # largest corrected rate at rest after the run, rad/s, unless the noise explains more
     max_rest_rate: float = 2e-4
     # largest error of the heading after five minutes, rad, unless it was larger without the
-    # calibration (`likelihood` only)
-    max_heading_error: float = 15.0 * DEGREE
+    # calibration (`likelihood` only): that of a bias of 0.1 deg/s, which a gyro has at least
+    max_heading_error: float = 30.0 * DEGREE
 
 
 @dataclass(frozen=True)
