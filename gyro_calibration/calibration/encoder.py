@@ -72,7 +72,7 @@ from gyro_calibration.calibration.reference_noise import (
     is_course,
     rate_noise_share,
 )
-from gyro_calibration.calibration.run_faults import refuse_unit_error
+from gyro_calibration.calibration.run_faults import fit_profile, refuse_unit_error, split_run
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, select_effects, Selection
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION,
@@ -98,6 +98,8 @@ from gyro_calibration.logs.quality import (
     find_holes,
     quantization_step,
     refuse_dead,
+    robust_deviation,
+    white_noise_deviation,
 )
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
@@ -123,6 +125,9 @@ _HOLE_EDGE = 15
 #: Share of the largest differences that show their tail, and the probability that noise alone
 #: exceeds the limit of a jump in a log.
 _TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
+#: Share of the noise of the output beside a reference that is computed from it; an independent
+#: reference leaves all of it.
+_OWN_NOISE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -236,10 +241,10 @@ def calibrate_encoder(log: Log, method: str | None = None,
 def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
-    limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET)
+    limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET, max_heading_error=15.0 * DEGREE)
+    _refuse_turn_in_hole(time, output, motion)
     refuse_one_speed(motion, limits)
     refuse_dead(output)
-    _refuse_turn_in_hole(time, output, motion)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
     fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
@@ -296,7 +301,8 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
 
     A jump is a change from one value to the next beyond all rates of the gyro around it, and
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
-    1975). Two in a row are an outlier, or a motion that the gyro does not measure.
+    1975). Two in a row, there and back, are a wrong value, which is left out; else they are a
+    motion that the gyro does not measure.
 
     """
     if log.time is None or log.output is None or log.reference_heading is None:
@@ -318,15 +324,22 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     above = usual & (beyond > noise)
     alone = np.convolve(above, np.ones(3), 'same') == 1.0
     jumps = known[1:][above & alone]
-    if not len(jumps):
-        return log, []
-    sizes = np.zeros(len(time))
-    sizes[jumps] = difference[above & alone]
-    places = format_list([f'{time[row]:.2f} s' for row in jumps])
-    return replace(log, reference_heading=log.reference_heading - np.cumsum(sizes)), [
-        f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value to '
-        f'the next, at {places}, where the gyro does not turn so fast, as after a lost reference '
-        'or where rows are missing; the heading is compared before and after, not over, each jump']
+    back = above[:-1] & above[1:] & (np.abs(difference[:-1] + difference[1:]) <= noise)
+    wrong = known[1:-1][back]
+    sizes, heading, remarks = np.zeros(len(time)), log.reference_heading.copy(), []
+    if len(wrong):
+        heading[wrong] = np.nan
+        remarks.append('the reference is off in single values, which are left out, by up to '
+                       f'{np.abs(difference[:-1][back]).max() / DEGREE:.1f} deg: '
+                       + format_list([f'{time[row]:.2f} s' for row in wrong]))
+    if len(jumps):
+        sizes[jumps] = difference[above & alone]
+        remarks.append(
+            f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
+            f'to the next, at {format_list([f"{time[row]:.2f} s" for row in jumps])}, where the '
+            'gyro does not turn so fast, as after a lost reference or where rows are missing; the '
+            'heading is compared before and after, not over, each jump')
+    return replace(log, reference_heading=heading - np.cumsum(sizes)), remarks
 
 
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
@@ -354,9 +367,11 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
         # a rate without noise may be a command, which the motion follows
         motion = motion_from_rates(log.time[reference_known], rate[reference_known])
     motion = replace(motion, name='reference')
-    if motion.duration < 10.0:
+    # the last value stands for an interval too; the rounding of stamps, 1 us, is no lack
+    duration = motion.duration + float(np.median(np.diff(motion.time)))
+    if duration < 10.0 - 1e-6:
         # not rounded up to the 10 s that are needed
-        raise DataRefused(f'the log lasts {math.floor(10.0 * motion.duration) / 10.0:g} s; at '
+        raise DataRefused(f'the log lasts {math.floor(10.0 * duration) / 10.0:g} s; at '
                           'least 10 s are needed: record longer')
     if motion.duration > 1e8:  # three years
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
@@ -378,8 +393,8 @@ def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:
         if abs(turned - by_gyro) > MAX_FOLLOWED_RESIDUAL:
             raise DataRefused(
                 f'the gyro has no samples for {end - begin:.1f} s from {begin:.1f} s on, in which '
-                f'the reference turns by {turned / DEGREE:.0f} deg: use --method course, or fit '
-                'the log before or after it (--to, --from)')
+                f'the reference turns by {abs(turned) / DEGREE:.0f} deg: use --method course, or '
+                'fit the log before or after it (--to, --from), or correct the stamps')
 
 
 def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:
@@ -534,11 +549,11 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
     if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
-        yield ('the motion hardly distinguishes a scale factor error from a smoothing of the '
-               'reference or a lag, as where it has one frequency; '
-               f'{100.0 * fit.response_deviation:.2g} % of the standard deviation are for that, '
-               'as far as the delay shows it. A reference that was smoothed without a delay may '
-               'err by more: turn at several speeds, with stops')
+        yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag of '
+               'the reference or the gyro, as where it has one frequency, or a period that is not '
+               f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
+               'are for that, as far as the delay shows it. A reference that was smoothed without '
+               'a delay may err by more: turn slowly, at several speeds, with stops')
     if fit.misalignment.size:
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
         if chance < FALSE_ALARM_RATE:
@@ -587,6 +602,8 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     calibrated by it, and so is one with a reference rate that is seldom steady.
 
     """
+    for log in logs.values():
+        _refuse_own_reference(log)
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
     if method == 'dwells' or method is None and (others or any(
             log.time is None or log.reference_rate is not None or log.reference_heading is None
@@ -611,11 +628,50 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         raise InputError(HEADING_ALONE)
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
-    return found if log.reference_heading is not None else replace(found, remarks=(
+    if log.reference_heading is not None:
+        return replace(found, remarks=(*_compare_references(log), *found.remarks))
+    return replace(found, remarks=(
         f'the log has a reference rate, which is constant {_MIN_DWELLS - 1} times at most, or for '
         f'up to {100.0 * FEW_DWELLS_SHARE:g} % of the time; so the rate is integrated, and '
         'headings are compared. For other effects than bias and scale factor error, hold each '
         'rate for some seconds', *found.remarks))
+
+
+def _refuse_own_reference(log: Log) -> None:
+    """Refuse a reference that follows the noise of the output: it is computed from it."""
+    if log.time is None or log.output is None:
+        return
+    for rate in (log.reference_rate, None if log.reference_heading is None else np.append(
+            math.nan, np.diff(log.reference_heading) / np.diff(log.time))):
+        if rate is None:
+            continue
+        # by the rectangle rule or the trapezoid rule, with any scale and bias
+        columns = np.column_stack([log.output[1:], log.output[:-1], np.ones(len(log) - 1)])
+        known = np.isfinite(rate[1:]) & np.isfinite(columns).all(axis=1)
+        shares = np.linalg.lstsq(columns[known], rate[1:][known], rcond=1e-12)[0]
+        if np.count_nonzero(known) > 100 and robust_deviation(
+                rate[1:][known] - columns[known] @ shares) < (
+                    _OWN_NOISE_SHARE * white_noise_deviation(columns @ shares, 6)):
+            raise DataRefused('the reference is computed from this gyro, since it follows its '
+                              'noise from sample to sample: give a reference without it')
+
+
+def _compare_references(log: Log) -> list[str]:
+    """Return a remark where heading and rate of a reference turn by different angles."""
+    if log.time is None or log.reference_rate is None or log.reference_heading is None:
+        return []
+    known = np.isfinite(log.reference_rate) & np.isfinite(log.reference_heading)
+    if np.count_nonzero(known) < 100:
+        return []
+    time = log.time[known] - log.time[known][0]
+    unexplained, scale = fit_profile(
+        split_run(time, log.reference_rate[known]),
+        motion_from_headings(time, log.reference_heading[known]), MAX_ENCODER_OFFSET)
+    # what noise or another delay may do to the scale is less than the root of what they leave
+    if abs(scale - 1.0) < max(RunLimits().max_scale_deviation, math.sqrt(max(unexplained, 0.0))):
+        return []
+    return [f'the reference rate turns {scale:.3f} times as far as the reference heading, which '
+            'is used; one of the two is wrong: check both, and leave the wrong one out']
 
 
 def _extract_named_dwells(path: str, log: Log) -> Dwells:

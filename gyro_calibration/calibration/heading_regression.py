@@ -971,7 +971,8 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                           f'{variation / DEGREE:.1f} deg, and its difference to the gyro changes '
                           f'by {residual / DEGREE:.1f} deg (robust standard deviations): the gyro '
                           'does not follow the course. Check that both belong to one drive, and '
-                          'check axis, sign, units, and that the gyro responds')
+                          'check axis, sign, units, that the gyro responds, and that turns exceed '
+                          'the errors of the course')
     covariance = fit.normal_covariance
     axes = (fit.value_slice(MISALIGNMENT_TERM) if MISALIGNMENT_TERM in fit.causes
             else slice(0))

@@ -669,7 +669,8 @@ def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
     return columns
 
 
-def _lag_prior(data: _Increments, estimate: _Estimate, possible: float) -> tuple[float, float]:
+def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
+               possible: float) -> tuple[float, float]:
     """
     Return the prior standard deviation of a lag, and that of the scale by what is not known of it.
 
@@ -677,10 +678,13 @@ def _lag_prior(data: _Increments, estimate: _Estimate, possible: float) -> tuple
     explain, as gyro and reference both show it, since their noise is no information; less two
     standard deviations. If it does so more narrowly than what is `possible`, s², or than the lag
     that is found, there is no prior; what a lag adds to the fourth order is that of a Gaussian
-    window, or by a fifth less, of a mean over a time. Else the lag is 0, as in a swing of one
-    frequency, and what it may do to the scale is uncertain.
+    window, or by a fifth of its square less, of a mean over a time, or by its square more, of a
+    filter of first order, which has the lag `offset` ** 2 / 2. Else the lag is 0, as in a swing of
+    one frequency, and what it may do to the scale is uncertain.
 
     """
+    of_first_order = 0.5 * offset ** 2
+    possible = max(possible, of_first_order)
     others = np.arange(data.columns.shape[1]) != 3
     columns = np.vstack([estimate.noise.whiten(data.columns[:, others]), np.diag(
         math.sqrt(estimate.rate_variance) / estimate.prior_deviation[others])])
@@ -693,7 +697,7 @@ def _lag_prior(data: _Increments, estimate: _Estimate, possible: float) -> tuple
     of_lag, lag = scales[0, :2].mean(), float(estimate.values[3])
     if information * max(possible, abs(lag) / NORMAL_QUANTILE_975) ** 2 > 1.0:
         of_fourth = scales[0, 2] - products[1, 2] / products[0, 1] * of_lag
-        return math.inf, 0.2 * lag ** 2 * abs(float(of_fourth))
+        return math.inf, abs(lag * max(0.2 * abs(lag), of_first_order) * float(of_fourth))
     return 1e-9, possible * abs(float(of_lag))
 
 
@@ -814,7 +818,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
 
     A measured heading, or the gyro, may be late since it was smoothed. Half the variance of the
     times by which it is late is from 0, of a delay, to half the square of their mean, of a
-    first-order lag, which is 1.5 standard deviations of the prior.
+    first-order lag, which is a standard deviation of the prior.
 
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
@@ -828,7 +832,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
             alignment.prior_deviation[3] = math.inf
             if estimate is not None:
                 alignment.prior_deviation[3], response_deviation = _lag_prior(
-                    data, estimate, max(possible, offset ** 2 / 3.0))
+                    data, estimate, offset, possible)
                 alignment.set_lag(float(estimate.values[3]))
             data = alignment.require_increments(offset, lag)
         values, covariance, estimate = _average_over_noise(data, prior_factors)

@@ -87,6 +87,8 @@ def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
         found, key=lambda factor: (factor not in usual, abs(math.log(size / factor))))]
     sign_note = ', and turns the other way' if scale < 0.0 else ''
     cause = f'either {gyro}, or {profile.replace("profile", reference)}' if reference else gyro
+    if reference == 'reference' and size > 1.0:
+        cause += ', or the reference was smoothed and shows less of a fast motion'
     raise DataRefused(f'the gyro reports {size:.4g} times what was turned{sign_note}: '
                       f'{cause}; correct the unit')
 

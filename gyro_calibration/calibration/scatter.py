@@ -307,8 +307,10 @@ class Uncertainty:
     uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
     its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
     sweeps alone are then those of Student's distribution with as many degrees of freedom as there
-    are sweeps more than values. The maximum of the likelihood alone would be at zero in about half
-    of the cases, and its intervals would be too narrow.
+    are sweeps more than values. That sweeps do not differ has the weight of a factor of e in that
+    variance: without it, the intervals of sweeps that do not differ would be too wide. The maximum
+    of the likelihood alone would be at zero in about half of the cases, and its intervals would be
+    too narrow.
 
     """
 
@@ -395,7 +397,8 @@ def _scatter_grid(size: float, variances: Array) -> tuple[Array, Array]:
     typical = 1.0 / math.sqrt(float(np.mean(1.0 / variances)))
     sizes = np.geomspace(max(0.3 * typical, size / 30.0), 100.0 * max(typical, size), 25)
     prior = sizes ** 2 * np.sqrt(np.mean((sizes[:, None] ** 2 + variances) ** -2.0, axis=1))
-    return np.append(0.0, sizes), np.append(0.5 * prior[0], prior * math.log(sizes[1] / sizes[0]))
+    return np.append(0.0, sizes), np.append(
+        0.5 + 0.5 * prior[0], prior * math.log(sizes[1] / sizes[0]))
 
 
 # errors in another run

@@ -513,6 +513,10 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
             yield Gate('wrapped_heading', False, str(refusal).rpartition(':')[0],
                        'unwrap the reference heading (--unwrap)')
     reference = reference_angle(log)
+    if log.output is not None and not np.isfinite(log.output).any():
+        yield Gate('motion', False, 'the output of the gyro has no numbers',
+                   'check its column, and the line that it came by')
+        return
     by_length = compare_headings(log, reference)
     if not by_length:
         still = replace(log, reference_rate=None, reference_heading=None, moving=None)
@@ -567,8 +571,9 @@ def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: 
     others = [name for name in log.others if 'gyro' in name.lower()]
     axis = f'; or take another axis of the gyro ({", ".join(others[:3])})' if others else ''
     return Gate('motion', False, evidence, 'give a reference of this motion and this axis, with '
-                'stamps of the same clock; where the sensor tilts or tumbles, transform the rates '
-                f'of all three axes into the frame of the reference first{axis}')
+                'errors below its turns and stamps of the same clock; where the sensor tilts or '
+                'tumbles, transform the rates of all three axes into the frame of the reference '
+                f'first{axis}')
 
 
 def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
@@ -609,7 +614,10 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         meaning = (', which is not plausible for a gyro' if name is None
                    else f', and {name} is {UNIT_FACTORS[name]:.5g}')
         yield Gate('unit', False, evidence + meaning,
-                   f'{correct_gyro}, or that of the reference', known)
+                   f'{correct_gyro}, or that of the reference'
+                   # a mean over time shows less of a fast motion, as does a line between values
+                   + ', or give one that is not smoothed or interpolated' * (
+                       name is None and factor > 1.0), known)
 
 
 def reference_angle(log: Log) -> Array:

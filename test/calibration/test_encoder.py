@@ -85,7 +85,11 @@ REFUSED = {'no heading': (replace(CLEAN, reference_heading=None), 'reference_hea
            'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)),
                          'the gyro has a value in 10'),
            'short': (log_of(SWING, 5.0), 'at least 10 s'),
-           'nearly long enough': (log_of(SWING, 10.0), 'lasts 9.9 s; at least 10 s'),
+           'nearly long enough': (log_of(SWING, 9.99), 'lasts 9.9 s; at least 10 s'),
+           'at rest': (log_of(motion_from_rates(np.array([0.0, 100.0]), np.zeros(2)), 100.0),
+                       'the reference does not turn'),
+           'a gap': (replace(CLEAN, time=CLEAN.time + 1e6 * (CLEAN.time > 50.0)),
+                     'no samples for 1000000.0 s from 50.0 s on'),
            'one speed': (log_of(REST, 100.0),
                          'in both senses, or at another speed too, or with a rest'),
            'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'),
@@ -142,9 +146,44 @@ def test_rows_that_are_missing_without_a_gap_in_the_stamps_are_found_by_the_jump
         deviations = np.sqrt(np.diag(fit.covariance))
         assert np.all(np.abs(off) < 4.0 * deviations)
         assert np.all(deviations < [2e-4, 0.01 * DEGREE])
-    assert found.remarks[0].startswith('the reference jumps by up to 18.')
-    assert '17.50 s, 29.70 s, 45.40 s, 60.60 s, 88.80 s' in found.remarks[0]
+    wrong, jumps = found.remarks[:2]
+    assert wrong.startswith('the reference is off in single values, which are left out, by up')
+    assert jumps.startswith('the reference jumps by up to 18.')
+    assert '17.50 s, 29.70 s, 45.40 s, 60.60 s, 88.80 s' in jumps
     assert not any('jumps' in remark for remark in whole.remarks)
+
+
+NOISY = log_of(SWING, 100.0, Noise(1e-4), np.random.default_rng(64))
+TURNED = np.cumsum(NOISY.output - B) * INTERVAL
+OWN = {'a sum': TURNED, 'the trapezoid rule': TURNED - 0.5 * INTERVAL * NOISY.output,
+       'scaled': 0.97 * TURNED}
+
+
+@pytest.mark.parametrize('heading', OWN.values(), ids=OWN)
+def test_a_reference_that_is_computed_from_the_gyro_is_refused(heading):
+    with pytest.raises(DataRefused, match='the reference is computed from this gyro'):
+        calibrate({'': replace(NOISY, reference_heading=heading)})
+    assert calibrate({'': NOISY}).fit.scale_factor_error == pytest.approx(S, abs=5e-4)
+
+
+@pytest.mark.parametrize('factor, late, said', [(1.05, 0.0, '1.05'), (0.95, 0.1, '0.95'),
+                                                (1.0, 0.1, ''), (1.005, 0.0, '')])
+def test_references_that_contradict_each_other_are_remarked(factor, late, said):
+    rate = factor * SWING.rate_at(NOISY.time - late)
+    noise = 0.1 * DEGREE * np.random.default_rng(65).standard_normal(len(rate))
+    remark = calibrate({'': replace(NOISY, reference_rate=rate + noise)}, method='likelihood'
+                       ).remarks[0]
+    assert remark.startswith(f'the reference rate turns {said}') == bool(said), remark
+
+
+@pytest.mark.parametrize('size', [0.5, 100.0, 1e6])
+def test_single_wrong_values_of_the_reference_are_left_out(size):
+    heading = CLEAN.reference_heading.copy()
+    heading[[2000, 5000]] += (size, -size)
+    found = calibrate_encoder(replace(CLEAN, reference_heading=heading))
+    assert 'single values, which are left out' in found.remarks[0]
+    assert '20.00 s, 50.00 s' in found.remarks[0]
+    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
 
 
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
