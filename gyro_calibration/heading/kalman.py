@@ -127,25 +127,30 @@ class HeadingState:
 
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time of constant heading, with its measurement."""
-        # A `wander_variance` is added to the variance of the measurement and to that of the
-        # heading, which is then the heading at the end.
+        return self.measure_rest(rate_integral)[1]
+
+    def measure_rest(self, rate_integral: RateIntegral
+                     ) -> tuple[HeadingState, HeadingState, Array]:
+        """Return the states before and after a rest given its measurement, and a covariance."""
+        # The covariance is that of the state before with that after, (n, n). The measured mean
+        # has the wander of the bias meanwhile in it, with which the bias at the end correlates. A
+        # `wander_variance` is in the measurement and in the heading, which is that at the end.
         step = self.transition(rate_integral)
-        gain_direction = self.covariance @ step.observation
-        noise = step.process_noise[HEADING_INDEX, HEADING_INDEX]
-        variance = float(step.observation @ gain_direction + noise) + rate_integral.wander_variance
-        innovation = rate_integral.angle - float(step.observation @ self.mean)
-        covariance = self.covariance
-        if rate_integral.wander_variance:
-            gain_direction[HEADING_INDEX] += rate_integral.wander_variance
-            covariance = covariance.copy()
-            covariance[HEADING_INDEX, HEADING_INDEX] += rate_integral.wander_variance
-        mean = self.mean + gain_direction * (innovation / variance)
-        covariance = covariance - gain_direction[:, None] * gain_direction / variance
-        grown = step.process_noise
+        grown, wander = step.process_noise, rate_integral.wander_variance
+        before = self.covariance @ step.observation
+        variance = float(step.observation @ before + grown[HEADING_INDEX, HEADING_INDEX]) + wander
+        after = step.retention * before - grown[HEADING_INDEX]
+        after[HEADING_INDEX] = before[HEADING_INDEX] + wander
         grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
-        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance
-        return HeadingState(self.noise, step.retention * mean,
-                            step.retention[:, None] * covariance * step.retention + grown)
+        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance + wander
+        scaled = (rate_integral.angle - float(step.observation @ self.mean)) / variance
+        kept = self.covariance * step.retention
+        return (HeadingState(self.noise, self.mean + before * scaled,
+                             self.covariance - before[:, None] * before / variance),
+                HeadingState(self.noise, step.retention * self.mean + after * scaled,
+                             step.retention[:, None] * kept + grown
+                             - after[:, None] * after / variance),
+                kept - before[:, None] * after / variance)
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
@@ -295,19 +300,11 @@ def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral]
 def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: bool,
                   later: HeadingState) -> HeadingState:
     """Return a state updated by the smoothed state after it."""
-    step, start = state.transition(rate_integral), state
     if is_resting:
-        after = state.advance_at_rest(rate_integral)
-        expected, variance = state.expected_rest_angle(rate_integral)
-        gain_direction = state.covariance @ step.observation
-        variance += rate_integral.wander_variance
-        start = replace(
-            state, mean=state.mean + gain_direction / variance * (rate_integral.angle - expected),
-            covariance=state.covariance - np.outer(gain_direction, gain_direction) / variance)
-        shared = start.covariance * step.retention
-        shared[:, HEADING_INDEX] -= gain_direction * rate_integral.wander_variance / variance
+        start, after, shared = state.measure_rest(rate_integral)
     else:
-        after, transition = state.propagate(rate_integral), np.diag(step.retention)
+        step, start, after = state.transition(rate_integral), state, state.propagate(rate_integral)
+        transition = np.diag(step.retention)
         transition[HEADING_INDEX] -= step.observation
         shared = state.covariance @ transition.T
     # the pseudo-inverse of correlations, as variances may be zero and of any size

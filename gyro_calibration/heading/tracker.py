@@ -821,13 +821,15 @@ class HeadingTracker:
             walk = noise.rate_random_walk ** 2 + noise.allan_floor ** 4 / white
             scatter_state = before.scatter_state + np.array(
                 [[0.0], [0.0], [0.0], [0.0], [walk * turn.duration]])
+        lost = turn.extra_noise_variance + turn.lost_variance
         scatter_state, likelihood = update_scatter(
-            scatter_state, turn.angle / turn.duration, white / turn.duration, white)
+            scatter_state, turn.angle / turn.duration,
+            (white + lost / turn.duration) / turn.duration, white)
         # of the blocks about their mean
         scatter = turn.block_square_sum - turn.angle ** 2 / turn.duration
         blocks = scatter * turn.duration / (
             self._energy.noise_factor ** 2 * self._model_noise.angle_random_walk ** 2
-            * turn.duration + turn.extra_noise_variance + turn.lost_variance)
+            * turn.duration + lost)
         likelihood += before.log_likelihood - 0.5 * (
             (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
             - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS))

@@ -61,7 +61,7 @@ def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False
 
 def random_parts(generator, noise):
     """Return random turns and an unseen one, which of them are rests, and the state before."""
-    durations = generator.uniform(0.3, 3.0, 14)
+    durations = generator.uniform(0.3, 3.0, 14) * generator.choice([1.0, 20.0], 14)
     parts = [RateIntegral(duration, 0.02 * generator.standard_normal() * duration,
                           np.array([-0.3 * generator.standard_normal(), -duration]))
              for duration in durations]
@@ -73,39 +73,25 @@ def random_parts(generator, noise):
 
 def by_least_squares(start, parts, resting):
     """Return mean and covariance of all headings from the joint distribution, not recursively."""
+    # the rates turn the heading in a rest too, and the two headings around it are measured equal
     size, count = len(start.mean), len(parts)
-    transitions, grown, pushed, measured = [], [], [], []
-    for part, rest in zip(parts, resting):
-        step = start.transition(part)
-        transition, new = np.diag(step.retention), step.process_noise.copy()
-        push = np.zeros(size)
-        if rest:
-            measured.append(
-                (step.observation, part.angle, step.process_noise[HEADING_INDEX, HEADING_INDEX]))
-            new[HEADING_INDEX] = new[:, HEADING_INDEX] = 0.0
-        else:
-            measured.append(None)
-            transition[HEADING_INDEX] -= step.observation
-            push[HEADING_INDEX] = part.angle
-        transitions.append(transition)
-        grown.append(new)
-        pushed.append(push)
     mean, whole = np.zeros((count + 1, size)), np.zeros(((count + 1) * size,) * 2)
     mean[0], whole[:size, :size] = start.mean, start.covariance
-    for k in range(count):
+    for k, part in enumerate(parts):
+        step = start.transition(part)
+        transition = np.diag(step.retention)
+        transition[HEADING_INDEX] -= step.observation
         here, after = slice(k * size, (k + 1) * size), slice((k + 1) * size, (k + 2) * size)
-        mean[k + 1] = transitions[k] @ mean[k] + pushed[k]
-        whole[after, :(k + 1) * size] = transitions[k] @ whole[here, :(k + 1) * size]
+        mean[k + 1] = transition @ mean[k]
+        mean[k + 1, HEADING_INDEX] += part.angle
+        whole[after, :(k + 1) * size] = transition @ whole[here, :(k + 1) * size]
         whole[:(k + 1) * size, after] = whole[after, :(k + 1) * size].T
-        whole[after, after] = transitions[k] @ whole[here, here] @ transitions[k].T + grown[k]
+        whole[after, after] = transition @ whole[here, here] @ transition.T + step.process_noise
     rows = np.zeros((sum(resting), (count + 1) * size))
-    known = [(k, each) for k, each in enumerate(measured) if each]
-    for row, (k, (seen, _, _)) in zip(rows, known):
-        row[k * size:(k + 1) * size] = seen
-    left = np.array([turned for _, (_, turned, _) in known]) - rows @ mean.ravel()
-    gain = whole @ rows.T @ np.linalg.inv(rows @ whole @ rows.T
-                                          + np.diag([variance for _, (_, _, variance) in known]))
-    return ((mean.ravel() + gain @ left)[HEADING_INDEX::size],
+    rests = np.flatnonzero(resting) * size + HEADING_INDEX
+    rows[np.arange(len(rests)), rests], rows[np.arange(len(rests)), rests + size] = -1.0, 1.0
+    gain = whole @ rows.T @ np.linalg.inv(rows @ whole @ rows.T)
+    return ((mean.ravel() - gain @ rows @ mean.ravel())[HEADING_INDEX::size],
             np.diagonal(whole - gain @ rows @ whole)[HEADING_INDEX::size])
 
 
