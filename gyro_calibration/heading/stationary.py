@@ -48,20 +48,20 @@ _MIN_WINDOW_SAMPLES = 8
 #: the model.
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
-#: to it, correlations of neighbours, and the variances of blocks about these means: first those of
-#: a rest, then those of straight drives. With variances beyond `_MAX_SCATTER_RATIO` and beyond
-#: that of the bias, most means over 1 s are beyond the limit of `mean_threshold_sigmas`, and most
-#: windows beyond that of the energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
+#: to it, correlations of neighbours with time constants of up to the longest lag, and the
+#: variances of blocks about these means: first those of a rest, then those of straight drives.
+#: With variances beyond `_MAX_SCATTER_RATIO` times that of the white noise or of the bias, most means
+#: over 1 s are beyond the limit of `mean_threshold_sigmas`, and most windows beyond that of the
+#: energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
-                        for shared in (0.0, 0.5, 0.75, 0.9) for fast in (0.0, 1.0, 4.0))]).T
+                        for shared in (0.0, *np.exp(-1.0 / np.array(MEAN_LAGS[::2])))
+                        for fast in (0.0, 1.0, 4.0))]).T
 _MAX_SCATTER_RATIO = 64.0
-#: The same of sums of many means, relative to that of white noise, for a process of first order.
-_SUM_RATIOS = SCATTER_RATIOS * (1.0 + SCATTER_CORRELATIONS) / (1.0 - SCATTER_CORRELATIONS)
-#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1,
-#: by which each correlation adds the same to the mean ratio of a sum; largest total.
-_PRIOR_COUNTS = (1.0 - SCATTER_CORRELATIONS) / (1.0 + SCATTER_CORRELATIONS)
-_PRIOR_COUNTS /= _PRIOR_COUNTS[1:] @ (SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO)
+#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1;
+#: largest total.
+_PRIOR_COUNTS = np.full(
+    len(SCATTER_RATIOS), 1.0 / np.sum(SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO))
 _PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
 
@@ -214,7 +214,7 @@ class RestScatter:
 
     def begin_rest(self, bias_ratio: float) -> None:
         """Begin a rest with a ratio of the variance of the bias, over 1 s, to the white noise."""
-        passes = max(bias_ratio, _MAX_SCATTER_RATIO) >= SCATTER_RATIOS
+        passes = _MAX_SCATTER_RATIO * max(bias_ratio, 1.0) >= SCATTER_RATIOS
         # numbers of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,)
         self.counts = self._learned + self._retention * _PRIOR_COUNTS * passes
 
@@ -224,10 +224,13 @@ class RestScatter:
         chances = self.counts * np.exp(possible - possible.max())
         return np.asarray(chances / chances.sum())
 
-    def mean_and_median(self, likelihood: Array) -> tuple[float, float]:
-        """Return the mean ratio for sums of correlated means, and the median ratio."""
-        chances = self.probabilities(likelihood)
-        return (float(chances @ _SUM_RATIOS),
+    def mean_and_median(self, likelihood: Array, count: float) -> tuple[float, float]:
+        """Return the mean ratio of variances of sums of `count` means, and the median ratio."""
+        chances, shared = self.probabilities(likelihood), SCATTER_CORRELATIONS
+        # of a process of first order, per mean
+        sums = SCATTER_RATIOS / (1.0 - shared) ** 2 * (
+            1.0 - shared ** 2 - 2.0 * shared * (1.0 - shared ** count) / count)
+        return (float(chances @ sums),
                 float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)]))
 
     def learn(self, last: Snapshot) -> None:

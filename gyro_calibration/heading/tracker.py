@@ -683,7 +683,7 @@ class HeadingTracker:
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._rest_scatter.begin_rest(
             (self.bias[1] / self._state.noise.angle_random_walk) ** 2)
-        _, median = self._rest_scatter.mean_and_median(np.zeros(1))
+        _, median = self._rest_scatter.mean_and_median(np.zeros(1), 1.0)
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
         self._adopt_state()
@@ -838,7 +838,7 @@ class HeadingTracker:
                 and self._wheels_stand == (last.rate_integral.wander_variance == 0.0)):
             start, part = replace(last.state_before, noise=noise), last.rate_integral + turn
             count = before.step_count - 1
-        ratio, median = self._rest_scatter.mean_and_median(likelihood)
+        ratio, median = self._rest_scatter.mean_and_median(likelihood, max(part.duration, 1.0))
         part.wander_variance = 0.0 if self._wheels_stand else ratio * white * part.duration
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
                          - remaining.duration)

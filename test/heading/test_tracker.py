@@ -21,6 +21,7 @@ from gyro_calibration.heading.kalman import (
     smooth_states,
 )
 from gyro_calibration.heading.stationary import (
+    RestScatter,
     SCATTER_CORRELATIONS,
     SCATTER_RATIOS,
     update_scatter,
@@ -376,3 +377,6 @@ def test_the_scatter_of_a_rest_has_the_likelihood_of_its_joint_distribution():
         expected = multivariate_normal(np.full(count, 0.01), covariance).logpdf(rates)
         assert likelihood[place] == pytest.approx(
             expected + 0.5 * count * math.log(2.0 * math.pi * white), rel=1e-9)
+        only = np.where(np.arange(len(SCATTER_RATIOS)) == place, 0.0, -math.inf)
+        assert RestScatter().mean_and_median(only, count)[0] == pytest.approx(
+            (covariance - white * np.eye(count) - bias_variance).sum() / count / white, rel=1e-9)
