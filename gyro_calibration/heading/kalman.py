@@ -25,8 +25,11 @@ heading also the earlier error of the heading.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+import operator
+from typing import Any
 
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import averaged_process_moments, BIAS_AVERAGING_TIME, Noise
@@ -55,20 +58,21 @@ class RateIntegral:
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
         """Return the integral over both, one after the other."""
-        return self._combine(other, 1)
+        return self._combine(other, operator.add)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return the rest of this integral after another with which it begins."""
-        return self._combine(other, -1)
+        return self._combine(other, operator.sub)
 
-    def _combine(self, other: RateIntegral, sign: int) -> RateIntegral:
+    def _combine(self, other: RateIntegral,
+                 combined: Callable[[Any, Any], Any]) -> RateIntegral:
         return RateIntegral(
-            self.duration + sign * other.duration, self.angle + sign * other.angle,
-            self.sensitivity + sign * other.sensitivity,
-            self.lost_variance + sign * other.lost_variance,
-            self.extra_noise_variance + sign * other.extra_noise_variance,
-            block_count=self.block_count + sign * other.block_count,
-            block_square_sum=self.block_square_sum + sign * other.block_square_sum)
+            combined(self.duration, other.duration), combined(self.angle, other.angle),
+            combined(self.sensitivity, other.sensitivity),
+            combined(self.lost_variance, other.lost_variance),
+            combined(self.extra_noise_variance, other.extra_noise_variance), 0.0,
+            combined(self.block_count, other.block_count),
+            combined(self.block_square_sum, other.block_square_sum))
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
 #: to it, correlations of neighbours with time constants of up to the longest lag, and the
 #: variances of blocks about these means: first those of a rest, then those of straight drives.
-#: With variances beyond `_MAX_SCATTER_RATIO` times that of the white noise or of the bias, most means
+#: With variances beyond `_MAX_SCATTER_RATIO` times that of white noise or of the bias, most means
 #: over 1 s are beyond the limit of `mean_threshold_sigmas`, and most windows beyond that of the
 #: energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
