@@ -58,10 +58,10 @@ SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
                         for shared in (0.0, *np.exp(-1.0 / np.array(MEAN_LAGS[::2])))
                         for fast in (0.0, 1.0, 4.0))]).T
 _MAX_SCATTER_RATIO = 64.0
-#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1;
-#: largest total.
-_PRIOR_COUNTS = np.full(
-    len(SCATTER_RATIOS), 1.0 / np.sum(SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO))
+#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1,
+#: by which each correlation adds the same to the mean ratio of a long sum; largest total.
+_PRIOR_COUNTS = (1.0 - SCATTER_CORRELATIONS) / (1.0 + SCATTER_CORRELATIONS)
+_PRIOR_COUNTS /= _PRIOR_COUNTS[1:] @ (SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO)
 _PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
 
