@@ -115,8 +115,6 @@ class StampDelay:
 
         The test compares with the delays of a window, s. A tolerance is a duration, s, the
         shortest one first, in which some samples are not late, and a change of their delay, s.
-        Both advance equally within 5 %; after two windows, a change of the pace from one window to
-        the next by more than the tolerance is of a window is a fault too.
 
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
@@ -150,21 +148,14 @@ class StampDelay:
         now = node_time(self._clock)
         # In a fast simulation the same delay is more simulated time.
         factor = 1.0 if self._clock.simulated() is None else 4.0
-        while self._earlier and not 0.0 <= now - self._earlier[0][0] <= 2.0 * self._window:
+        while self._earlier and not 0.0 <= now - self._earlier[0][0] <= self._window:
             self._earlier.popleft()
         least = [self._least_delay(duration) for duration, _ in self._tolerances]
-        old = [each for each in self._earlier if now - each[0] > self._window]
-        for then, before in list(self._earlier)[len(old):]:
+        for then, before in self._earlier:
             elapsed = now - then
-            for place, (late, early, (duration, tolerance)) in enumerate(
-                    zip(least, before, self._tolerances, strict=True)):
-                # the clocks of gyros are up to 3 % off, and stay so
-                pace, unknown = 0.0, 0.05
-                if (tolerance < unknown * self._window and len(old) > 1
-                        and old[-1][0] - old[0][0] > self._window - 2.0 * duration):
-                    pace = (old[-1][1][place] - old[0][1][place]) / (old[-1][0] - old[0][0])
-                    pace, unknown = max(min(pace, unknown), -unknown), tolerance / self._window
-                if abs(late - early - pace * elapsed) > factor * tolerance + unknown * elapsed:
+            for late, early, (_, tolerance) in zip(least, before, self._tolerances, strict=True):
+                # the clocks of gyros are up to 3 % off
+                if abs(late - early) > factor * tolerance + 0.05 * elapsed:
                     return ('this computer was busy, or the clock of the driver is wrong: the '
                             'stamps on imu/data_raw advanced by '
                             f'{elapsed - late + early:.2f} s in {elapsed:.2f} s; reduce the load, '
@@ -242,6 +233,7 @@ class TurnComparison:
         self._by_wheels = self._by_gyro = 0.0
         self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
+        self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
 
     @property
     def is_contradictory(self) -> bool:
@@ -249,13 +241,18 @@ class TurnComparison:
         return self._contradictions > 1
 
     @property
-    def turn_at_rest(self) -> tuple[float, float]:
-        """Return duration, s, and turn by the gyro, rad, while odometry shows standstill."""
+    def turn_at_rest(self) -> tuple[float, float, float]:
+        """
+        Return duration, s, and turn by the gyro, rad, while odometry shows standstill.
+
+        The least rate in a second of it, rad/s, follows: a push is over, a bias is not.
+
+        """
         # two seconds pass before a robot stands, and one until a late odometry shows its turn
         if len(self._at_rest) < 4:
-            return 0.0, 0.0
+            return 0.0, 0.0, 0.0
         (begin, before), (end, after) = self._at_rest[2], self._at_rest[-2]
-        return end - begin, abs(after - before)
+        return end - begin, abs(after - before), self._least_rate
 
     def add(self, source: str, time: float, rate: float, heading: float, *,
             stands: bool = False) -> None:
@@ -270,7 +267,11 @@ class TurnComparison:
         self.source = source
         if not (is_next and stands):
             self._at_rest.clear()
+            self._least_rate = math.inf
         if stands and (not self._at_rest or time - self._at_rest[-1][0] >= MAX_VELOCITY_AGE):
+            if len(self._at_rest) > 2:
+                past, angle = self._at_rest[-1]
+                self._least_rate = min(self._least_rate, abs(heading - angle) / (time - past))
             del self._at_rest[3:-1]
             self._at_rest.append((time, heading))
         # at slower rates the bias of a gyro may be larger

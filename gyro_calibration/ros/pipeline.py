@@ -212,7 +212,7 @@ class Pipeline:
     def _new_stamp_delay(self) -> StampDelay:
         """Return a comparison of stamps and clock, whose tolerance a deviation of 6 % exceeds."""
         # a busy computer delays all samples by a second for a short time
-        return StampDelay(self._clock, 60.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
+        return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
 
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
@@ -286,7 +286,7 @@ class Pipeline:
         estimator, turns = self.estimator, self._turns
         turns.add(source, time, rate,
                   estimator.heading_before_resets + estimator.tracker.heading, stands=stands)
-        (duration, turned), (known, _) = turns.turn_at_rest, self._false_turn
+        (duration, turned, least_rate), (known, _) = turns.turn_at_rest, self._false_turn
         if not duration:
             if self._stood and not known:
                 self._agreed_time = time
@@ -294,8 +294,9 @@ class Pipeline:
             return
         self._stood = True
         if turned > 4.0 * estimator.tracker.bias[1] * duration + MIN_TURN_ANGLE:
-            # the bias may have changed at any time since the last rest in which both agreed
-            unknown = max(turned / duration * max(time - self._agreed_time, duration), known)
+            # a bias may have changed at any time since the last rest in which both agreed
+            before = max(time - duration - self._agreed_time, 0.0)
+            unknown = max(turned + least_rate * before, known)
             self._false_turn = unknown, turned
             estimator.tracker.add_unknown_turn(math.sqrt(unknown ** 2 - known ** 2))
 
@@ -319,7 +320,7 @@ class Pipeline:
     def standstill_fault(self) -> str:
         """Return that the gyro shows a turn while odometry shows standstill; ''."""
         return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
-                'the robot stands: if it stands, call calibrate_bias, else check odom'
+                'the robot stands: unless others turn it, call calibrate_bias, or check odom'
                 if self._false_turn[1] else '')
 
     def add_command(self, velocity: Velocity) -> None:
