@@ -640,15 +640,15 @@ def _refuse_own_reference(log: Log) -> None:
     """Refuse a reference that follows the noise of the output: it is computed from it."""
     if log.time is None or log.output is None:
         return
-    for rate in (log.reference_rate, None if log.reference_heading is None else np.append(
-            math.nan, np.diff(log.reference_heading) / np.diff(log.time))):
-        if rate is None:
-            continue
-        # by the rectangle rule or the trapezoid rule, with any scale and bias
-        columns = np.column_stack([log.output[1:], log.output[:-1], np.ones(len(log) - 1)])
-        known = np.isfinite(rate[1:]) & np.isfinite(columns).all(axis=1)
-        shares = np.linalg.lstsq(columns[known], rate[1:][known], rcond=1e-12)[0]
-        left = np.abs(rate[1:][known] - columns[known] @ shares)
+    # by the rectangle rule or the trapezoid rule, with any scale and bias
+    columns = np.column_stack([log.output[1:], log.output[:-1], np.ones(len(log) - 1)])
+    rates = [] if log.reference_rate is None else [log.reference_rate[1:]]
+    if log.reference_heading is not None:
+        rates.append(np.diff(log.reference_heading) / np.diff(log.time))
+    for rate in rates:
+        known = np.isfinite(rate) & np.isfinite(columns).all(axis=1)
+        shares = np.linalg.lstsq(columns[known], rate[known], rcond=1e-12)[0]
+        left = np.abs(rate[known] - columns[known] @ shares)
         if np.count_nonzero(known) > 100 and np.quantile(left, 0.9) < (
                 _OWN_DIFFERENCE_SHARE * white_noise_deviation(columns @ shares, 6)):
             raise DataRefused('the reference is computed from this gyro, since it follows its '
