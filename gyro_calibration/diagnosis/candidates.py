@@ -209,7 +209,7 @@ def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
                     for shapes in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)))
     if 'specific_force' in has:
         yield 'acceleration_sensitivity', ()
-        yield from (('vibration_rectification', (constant,)) for constant in (0.1, 0.3, 1.0))
+        yield from (('vibration_rectification', (constant,)) for constant in (1.0, 3.0))
     if 'supply' in has:
         yield 'supply_sensitivity', (5.0,)
     for name, own in USER_EFFECTS.items():

@@ -106,23 +106,31 @@ def band_starts(angle: Array, interval: float, single_bands: int = 24,
     return np.unique([edge for edge in edges if edge < count])
 
 
+#: Share of a variance that is small, of two noises; and logarithm of the ratio of the variances of
+#: neighbouring random walks.
+_SMALL_NOISE_SHARE, _WALK_STEP = 0.1, 0.9
+
+
 def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) -> list[NoiseShape]:
     """
     Return a grid of noises that a residual may have.
 
-    A random walk shows if it is stronger than white noise over the log; a Gauss-Markov process,
-    which flicker may replace, if its correlation time is between some samples and this duration.
+    The random walk ranges from a small part of the white noise at the lowest frequency of the log
+    to as much as the white noise at its highest. A Gauss-Markov process, which flicker may
+    replace, has a correlation time between some samples and this duration. Combinations in which
+    one of them is small beside the other at all frequencies are left out.
 
     """
-    lowest = 0.02 / duration ** 2
-    highest = max(1e5 * lowest, 1e-3 / interval ** 2 * 1e-3)
-    walks = [0.0, *np.geomspace(lowest, highest, 14)]
+    small, lowest = _SMALL_NOISE_SHARE, (math.pi / duration) ** 2
+    walks = [0.0, *np.geomspace(small * lowest, 1.0 / interval ** 2, 1 + math.ceil(
+        -math.log(small * lowest * interval ** 2) / _WALK_STEP))]
     times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
-    # By their spectral density at frequency 0 relative to white noise.
-    strong = [(ratio / (2.0 * time), time) for time in times
-              for ratio in np.geomspace(0.3, 1000.0, 7)]
-    plain = [NoiseShape(walk, strength, time, rounding_ratio) for walk in walks
-             for strength, time in [(0.0, 1.0), *strong]]
+    # by their spectral density at frequency 0 relative to white noise
+    strong = [(level, time) for time in times for level in np.geomspace(0.3, 1000.0, 7)]
+    plain = [NoiseShape(walk, level / (2.0 * time), time, rounding_ratio)
+             for walk in walks for level, time in [(0.0, 1.0), *strong]
+             if not walk or not level
+             or small * lowest < walk / level < 1.0 / (small * time ** 2)]
     corners = np.geomspace(0.1 / duration, 0.3 / interval, 14)
     return plain + [NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
                     for walk in walks[::4] for corner in corners]

@@ -278,6 +278,13 @@ def test_a_random_walk_is_told_from_the_noise_of_a_model_and_not_from_its_look_a
     assert found.findings[0].ambiguous_with == ('bias_instability',)
 
 
+@pytest.mark.parametrize('seed', [36202, 36209, 36222])
+def test_a_random_walk_that_exceeds_white_noise_within_a_minute_is_no_other_cause(seed):
+    log, = hidden_in(['rate_random_walk'], 5.0, seed, reference=REFERENCES[0])
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    assert names_of(found) in (['rate_random_walk'], ['bias_instability']), told(log, found)
+
+
 # faults of a record
 
 @pytest.mark.parametrize('seed', [1, 4])
