@@ -222,7 +222,9 @@ class TurnComparison:
 
     Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
-    wheels; a robot may be turned by others than the commands.
+    wheels; a robot may be turned by others than the commands, or scale them. So beside commands
+    the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
 
     """
 
@@ -230,7 +232,7 @@ class TurnComparison:
         """Start without turns."""
         self.ratio, self.source = math.nan, ''  # of the last turns
         self._last = math.nan, math.nan
-        self._by_wheels = self._by_gyro = 0.0
+        self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
         self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
@@ -279,12 +281,16 @@ class TurnComparison:
             return
         self._by_wheels += rate * (time - then)
         self._by_gyro += heading - before
+        self._path += abs(heading - before)
+        self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
             self.ratio = self._by_gyro / self._by_wheels
-            is_wrong = (self.ratio > math.sqrt(180.0 / math.pi)
+            confused, rate = 180.0 / math.pi, self._path / self._duration
+            is_wrong = (self.ratio > math.sqrt(confused)
+                        and (source == ODOMETRY or self.ratio * rate > confused)
                         or source == ODOMETRY and self.ratio < -0.5)
             self._contradictions = is_wrong * (self._contradictions + 1)
-            self._by_wheels = self._by_gyro = 0.0
+            self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
 
 class Wheels:

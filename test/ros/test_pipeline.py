@@ -297,9 +297,10 @@ def test_a_turn_by_the_gyro_alone_while_odometry_stands_is_a_warning_and_in_the_
         assert 10.0 * DEGREE < abs(error) < 2.0 * deviation < 4.0 * abs(error)
 
 
-@pytest.mark.parametrize('unit, warns', [(1.0 / DEGREE, True), (1.0, False), (-1.0, False)])
+@pytest.mark.parametrize('unit, warns', [
+    (1.0 / DEGREE, True), (1.0, False), (-1.0, False), (10.0, False)])
 def test_without_odometry_turns_are_compared_with_commands(tmp_path, reported, unit, warns):
-    """Where others turn the robot the other way, commands show nothing."""
+    """Where others turn the robot the other way, or a base ten times as far, nothing is shown."""
     rig = rested(tmp_path)
     rig.odometry = lambda stamp, reading: None
     rig.robot.distort = lambda output: unit * output
