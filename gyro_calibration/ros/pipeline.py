@@ -381,7 +381,11 @@ class Pipeline:
             counts['repeated_stamps'] += 1
             first, fastest = self._frozen_stamp or (now, 0.0)
             self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
+            journal.event = (
+                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                if now - first > DRIVE_SAMPLE_TIMEOUT else
+                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
+                'on its arrival; only the first of them is used: stamp when the gyro measures')
             return None
         if self._frozen_stamp is not None:
             (first, fastest), self._frozen_stamp = self._frozen_stamp, None

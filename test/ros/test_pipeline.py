@@ -389,6 +389,16 @@ def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, sh
     assert abs(turned) < 0.7 * 0.5, 'half a second at most'
 
 
+def test_a_queue_that_is_stamped_on_arrival_is_no_stamp_that_stands_still(tmp_path, reported):
+    rig = rested(tmp_path)
+    rig.go(2.0)
+    stamp = max(rig.truth) + 10 ** 7
+    for _ in range(5):
+        rig.pipeline.add_sample(stamp, 0.0)
+    level, message, _ = reported(rig)
+    assert level == WARN and 'several samples have the stamp' in message
+
+
 @pytest.mark.parametrize('other, warns', [
     (lambda rate: 0.0, True), (lambda rate: -0.3 * rate, True), (lambda rate: rate, False),
     (lambda rate: 1.05 * rate + 0.01, False)], ids=['across', 'oblique', 'one gyro', 'same axis'])
