@@ -597,7 +597,7 @@ def _average(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array
     Heading and integral of the output are averaged with the same weights, so that deviations of
     the table from its steady rate are the same in both. The deviation is that of four to twelve
     batches of at least 0.75 s, in which a vibration of the table and the response of the gyro's
-    filter average out; nan where it is not known.
+    filter average out; nan where it is not known. The rounding of the output adds its own.
 
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
@@ -620,8 +620,33 @@ def _average(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array
     # same in all dwells under white noise.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
-    deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2)
+    deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2
+                        + _rounding_variance(samples.output, dwells))
     return rate, output, np.where(deviation > 0.0, deviation, np.nan)
+
+
+def _rounding_variance(output: Array, dwells: Sequence[Numbers]) -> Array:
+    """
+    Return the variance of the mean of each dwell due to the steps of its output, shape (n,).
+
+    The mean of a value with normal noise of variance v, rounded to a step q, is a periodic
+    function of the value; its error has the variance ``q² / (2 π²) sum(exp(-4 π² k² v / q²) /
+    k²)``, k from 1 on: q² / 12 without noise, and nothing from v = q² / 4 on (Widrow and Kollar
+    2008, Quantization Noise). v is such that ``v + q² / 12`` less this is the variance of the
+    samples. Dwells that are rounded to the same step have the same error, so each of n has n
+    times this variance.
+
+    """
+    step = quantization_step(output)
+    if not step:
+        return np.zeros(len(dwells))
+    noise, order = np.linspace(0.0, 1.0, 1001), np.arange(1, 100)[:, None]
+    error = np.sum(np.exp(-4.0 * (np.pi * order) ** 2 * noise) / order ** 2, axis=0) / (
+        2.0 * np.pi ** 2)
+    variances = [float(np.var(output[rows])) / step ** 2 for rows in dwells]
+    means = np.array([output[rows].mean() for rows in dwells])
+    alike = np.sum(np.abs(means - means[:, None]) < 0.5 * step, axis=1)
+    return alike * step ** 2 * np.interp(variances, noise + 1.0 / 12.0 - error, error)
 
 
 def _encoder_deviation(heading: Array, step: float, duration: float) -> float:

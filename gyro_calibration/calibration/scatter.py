@@ -178,9 +178,10 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
     # small errors would be lost in rounding.
     error = error - surface @ (surface.T @ error)
     fastest = max(float(np.abs(used.rate).max()), 1e-9)
-    # of exact values above their rounding, or what is rounded would be explained
+    # of exact values above their rounding, or what is rounded would be explained, and the Gram
+    # matrix of a dwell that is exact beside others would be singular
     size = (rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1))
-            + 1e-12 * fastest)
+            + 1e-12 * fastest + 1e-3 * float(np.nanmax(used.deviation, initial=0.0)))
     relative = size / fastest
     units = np.array([size, relative, size, relative])[:_count_scatter_terms(used)]
 
@@ -215,7 +216,8 @@ def find_inliers(dwells: Dwells) -> Mask:
     Return which dwells are not outlying, by a robust fit of the surface.
 
     Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
-    dwells of a sweep whose scale differs are not outlying.
+    dwells of a sweep whose scale differs are not outlying. Nor is what the deviation of a dwell of
+    its own explains, such as that by the steps of the output where rests are all on one step.
 
     """
     columns = _smooth_surface(dwells)
@@ -229,7 +231,8 @@ def find_inliers(dwells: Dwells) -> Mask:
     residual = np.abs(robust_residual(columns, dwells.output - dwells.rate, 20))
     # Such a fit passes through as many dwells as it has columns; these are left out of the median.
     spread = 1.4826 * float(np.median(np.sort(residual)[columns.shape[1]:]))
-    return (residual <= OUTLIER_THRESHOLD * spread + 1e-12) | (len(dwells) < _MIN_DWELLS)
+    limit = OUTLIER_THRESHOLD * np.hypot(spread, np.nan_to_num(dwells.deviation)) + 1e-12
+    return (residual <= limit) | (len(dwells) < _MIN_DWELLS)
 
 
 def _smooth_surface(dwells: Dwells) -> Array:

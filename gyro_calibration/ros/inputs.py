@@ -26,6 +26,8 @@ import reprlib
 from types import SimpleNamespace
 from typing import Protocol
 
+from gyro_calibration.calibration.self_calibration import RunLimits
+
 _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
                                 str: 'text', list: 'a list of strings'}
 
@@ -222,7 +224,9 @@ class TurnComparison:
 
     Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
-    wheels; a robot may be turned by others than the commands.
+    wheels; a robot may be turned by others than the commands, or scale them. So beside commands
+    the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
 
     """
 
@@ -230,7 +234,7 @@ class TurnComparison:
         """Start without turns."""
         self.ratio, self.source = math.nan, ''  # of the last turns
         self._last = math.nan, math.nan
-        self._by_wheels = self._by_gyro = 0.0
+        self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
         self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
@@ -279,12 +283,69 @@ class TurnComparison:
             return
         self._by_wheels += rate * (time - then)
         self._by_gyro += heading - before
+        self._path += abs(heading - before)
+        self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
             self.ratio = self._by_gyro / self._by_wheels
-            is_wrong = (self.ratio > math.sqrt(180.0 / math.pi)
+            confused, rate = 180.0 / math.pi, self._path / self._duration
+            is_wrong = (self.ratio > math.sqrt(confused)
+                        and (source == ODOMETRY or self.ratio * rate > confused)
                         or source == ODOMETRY and self.ratio < -0.5)
             self._contradictions = is_wrong * (self._contradictions + 1)
-            self._by_wheels = self._by_gyro = 0.0
+            self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
+
+
+class AlternateTurns:
+    """
+    Comparison of the turns by every other sample, and by those between, half a radian at a time.
+
+    Both turns are equal, of samples of a single gyro. They contradict each other where they differ
+    by more than the largest scale factor error that a calibration accepts, in the same proportion
+    in turns of a row whose sense changes twice: samples of another gyro, with another axis or
+    without a function, have the same topic and frame. A vibration near half the sample rate has
+    the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
+    biases of the two may differ.
+
+    """
+
+    def __init__(self) -> None:
+        """Start without samples."""
+        self._samples: list[tuple[float, float]] = []  # the last ones, up to 2; s and rad/s
+        self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
+        # difference over sum in turns of a row, their last sense, and how often it changed
+        self._share, self._sense, self._changes = math.nan, 0.0, 0
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Tell whether the last turns contradict each other."""
+        return self._changes > 1
+
+    def add(self, time: float, rate: float) -> None:
+        """Add a sample, s and rad/s."""
+        self._samples.append((time, rate))
+        if len(self._samples) < 3:
+            return
+        (begin, before), (_, middle), _ = self._samples
+        self._samples, interval = self._samples[2:], time - begin
+        if not 0.0 < interval <= MAX_VELOCITY_AGE:
+            self._turned = self._between = self._duration = 0.0
+            return
+        # the mean of both neighbours is the rate between them also while the robot accelerates
+        self._turned += 0.5 * (before + rate) * interval
+        self._between += middle * interval
+        self._duration += interval
+        total = self._turned + self._between
+        if abs(total) > 1.0:  # rad
+            apart = self._turned - self._between
+            allowed, share = RunLimits.max_scale_factor_error, apart / total
+            if not abs(apart) > allowed * max(abs(self._turned), abs(self._between)):
+                share = math.nan
+            is_alike = abs(share - self._share) <= allowed * abs(share)
+            self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
+            self._share, self._sense = self._share if is_alike else share, total
+        elif self._duration * MIN_TURN_RATE <= 1.0:
+            return
+        self._turned = self._between = self._duration = 0.0
 
 
 class Wheels:

@@ -59,6 +59,7 @@ from gyro_calibration.ros.health_monitor import (
     RepeatedOutputDetector,
 )
 from gyro_calibration.ros.inputs import (
+    AlternateTurns,
     Clock,
     COMMAND,
     MAX_ANGULAR_ACCELERATION,
@@ -201,7 +202,7 @@ class Pipeline:
         self._suspect_temperature = math.nan  # a temperature, degC
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
-        self._turns = TurnComparison()
+        self._turns, self._alternate_turns = TurnComparison(), AlternateTurns()
         # Time until which gyro and odometry agreed at standstill, s, whether it stands, and the
         # possible error of the heading and the turn by the gyro since then, rad.
         self._agreed_time, self._stood, self._false_turn = math.inf, False, (0.0, 0.0)
@@ -317,6 +318,13 @@ class Pipeline:
                 if turns.is_contradictory else '')
 
     @property
+    def alternation_fault(self) -> str:
+        """Return that every other sample shows another turn; ''."""
+        return ('every other sample on imu/data_raw shows another turn, as with two gyros on one '
+                'topic: give each gyro a topic of its own'
+                if self._alternate_turns.is_contradictory else '')
+
+    @property
     def standstill_fault(self) -> str:
         """Return that the gyro shows a turn while odometry shows standstill; ''."""
         return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
@@ -373,7 +381,11 @@ class Pipeline:
             counts['repeated_stamps'] += 1
             first, fastest = self._frozen_stamp or (now, 0.0)
             self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
+            journal.event = (
+                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                if now - first > DRIVE_SAMPLE_TIMEOUT else
+                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
+                'on its arrival; only the first of them is used: stamp when the gyro measures')
             return None
         if self._frozen_stamp is not None:
             (first, fastest), self._frozen_stamp = self._frozen_stamp, None
@@ -396,6 +408,7 @@ class Pipeline:
             return None
         self._stamp_delay.add(time)
         self._check_repeats(time, output, now)
+        self._alternate_turns.add(time, output)
         run = self.session.run
         if self.monitor.is_enabled and self.monitor.add(time, output,
                                                         self.estimator.corrected_rate):
@@ -548,7 +561,7 @@ class Pipeline:
         if self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT:
             return ROS_TIME_PAUSED
         if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
-                or self.clock_fault or self.frame_fault):
+                or self.clock_fault or self.frame_fault or self.alternation_fault):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
@@ -589,7 +602,8 @@ class Pipeline:
         before = self._suspected_clock_fault
         self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
-        if self.clock_fault or self.frame_fault or self.turn_fault:
+        if (self.clock_fault or self.frame_fault or self.turn_fault
+                or self.alternation_fault):
             self.estimator.tracker.add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):

@@ -13,10 +13,15 @@
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    dwells_from_table,
+    find_dwells,
+    select_dwells,
+)
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
 from gyro_calibration.calibration.scatter import find_inliers
-from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -49,6 +54,42 @@ def measured(terms=LINEAR, seed=1, **table):
 
 
 # estimates
+
+@pytest.mark.parametrize('noise', [0.0, 0.1, 0.5])
+def test_the_steps_of_a_coarse_output_are_in_the_intervals_of_bias_and_scale(noise):
+    """
+    Of steps of 0.5 deg/s, with noise in steps; the reference is exact.
+
+    All rests are on one step, with one error, and no turn that is rounded is outlying.
+
+    """
+    step = 0.5 * DEGREE
+    for seed in range(6):
+        generator = np.random.default_rng([seed, round(10 * noise)])
+        rate = np.concatenate([np.concatenate([
+            np.zeros(300), np.linspace(0.0, turn, 50), np.full(500, turn),
+            np.linspace(turn, 0.0, 50)]) for turn in np.tile([-1.4, -0.9, -0.4, 0.4, 0.9, 1.4], 2)
+            * generator.uniform(0.8, 1.2, 12)] + [np.zeros(300)])
+        truth = 0.02 * generator.standard_normal(2)
+        output = rate + truth @ [np.ones(len(rate)), rate] + (
+            noise * step * generator.standard_normal(len(rate)))
+        found = fit_effects(find_dwells(Log(
+            output=step * np.round(output / step), time=0.01 * np.arange(len(rate)),
+            reference_rate=rate)), [BIAS, SCALE_FACTOR_ERROR])
+        values = np.concatenate([term.values for term in found.terms])
+        assert (np.abs(values - truth) < 4.0 * np.sqrt(np.diag(found.model.covariance))).all()
+
+
+def test_dwells_of_any_deviations_beside_each_other_are_no_error():
+    """Outputs on few steps have means without scatter, to rounding, beside ones with much."""
+    generator = np.random.default_rng(0)
+    rate = np.array([*[0.0] * 12, -1.31, 0.0, 0.0, -0.69, 0.0])
+    for _ in range(50):
+        found = fit_effects(dwells(
+            rate, 0.019 * rate, deviation=10.0 ** generator.uniform(-16.0, -3.0, 17),
+            sweep=np.arange(17) // 2), [BIAS, SCALE_FACTOR_ERROR])
+        assert np.isfinite(found.model.covariance).all()
+        assert found.terms[1].values[0] == pytest.approx(0.019, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -269,11 +269,11 @@ PROFILES = {each.duration: each for each in (CALIBRATION_MOTION, constant_rate_m
     [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]))}
 
 
-def ended(seed, yaw, rest, motion=CALIBRATION_MOTION):
-    """Return a fit of a run with a steady turn until its end, whose log ends soon after it."""
+def ended(seed, yaw, rest, motion=CALIBRATION_MOTION, lasts=0.0):
+    """Return a fit of a run with a steady turn until s after its end, whose log ends soon."""
     time = np.arange(0.0, motion.duration + rest, 0.01)
     rate = (output(seed, motion=motion, time=time)
-            + np.where(time < motion.duration, yaw, 0.0))
+            + np.where(time < motion.duration + lasts, yaw, 0.0))
     fit = self_calibrate(time, rate, motion, noise=XV3500.noise)
     return check_end(time, rate, fit, motion, XV3500.noise)
 
@@ -286,6 +286,19 @@ def test_a_steady_turn_in_a_log_without_a_rest_is_refused_or_in_the_interval(deg
             fit = ended(seed, degrees * DEGREE, 0.4, motion)
         except DataRefused as refused:
             assert 'the robot turned throughout the run' in str(refused)
+        else:
+            assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
+
+
+@pytest.mark.parametrize('lasts', [0.2, 0.4, 0.6])
+@pytest.mark.parametrize('degrees', [0.5, -1.0])
+def test_a_steady_turn_that_ends_within_the_rest_is_refused_or_in_the_interval(degrees, lasts):
+    """By the built-in profile; what the whole log has is a bias."""
+    for seed in range(3):
+        try:
+            fit = ended(seed, degrees * DEGREE, 0.9, lasts=lasts)
+        except DataRefused as refused:
+            assert 'still turned after it' in str(refused)
         else:
             assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
 

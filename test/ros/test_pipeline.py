@@ -10,6 +10,7 @@
 
 """What comes of samples, temperatures, wheels and clocks: rates, headings, variances, reports."""
 
+import itertools
 import math
 from pathlib import Path
 import re
@@ -19,6 +20,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.inputs import (
+    AlternateTurns,
     COASTING_DURATION,
     COMMAND,
     MAX_VELOCITY_AGE,
@@ -297,9 +299,10 @@ def test_a_turn_by_the_gyro_alone_while_odometry_stands_is_a_warning_and_in_the_
         assert 10.0 * DEGREE < abs(error) < 2.0 * deviation < 4.0 * abs(error)
 
 
-@pytest.mark.parametrize('unit, warns', [(1.0 / DEGREE, True), (1.0, False), (-1.0, False)])
+@pytest.mark.parametrize('unit, warns', [
+    (1.0 / DEGREE, True), (1.0, False), (-1.0, False), (10.0, False)])
 def test_without_odometry_turns_are_compared_with_commands(tmp_path, reported, unit, warns):
-    """Where others turn the robot the other way, commands show nothing."""
+    """Where others turn the robot the other way, or a base ten times as far, nothing is shown."""
     rig = rested(tmp_path)
     rig.odometry = lambda stamp, reading: None
     rig.robot.distort = lambda output: unit * output
@@ -384,6 +387,48 @@ def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, sh
     assert 'jump back repeatedly' in rig.pipeline.conflict
     turned = rig.outputs[-1].heading - rig.outputs[250].heading
     assert abs(turned) < 0.7 * 0.5, 'half a second at most'
+
+
+def test_a_queue_that_is_stamped_on_arrival_is_no_stamp_that_stands_still(tmp_path, reported):
+    rig = rested(tmp_path)
+    rig.go(2.0)
+    stamp = max(rig.truth) + 10 ** 7
+    for _ in range(5):
+        rig.pipeline.add_sample(stamp, 0.0)
+    level, message, _ = reported(rig)
+    assert level == WARN and 'several samples have the stamp' in message
+
+
+@pytest.mark.parametrize('other, warns', [
+    (lambda rate: 0.0, True), (lambda rate: -0.3 * rate, True), (lambda rate: rate, False),
+    (lambda rate: 1.05 * rate + 0.01, False)], ids=['across', 'oblique', 'one gyro', 'same axis'])
+def test_every_other_sample_of_another_gyro_is_a_warning_and_the_heading_claims_nothing(
+        tmp_path, reported, other, warns):
+    """One publisher, one frame and increasing stamps, as of a relay that joins two topics."""
+    rig, count = rested(tmp_path), itertools.count()
+    rig.robot.distort = lambda output: other(output) if next(count) % 2 else output
+    for rate in (0.5, -0.8, 0.6, -0.4):
+        rig.robot.command(rate)
+        rig.go(6.0)
+    level, message, _ = reported(rig)
+    assert (level == WARN and 'every other sample on imu/data_raw' in message) == warns, message
+    assert (rig.error()[1] > math.tau) == warns
+    assert ('every other sample' in rig.pipeline.find_obstacle()) == warns
+
+
+@pytest.mark.parametrize('rate', [10, 20, 400])
+def test_the_samples_of_a_gyro_that_vibrates_and_turns_fast_do_not_alternate(rate):
+    """Also of one whose samples come in pairs, at 4 rad/s and 20 rad/s²."""
+    generator, turns = np.random.default_rng(rate), AlternateTurns()
+    time = np.arange(0.0, 300.0, 1.0 / rate)
+    swing = np.clip(10.0 * np.sin(0.9 * time), -4.0, 4.0)
+    vibration = 0.5 * np.sin(2.0 * np.pi * 0.49 * rate * time)
+    pairs = time - np.where(np.arange(len(time)) % 2, 0.8 / rate, 0.0)
+    for stamps in (time, pairs):
+        for stamp, value in zip(stamps, swing + vibration + 0.1 * generator.standard_normal(
+                len(time))):
+            turns.add(stamp, value)
+            assert not turns.is_contradictory
 
 
 def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
