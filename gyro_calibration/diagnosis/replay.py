@@ -98,10 +98,9 @@ def coefficient_angles(count: int) -> Array:
     return np.arange(1, count) * math.pi / count
 
 
-def band_starts(angle: Array, interval: float, single_bands: int = 24,
-                ratio: float = 1.12) -> Array:
-    """Return the first index of each band of coefficients: the lowest alone, then by ratio."""
-    edges, count = list(range(min(single_bands, len(angle)))), len(angle)
+def band_starts(count: int) -> Array:
+    """Return the first index of each band of coefficients: the lowest 24 alone, then by ratio."""
+    edges, ratio = list(range(min(24, count))), 1.12
     while edges and edges[-1] * ratio + 1.0 < count:
         edges.append(int(math.ceil(edges[-1] * ratio + 0.5)))
     return np.unique([edge for edge in edges if edge < count])
