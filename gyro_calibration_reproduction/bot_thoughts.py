@@ -145,10 +145,10 @@ def _strobe_contradiction() -> Contradiction:
 
 # an encoder of 2 deg
 
-def encoder_log(generator: np.random.Generator, delay: float = 0.0) -> tuple[Array, Array, Motion]:
+def encoder_log(generator: np.random.Generator) -> tuple[Array, Array, Motion]:
     """Return time, s, rates of a gyro with noise only, rad/s, and the motion by the encoder."""
     time = np.arange(round(HAND_MOTION.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
-    rate = HAND_MOTION.rate_at(time - delay) + simulate_noise(
+    rate = HAND_MOTION.rate_at(time) + simulate_noise(
         NOISE, len(time), 1.0 / SAMPLE_RATE, generator)
     steps = np.floor(HAND_MOTION.heading_at(time) / ENCODER_STEP + generator.uniform())
     return time, rate, motion_from_headings(time, steps * ENCODER_STEP)

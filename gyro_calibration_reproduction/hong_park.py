@@ -183,10 +183,10 @@ def _compare_self_calibration() -> list[Comparison]:
                        '-0.111', 'section 3.1'), *rows]
 
 
-def equation_8(motion: Motion, as_printed: bool) -> Array:
+def equation_8(as_printed: bool) -> Array:
     """Return [s̄, b̄] by eq. 8, with its columns as they are printed or exchanged."""
-    time, measured = noiseless_output(motion)
-    true = motion.rate_at(time)
+    time, measured = noiseless_output(CALIBRATION_MOTION)
+    true = CALIBRATION_MOTION.rate_at(time)
     matrix = np.array([[measured.sum(), measured @ measured], [len(measured), measured.sum()]])
     return np.linalg.solve(matrix if as_printed else matrix[:, ::-1],
                            np.array([true @ measured, true.sum()]))
@@ -209,8 +209,8 @@ def _rectangle_rule() -> Contradiction:
 
 
 def _exchanged_columns() -> Contradiction:
-    printed = equation_8(CALIBRATION_MOTION, True)
-    exchanged = equation_8(CALIBRATION_MOTION, False)
+    printed = equation_8(as_printed=True)
+    exchanged = equation_8(as_printed=False)
     return Contradiction({'first': printed[0], 'second': printed[1], 'right_first': exchanged[0],
                           'right_second': exchanged[1]},
                          'Eq. 8: the columns of the matrix are exchanged. The printed form gives '
