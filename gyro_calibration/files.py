@@ -41,6 +41,8 @@ MAX_MAGNITUDE = 1e20
 #: Largest ratio of decompressed to compressed size (sensor data compress to about a tenth), and
 #: the size in bytes that is allowed at any ratio.
 MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
+#: Largest depth of nested lists, names and messages, which the stack of Python holds.
+MAX_DEPTH = 10
 #: Longest wait for a program to write to a pipe, ms.
 _PIPE_TIMEOUT_MS = 900
 

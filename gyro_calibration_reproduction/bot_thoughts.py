@@ -35,6 +35,7 @@ from gyro_calibration_reproduction.finding import (
     from_own_figures,
     Reproduction,
 )
+from gyro_calibration_reproduction.hong_park import solve_equation_7
 import numpy as np
 from scipy.stats import linregress
 from scipy.stats import t as student
@@ -144,10 +145,10 @@ def _strobe_contradiction() -> Contradiction:
 
 # an encoder of 2 deg
 
-def encoder_log(generator: np.random.Generator, delay: float = 0.0) -> tuple[Array, Array, Motion]:
+def encoder_log(generator: np.random.Generator) -> tuple[Array, Array, Motion]:
     """Return time, s, rates of a gyro with noise only, rad/s, and the motion by the encoder."""
     time = np.arange(round(HAND_MOTION.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
-    rate = HAND_MOTION.rate_at(time - delay) + simulate_noise(
+    rate = HAND_MOTION.rate_at(time) + simulate_noise(
         NOISE, len(time), 1.0 / SAMPLE_RATE, generator)
     steps = np.floor(HAND_MOTION.heading_at(time) / ENCODER_STEP + generator.uniform())
     return time, rate, motion_from_headings(time, steps * ENCODER_STEP)
@@ -159,15 +160,18 @@ def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
 
     They are those of scale, 1, and offset, rad/s, by the method of the solver, which is least
     squares of the encoder's gradient on the gyro; the same by likelihood; of the scale of the
-    reverse regression; the largest of the heading after the method of the solver, rad.
+    reverse regression; the largest of the heading after the method of the solver, rad; scale and
+    offset by least squares of headings.
 
     """
     time, rate, motion = encoder_log(generator)
     gradient, likely = fit_rate(time, rate, motion), fit_likelihood(time, rate, motion, 0.1)
     reverse = linregress(motion.rate_at(time), rate).slope - 1.0
     heading = integrate(time, rate - gradient.bias) / (1.0 + gradient.scale_factor_error)
+    scale, offset = solve_equation_7(integrate(time, rate), time, motion.heading).tolist()
     return (gradient.scale_factor_error, gradient.bias, likely.scale_factor_error, likely.bias,
-            float(reverse), float(np.abs(heading - motion.heading).max()))
+            float(reverse), float(np.abs(heading - motion.heading).max()), 1.0 / scale - 1.0,
+            -offset / scale)
 
 
 def _compare_solver(found: Array) -> list[Comparison]:
@@ -182,10 +186,14 @@ def _compare_solver(found: Array) -> list[Comparison]:
                    3.0 * deviations[1] / DEGREE, 'not by the method; possibly another null'),
         Comparison("error of scale, solver's way: mean", '%', 100.0 * means[0]),
         Comparison("error of scale, solver's way: standard deviation", '%', 100.0 * deviations[0]),
+        Comparison('error of scale, headings: standard deviation', '%', 100.0 * deviations[6],
+                   note='"heading rate ... a better fit" in part 2'),
         Comparison('error of scale, likelihood: mean', '%', 100.0 * means[2]),
         Comparison('error of scale, likelihood: standard deviation', '%', 100.0 * deviations[2]),
         Comparison("error of offset, solver's way: standard deviation", 'deg/s',
                    deviations[1] / DEGREE),
+        Comparison('error of offset, headings: standard deviation', 'deg/s',
+                   deviations[7] / DEGREE),
         Comparison('error of offset, likelihood: standard deviation', 'deg/s',
                    deviations[3] / DEGREE),
         Comparison("largest error of heading, solver's way", 'deg', means[5] / DEGREE, '< 3',

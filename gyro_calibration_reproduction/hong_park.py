@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 
+from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, to_model_record
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
@@ -48,6 +49,8 @@ TRUE_SCALE_ERROR, TRUE_BIAS = -0.1, 0.1
 REFERENCE_SAMPLE_RATE, GYRO_SAMPLE_RATE = 20.0, 100.0
 #: Sections 3.2 and 4.2: deg/s, deg/s as printed (deg/min is taken, see `_bias_unit`), s.
 THRESHOLD, PRINTED_BIAS, DRIVE_DURATION = 0.3, 0.75, 160.0
+#: Section 2.2: of ten gyros, 1.
+MEAN_SCALE_ERROR = 0.0253
 #: Table 1: mean and standard deviation of the heading error, deg.
 TABLE_1 = {'pure integration': (1.6675, 1.5075), 'self-calibration': (1.1511, 1.1675),
            'threshold filter': (0.7768, 1.2653), 'both': (0.5985, 1.2998)}
@@ -58,17 +61,54 @@ ASSUMED = (
     'The drive of figure 10 is not published; the built-in motions `calibration` (20 s) and '
     '`robot` (160 s, half of it standing) are taken. The percentages compare, the degrees do not.',
     'b is taken in deg/min, the noise as white noise and flicker.',
+    'The text has no number of figures 4 and 5, the change of bias with temperature and of scale '
+    'factor with age.',
 )
 
 
 def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
-    errors = np.array([drive_errors(generator) for _ in progress(range(runs))])
-    return Reproduction(TITLE, ASSUMED, (*_compare_self_calibration(), *_compare_own_figures(),
-                                         *_compare_table_1(errors)),
-                        (_rectangle_rule(), _exchanged_columns(),
-                         _efficiency(generator, runs, progress), _bias_unit(),
-                         _noise_over_threshold(errors)))
+    errors, deviations = np.stack(
+        [drive_errors(generator) for _ in progress(range(runs))], axis=1)
+    efficiency = _efficiency(generator, runs, progress)
+    instrument = _compare_instrument(generator, max(2, runs // 20), progress)
+    return Reproduction(TITLE, ASSUMED, (
+        *instrument, *_compare_self_calibration(), *_compare_own_figures(),
+        *_compare_table_1(errors, deviations)),
+        (_rectangle_rule(), _exchanged_columns(), efficiency, _bias_unit(),
+         _noise_over_threshold(errors)))
+
+
+# figures 2, 3 and 8
+
+def measured_figures(generator: np.random.Generator) -> tuple[float, ...]:
+    """
+    Measure a simulated gyro with the figures of the paper.
+
+    Return the angle random walk, deg/√h, and the bias instability, deg/h, by an hour at rest; the
+    scale factor error, %, by 22 rates of 10 s each; and the peak-to-peak noise of 1 s, deg/s.
+
+    """
+    interval = 1.0 / GYRO_SAMPLE_RATE
+    rest = simulate_noise(XV3500.noise, 3600 * round(GYRO_SAMPLE_RATE), interval, generator)
+    figures = fit_noise(rest, interval).figures
+    rates = np.linspace(-100.0, 100.0, 22) * DEGREE
+    means = simulate_noise(XV3500.noise, 22 * 1000, interval, generator).reshape(22, 1000).mean(1)
+    scale = float(np.polyfit(rates, (1.0 + MEAN_SCALE_ERROR) * rates + means, 1)[0]) - 1.0
+    return (figures['N'].value / DEGREE * 60.0, figures['B'].value / DEGREE * 3600.0,
+            100.0 * scale, float(np.ptp(rest[:round(GYRO_SAMPLE_RATE)])) / DEGREE)
+
+
+def _compare_instrument(generator: np.random.Generator, runs: int,
+                        progress: Progress) -> list[Comparison]:
+    found = np.array([measured_figures(generator) for _ in progress(range(runs))])
+    rows = (('angle random walk by an Allan chart of an hour', 'deg/sqrt(h)', '2.5', 'fig. 2', ''),
+            ('bias instability by an Allan chart of an hour', 'deg/h', '17.99', 'fig. 2', ''),
+            ('scale factor error of 2.53 %, by 22 rates', '%', '2.53', 'fig. 3', ''),
+            ('peak-to-peak noise', 'deg/s', '2', 'fig. 8', 'of 1 s, which is not stated'))
+    return [Comparison(quantity, unit, float(values.mean()), published, place,
+                       3.0 * _standard_error(values), note=note)
+            for (quantity, unit, published, place, note), values in zip(rows, found.T)]
 
 
 # figures 6 and 7
@@ -100,11 +140,12 @@ def errors_by_rectangles(motion: Motion, delay_samples: int = 0) -> tuple[float,
 def errors_by_trapezoids(motion: Motion) -> tuple[float, float]:
     """Return the errors of s and b, %, by eq. 5 to 7 with the trapezoid rule for eq. 4."""
     time, rate = noiseless_output(motion)
-    scale, offset = _solve_equation_7(integrate(time, rate), time, motion.heading_at(time))
+    scale, offset = solve_equation_7(integrate(time, rate), time, motion.heading_at(time))
     return _percent_errors(1.0 / scale - 1.0, -offset / scale)
 
 
-def _solve_equation_7(integral: Array, time: Array, heading: Array) -> Array:
+def solve_equation_7(integral: Array, time: Array, heading: Array) -> Array:
+    """Return [s̄, b̄] of eq. 7 by integrals of the output, rad, at times since the begin, s."""
     return np.linalg.lstsq(np.column_stack([integral, time]), heading, rcond=None)[0]
 
 
@@ -142,10 +183,10 @@ def _compare_self_calibration() -> list[Comparison]:
                        '-0.111', 'section 3.1'), *rows]
 
 
-def equation_8(motion: Motion, as_printed: bool) -> Array:
+def equation_8(as_printed: bool) -> Array:
     """Return [s̄, b̄] by eq. 8, with its columns as they are printed or exchanged."""
-    time, measured = noiseless_output(motion)
-    true = motion.rate_at(time)
+    time, measured = noiseless_output(CALIBRATION_MOTION)
+    true = CALIBRATION_MOTION.rate_at(time)
     matrix = np.array([[measured.sum(), measured @ measured], [len(measured), measured.sum()]])
     return np.linalg.solve(matrix if as_printed else matrix[:, ::-1],
                            np.array([true @ measured, true.sum()]))
@@ -168,8 +209,8 @@ def _rectangle_rule() -> Contradiction:
 
 
 def _exchanged_columns() -> Contradiction:
-    printed = equation_8(CALIBRATION_MOTION, True)
-    exchanged = equation_8(CALIBRATION_MOTION, False)
+    printed = equation_8(as_printed=True)
+    exchanged = equation_8(as_printed=False)
     return Contradiction({'first': printed[0], 'second': printed[1], 'right_first': exchanged[0],
                           'right_second': exchanged[1]},
                          'Eq. 8: the columns of the matrix are exchanged. The printed form gives '
@@ -188,7 +229,7 @@ def _compare_own_figures() -> list[Comparison]:
     drift = drift_in_half_an_hour()
     return [
         from_own_figures('scale factor error of 2.53 %, after one revolution', 'deg',
-                         360.0 * 0.0253, '9.1', 'section 2.2'),
+                         360.0 * MEAN_SCALE_ERROR, '9.1', 'section 2.2'),
         from_own_figures('drift in 30 min, sum of both parts', 'deg', sum(drift), '11',
                          'section 1', note='deviations do not add so'),
         from_own_figures('drift in 30 min, root of the sum of squares', 'deg', math.hypot(*drift),
@@ -257,7 +298,12 @@ def noisy_output(motion: Motion, noise: Noise,
 
 
 def drive_errors(generator: np.random.Generator) -> Array:
-    """Return the mean absolute heading error of a simulated drive, deg, by each of `METHODS`."""
+    """
+    Return the absolute heading errors of a simulated drive, deg, by each of `METHODS`.
+
+    They are means and standard deviations over the drive, shape (2, methods).
+
+    """
     time, output = noisy_output(FULL_MOTION, XV3500.noise, generator)
     run = time <= CALIBRATION_MOTION.duration
     fits = (fit_heading(time[run], output[run], CALIBRATION_MOTION),
@@ -266,22 +312,22 @@ def drive_errors(generator: np.random.Generator) -> Array:
     filtered = [[filter_rates(settings, time, rate) for settings in FILTERS.values()]
                 for rate in rates]
     known = np.where(FULL_MOTION.rate_at(time) == 0.0, 0.0, output)
-    return np.array([_mean_error(time, rate)
-                     for rate in (*rates, *filtered[0], known, *filtered[1], *filtered[2])])
-
-
-def _mean_error(time: Array, rate: Array) -> float:
     drive = time >= CALIBRATION_MOTION.duration
     true = ROBOT_MOTION.heading_at(time[drive] - CALIBRATION_MOTION.duration)
-    return float(np.abs(integrate(time[drive], rate[drive]) - true).mean()) / DEGREE
+    errors = np.abs([integrate(time[drive], rate[drive]) - true
+                     for rate in (*rates, *filtered[0], known, *filtered[1], *filtered[2])])
+    return np.stack([errors.mean(axis=1), errors.std(axis=1)]) / DEGREE
 
 
-def _compare_table_1(errors: Array) -> list[Comparison]:
+def _compare_table_1(errors: Array, deviations: Array) -> list[Comparison]:
     rows, means = [], errors.mean(axis=0)
-    for number, (name, (published, _), percent, why) in enumerate(METHODS):
+    for number, (name, (published, deviation), percent, why) in enumerate(METHODS):
         uncertainty = 3.0 * _standard_error(errors[:, number])
         rows.append(Comparison(f'mean error, {name}', 'deg', means[number], f'{published}',
                                'table 1', uncertainty, 'another drive'))
+        rows.append(Comparison(f'standard deviation of it, {name}', 'deg',
+                               float(deviations[:, number].mean()), f'{deviation}', 'table 1',
+                               3.0 * _standard_error(deviations[:, number]), 'another drive'))
         if percent:
             ratio = means[number] / means[0]
             # of the ratio of two means
@@ -324,8 +370,8 @@ def _efficiency(generator: np.random.Generator, runs: int, progress: Progress) -
     white, found = Noise(XV3500.noise.angle_random_walk), []
     for _ in progress(range(runs)):
         time, rate = noisy_output(CALIBRATION_MOTION, white, generator)
-        scale, offset = _solve_equation_7(integrate(time, rate), time,
-                                          CALIBRATION_MOTION.heading_at(time))
+        scale, offset = solve_equation_7(integrate(time, rate), time,
+                                         CALIBRATION_MOTION.heading_at(time))
         likely = fit_likelihood(time, rate, CALIBRATION_MOTION, 0.1)
         found.append((1.0 / scale, -offset / scale, 1.0 + likely.scale_factor_error, likely.bias))
     columns = np.column_stack([CALIBRATION_MOTION.rate_at(time), np.ones(len(time))])

@@ -89,10 +89,10 @@ def rd2100(sine_constant: float = SINE_CONSTANT) -> GyroModel:
 def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
+    regressor, sine = _regressor(generator), _sine(generator, len(found), progress)
     return Reproduction(TITLE, ASSUMED, (*_compare_own_figures(), *_compare_instrument(),
-                                         *_compare_results(found)),
-                        (_index(), _regressor(generator),
-                         _sine(generator, len(found), progress), _full_turn()))
+                                         *_compare_results(found), *_compare_drifts(generator)),
+                        (_index(), regressor, sine, _full_turn()))
 
 
 # a rate table
@@ -172,6 +172,8 @@ def _compare_own_figures() -> list[Comparison]:
     return [
         from_own_figures('drift of 0.002 deg/s in an hour', 'deg/h', 3600.0 * BIAS_STABILITY,
                          '7.2', 'section 1'),
+        from_own_figures('drift of 0.002 deg/s in 10 min', 'deg', 600.0 * BIAS_STABILITY, '1.2',
+                         'section 1'),
         from_own_figures('angle random walk of 5 (deg/h)/sqrt(Hz)', 'deg/sqrt(h)',
                          ANGLE_RANDOM_WALK / 60.0, '0.08', 'table I'),
         from_own_figures('data sets, every 10 deg/s and 2 K', '1', float(sets), '121',
@@ -218,6 +220,26 @@ def _compare_results(found: Array) -> list[Comparison]:
             Comparison(f'largest error of a full turn, {name}', '%', percent * means[number, 1],
                        '< 2', 'section 5, fig. 9', percent * uncertainties[number, 1])]
     return rows
+
+
+def _compare_drifts(generator: np.random.Generator, runs: int = 100) -> list[Comparison]:
+    """Compare the headings after 10 min at constant temperature, by the time since the rest."""
+    noise, minutes = rd2100().noise, (0, 60, 480)
+    samples = round(60.0 * (minutes[-1] + 10) * OUTPUT_RATE)
+    drifts = np.empty((runs, len(minutes)))
+    for run in range(runs):
+        rate = simulate_noise(noise, SAMPLES_PER_SET + samples, 1.0 / OUTPUT_RATE, generator)
+        static, powered = rate[:SAMPLES_PER_SET].mean(), rate[SAMPLES_PER_SET:]
+        for place, begin in enumerate(round(60.0 * each * OUTPUT_RATE) for each in minutes):
+            mission = powered[begin:begin + round(600.0 * OUTPUT_RATE)]
+            drifts[run, place] = (mission - static).sum() / OUTPUT_RATE / DEGREE
+    sizes = np.sqrt(np.mean(drifts ** 2, axis=0))
+    return [Comparison(f'heading after 10 min, rms, {when}', 'deg', size, published, place,
+                       3.0 * size / math.sqrt(2.0 * runs), why)
+            for size, (when, published, place, why) in zip(sizes.tolist(), (
+                ('rest before it', '< 1', 'section 2', 'flicker of 0.002 deg/s drifts by more'),
+                ('rest 1 h before it', '', '', ''),
+                ('rest 8 h before it', '', '', '')))]
 
 
 # misprints, and properties of the method

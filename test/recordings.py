@@ -119,9 +119,9 @@ def write(path, topics, storage='SQLITE3', mode='NONE', distribution='ROS2_JAZZY
     return path
 
 
-def of_log(log, distribution='ROS2_JAZZY'):
+def of_log(log):
     """Return the topics of a recording of a whole log, a message for each value at its time."""
-    make, time = Messages(distribution), log.time - log.time[0]
+    make, time = Messages(), log.time - log.time[0]
     force = [None] * len(log) if log.specific_force is None else log.specific_force.tolist()
     topics = {'imu/data_raw': [(at, make.imu(at, rate, each))
                                for at, rate, each in zip(time, log.output, force, strict=True)]}

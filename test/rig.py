@@ -334,12 +334,12 @@ class Rig:
             self.step()
         return until()
 
-    def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None, force=None):
+    def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None):
         """
         Play outputs of a gyro, rad/s, without the robot; return what came out for each.
 
         The temperature, degC, may be one or one a sample; `moving` is the rate that odometry
-        shows, rad/s, and `force` the specific force, m/s².
+        shows, rad/s.
 
         """
         found = []
@@ -353,7 +353,7 @@ class Rig:
                 self.pipeline.add_temperature(stamp, float(each))
             if moving is not None:
                 self.pipeline.add_odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
-            found.append(self.pipeline.add_sample(stamp, float(output), force, self.receivers))
+            found.append(self.pipeline.add_sample(stamp, float(output), None, self.receivers))
             self.outputs += [found[-1]] if found[-1] else []
             self.guards()
         return found

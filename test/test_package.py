@@ -83,7 +83,7 @@ def test_bloom_finds_a_dated_section_of_the_version_in_the_changelog():
 
 
 def test_the_manifest_names_exactly_what_is_imported():
-    """By the names of rosdep, which has no mcap; the rest only a fleet of logs needs."""
+    """By the names of rosdep; only a fleet of logs needs the two without one."""
     names = {name for folder in ('gyro_calibration', 'launch')
              for file in (ROOT / folder).rglob('*.py') for name in imports(file)}
     roots = ({name.partition('.')[0] for name in names} - sys.stdlib_module_names
@@ -92,7 +92,7 @@ def test_the_manifest_names_exactly_what_is_imported():
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert {element.text for element in manifest.iter('exec_depend')} == {
         f'python3-{root}' if root in python else root
-        for root in roots - {'mcap', 'distributed', 'pyarrow'}}
+        for root in roots - {'distributed', 'pyarrow'}}
 
 
 def test_every_launcher_is_the_same_and_can_be_executed():

@@ -27,6 +27,7 @@ import math
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
+from gyro_calibration.calibration.whole_turns import FALSE_REFUSAL_RATE
 from gyro_calibration.logs.log import Array, DataRefused, Mask
 from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
@@ -48,9 +49,8 @@ from scipy.stats import pearsonr
 MIN_ALLAN_SAMPLES = 100
 #: Largest share of lost samples in a window; it is also the largest change of the variance.
 _MAX_LOST_PER_WINDOW = 0.01
-#: Least number of spans in the test whether a reference turns with the output, and its level: the
-#: probability of such a correlation by chance at rest.
-_MIN_SPANS, _CORRELATION_P_VALUE = 8, 1e-4
+#: Least number of spans in the test whether a reference turns with the output.
+_MIN_SPANS = 8
 #: Largest share of a record that may be lost.
 _MAX_LOST_SHARE = 0.3
 
@@ -124,7 +124,7 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
                 or (np.ptp(both, axis=1) <= 1e-9 * np.abs(both).max(axis=1)).any()):
             continue
         correlation, chance = pearsonr(*both)
-        if correlation ** 2 > 0.5 and chance < _CORRELATION_P_VALUE:
+        if correlation ** 2 > 0.5 and chance < FALSE_REFUSAL_RATE:
             raise DataRefused(
                 f'the reference heading turns with the output ({100.0 * correlation ** 2:.0f} % '
                 f'of the variance of means over {span:g} s): the gyro was moved; give a part at '

@@ -49,6 +49,7 @@ from gyro_calibration.calibration.heading_regression import (
     MAX_ENCODER_OFFSET,
     MAX_FOLLOWED_RESIDUAL,
     TECHNOLOGY_PRIORS,
+    WANDER_COSINES,
 )
 from gyro_calibration.calibration.likelihood import (
     fit_likelihood,
@@ -110,8 +111,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-#: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
-_WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
+#: The gyro's white noise that is possible, rad/√s.
+_WHITE_NOISE_RANGE = (1e-5, 1e-2)
 #: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
 _GYRO_LAG_DEVIATION = 2e-4
 #: Prior standard deviation of the smoothing of a heading without steps, half the variance of the
@@ -121,9 +122,8 @@ _SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
-#: Share of the largest differences that show their tail, and the probability that noise alone
-#: exceeds the limit of a jump in a log.
-_TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
+#: Share of the largest differences that show their tail.
+_TAIL_SHARE = 0.005
 #: Largest difference from a reference that is computed from the output, relative to its noise:
 #: that of rounding. A second gyro that shares vibration or fast motion differs by 1e-3 or more.
 _OWN_DIFFERENCE_SHARE = 1e-6
@@ -319,7 +319,7 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     usual = apart < 1.5 * np.median(apart)
     low, high = np.quantile(np.abs(difference[usual]), 1.0 - _TAIL_SHARE * np.array([2.0, 1.0]))
     noise = high + (high - low) * math.log2(
-        max(_TAIL_SHARE * len(known) / _JUMP_PROBABILITY, 1.0))
+        max(_TAIL_SHARE * len(known) / FALSE_ALARM_RATE, 1.0))
     above = usual & (beyond > noise)
     alone = np.convolve(above, np.ones(3), 'same') == 1.0
     jumps = known[1:][above & alone]
@@ -479,7 +479,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     largest = max(TECHNOLOGY_PRIORS[technology][1], 3.0 * abs(bias))
     found = fit_noise_grid(
         moved, spacing[:, None], [walk, repeated],
-        *bias_wander_columns(middle, cosine_count=_COSINE_COUNT), prior_mean=np.array([-bias]),
+        *bias_wander_columns(middle, cosine_count=WANDER_COSINES), prior_mean=np.array([-bias]),
         prior_deviation=np.array([largest]),
         hierarchical_priors=(HierarchicalPrior('bias', 0, (0.1 * largest, largest)),))
     white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(

@@ -111,8 +111,9 @@ MAX_ENCODER_OFFSET = 0.25
 #: its variance: the errors of a course have Student's distribution with so many degrees of
 #: freedom, plus one for each observed error.
 _BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
-#: The random walk of the bias that is possible beside a course, rad/s/√s, and its cosines.
-_COURSE_RANDOM_WALK_RANGE, _COURSE_COSINE_COUNT = (1e-7, 1e-4), 8
+#: The random walk of the bias that is possible beside a course, rad/s/√s; and the cosines of a
+#: wander that one part of noise describes.
+_COURSE_RANDOM_WALK_RANGE, WANDER_COSINES = (1e-7, 1e-4), 8
 #: Prior standard deviation of the smoothing of a course, s².
 _SMOOTHING_DEVIATION = 0.1
 #: Correlations of the errors of a course over a span that are possible.
@@ -126,7 +127,7 @@ _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Cosines over which the power spectrum of a rate is averaged: that of white noise to 14 %.
-_SPECTRUM_BINS = 101
+SPECTRUM_BINS = 101
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
 #: vibration.
 _MAX_VEHICLE_WALK = 5e-4
@@ -356,7 +357,7 @@ class Spans:
         """
         rate = np.asarray(self.channels.rate)
         cosines = dct(rate, norm='ortho')
-        power = uniform_filter1d(cosines ** 2, _SPECTRUM_BINS)
+        power = uniform_filter1d(cosines ** 2, SPECTRUM_BINS)
         share = 1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300)
         return np.asarray(idct(np.maximum(share, 0.0) * cosines, norm='ortho'))
 
@@ -472,7 +473,7 @@ class Spans:
                          for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
         waves, parts = bias_wander_columns(self.time, *(
             (flicker, walk) if self.treatment.is_fine
-            else (None, _COURSE_RANDOM_WALK_RANGE, _COURSE_COSINE_COUNT)))
+            else (None, _COURSE_RANDOM_WALK_RANGE, WANDER_COSINES)))
         assert self.log.time is not None
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)

@@ -58,7 +58,8 @@ class GoodnessOfFit:
                 f'noise {self.noise_ratio:.2f} times that of the model)')
 
 
-#: Below this probability the message states that the residual is larger than expected.
+#: Probability of a misfit by chance below which it is stated: of a residual, of a frequency band
+#: of it, or of sizes of a cause that differ from log to log.
 MIN_FIT_PROBABILITY = 1e-3
 
 

@@ -190,7 +190,6 @@ class TridiagonalMatrix:
 
 
 def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
-                  typical_reference_noise: float = math.radians(1.0),
                   angle_random_walk: tuple[float, float] | None = None,
                   correlation: Array | None = None,
                   reference_walk: Array | None = None) -> list[BandedNoise]:
@@ -203,8 +202,6 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     rate : at the points, rad/s, shape (n + 1,)
     point_variance : of the reference at each point, relative to the others, shape (n + 1,); larger
         where a point is an outlier
-    typical_reference_noise : typical size of the noise of the reference, rad; sizes from 1e-4 to
-        10 times it are possible
     angle_random_walk : smallest and largest N that is possible, rad/√s, where a log at rest, a
         data sheet or the differences between samples bound it; equal ends where it is known
     correlation : of the errors of the reference at both ends of each span, shape (n,); the parts
@@ -215,7 +212,7 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     """
     points = np.ones(len(time)) if point_variance is None else point_variance
     rate_rms = math.sqrt(float(np.mean(rate**2))) + 1e-12
-    sizes = 1e-4 * typical_reference_noise, 1e1 * typical_reference_noise
+    sizes = math.radians(1e-4), math.radians(10.0)  # possible ones of the reference
     moving = (BandedNoise('reference_walk', *_walk_covariance(reference_walk, correlation), sizes)
               if reference_walk is not None else BandedNoise(
                   'motion', *difference_covariance(points * rate ** 2, correlation),

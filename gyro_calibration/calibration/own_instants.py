@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.logs.log import Array, Log
+from gyro_calibration.logs.log import Array, Log, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import bridge_gaps, find_runs, quantization_step
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -28,8 +28,6 @@ MAX_ROUNDING_STEP = 2e-4
 #: Largest change of the slope on a straight line as a share of the usual slope, and least number
 #: of instants.
 _MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
-#: Difference of times that is rounding, s.
-_EQUAL_TIMES = 1e-9
 
 
 class OwnInstants(NamedTuple):
@@ -159,7 +157,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         kept = found._replace(time=np.full(len(log), np.nan), values=np.full(len(log), np.nan))
         kept.time[rows], kept.values[rows] = at, values
         own = kept.values.copy()
-        if np.abs(at - log.time[rows]).max(initial=0.0) > _EQUAL_TIMES:
+        if np.abs(at - log.time[rows]).max(initial=0.0) > MIN_SAMPLE_INTERVAL:
             own[rows] = CubicSpline(found.time, found.values)(log.time[rows])
         log = (replace(log, reference_heading=own) if is_heading
                else replace(log, reference_rate=own))

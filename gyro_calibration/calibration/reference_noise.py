@@ -21,6 +21,7 @@ from gyro_calibration.calibration.own_instants import (
     is_command,
     keep_own_instants,
 )
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
@@ -58,8 +59,6 @@ _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Least noise of a course, rad, over a second or from span to span; by RTK fixes of a car in town
 #: it is 0.4 deg, and a motion capture with short gaps has less.
 MIN_COURSE_NOISE = 0.25 * DEGREE
-#: Chance by which a heading that rests is taken for one that is repeated in motion.
-_DETECTION_LEVEL = 0.01
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
@@ -274,7 +273,8 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     usual = heading_difference(replace(log, reference_heading=moving))
     if not usual.total_walk > 0.0:
         return log, []
-    bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / _DETECTION_LEVEL))
+    # a heading that rests is taken for a repeated one by chance at this rate
+    bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
     step = quantization_step(heading[known])
     turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
     seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]

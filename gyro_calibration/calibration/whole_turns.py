@@ -44,8 +44,8 @@ _PART_DURATION, _MIN_MOVING_RATE = 0.25, 0.5 * DEGREE
 MAX_COUNT_ERROR = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
 MAX_COUNTING_SCALE_ERROR = 0.05
-#: Probability of refusing two rests of equal bias as different.
-_FALSE_REFUSAL_RATE = 1e-4
+#: Probability of refusing by chance: two rests of equal bias, or a reference beside noise.
+FALSE_REFUSAL_RATE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     difference_variance = white_density / rest_durations[0] + white_density / rest_durations[1]
     bias, variance = 0.5 * (first + last), 0.25 * difference_variance + 0.5 * wander_variance
     difference, deviation = last - first, math.sqrt(difference_variance + wander_variance)
-    if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSAL_RATE)) * deviation,
+    if abs(difference) > max(-float(ndtri(0.5 * FALSE_REFUSAL_RATE)) * deviation,
                              limits.max_rest_rate):
         raise DataRefused(
             f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '

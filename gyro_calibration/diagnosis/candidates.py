@@ -27,7 +27,7 @@ import math
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
+from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.interpolate import BSpline
 
@@ -190,40 +190,34 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
 
 def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
                    moves: bool = True) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Give the lasting causes that some channels may show, linear in size, with first shapes."""
-    yield 'rate_ramp', ()
-    yield from (('warm_up', (time_constant,)) for time_constant in np.geomspace(
-        duration / 100.0, duration * 0.7, 9).tolist())
-    if 'temperature' in has:
-        middle = float(temperature.mean())
-        yield 'bias_temperature', (middle,)
+    """
+    Give the lasting causes that some channels may show, linear in size, with first shapes.
+
+    They are those of the record of the effect, unless they depend on the log.
+
+    """
+    middle = float(temperature.mean())
+    of_log: dict[str, list[tuple[float, ...]]] = {
+        'warm_up': [(each,) for each in np.geomspace(
+            duration / 100.0, duration * 0.7, 9).tolist()],
+        'thermal_lag': [(each,) for each in np.geomspace(
+            MIN_THERMAL_LAG, min(duration, 3000.0), 8).tolist()],
+        'thermal_hysteresis': [(1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)],
+        'bias_temperature': [(middle,)], 'scale_factor_temperature': [(middle,)],
         # that of data sheets, mean and first temperature; of two that are as likely, a few kelvin
         # apart, the coefficients differ by more than their intervals
-        for reference in (25.0, middle, float(temperature[0])):
-            yield 'bias_temperature_quadratic', (reference,)
-        for filter_time in (0.3, 1.0, 3.0, 10.0):
-            yield 'bias_temperature_rate', (filter_time,)
-        yield from (('thermal_lag', (time_constant,)) for time_constant in np.geomspace(
-            MIN_THERMAL_LAG, min(duration, 3000.0), 8).tolist())
-        yield from (('thermal_hysteresis', shapes)
-                    for shapes in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)))
-    if 'specific_force' in has:
-        yield 'acceleration_sensitivity', ()
-        yield from (('vibration_rectification', (constant,)) for constant in (1.0, 3.0))
-    if 'supply' in has:
-        yield 'supply_sensitivity', (5.0,)
-    for name, own in USER_EFFECTS.items():
-        if (own.inputs & MIN_CHANNEL_RANGE.keys() <= set(has)
-                and (moves or not own.inputs & {'rate', 'output', 'heading'})):
-            yield from ((name, shapes)
-                        for shapes in product(*(shape.begin_with or (shape.default or 0.0, )
-                                                for shape in own.nonlinear_parameters)))
+        'bias_temperature_quadratic': [(25.0,), (middle,), (float(temperature[0]),)]}
+    for name, effect in CATALOGUE.items():
+        if (effect.inputs & MIN_CHANNEL_RANGE.keys() <= {*has}
+                and (moves or not effect.inputs & {'rate', 'output', 'heading'})
+                and effect.distortion is None and name not in ('bias', 'scale_factor_error')):
+            # none of an effect with a shape that has no first values
+            recorded = product(*(shape.begin_with or (
+                () if shape.default is None else (shape.default,))
+                for shape in effect.nonlinear_parameters))
+            yield from ((name, shapes) for shapes in of_log.get(name, recorded))
     if moves:
-        yield from ((name, ()) for name in (
-            'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
-            'heading_sensitivity', 'reference_once_per_rev'))
-        if 'temperature' in has:
-            yield 'scale_factor_temperature', (middle,)
+        yield 'reference_once_per_rev', ()
 
 
 def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from gyro_calibration.calibration.dwells import require_output
+from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_output
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import (
@@ -78,11 +78,11 @@ _MOTION_CLASSES = 8
 #: Probability of a repeat from which on single repeats of a coarse output are not tested, and up
 #: to which they are marked as a fault.
 _COARSE_REPEAT_CHANCE, _RARE_REPEAT_CHANCE = 0.3, 0.02
-#: Least deviation of an outlier in standard deviations (more for very long logs); and a deviation
-#: that noise reaches rarely: from there to that of outliers there are at most half as many samples
-#: as outliers, as more are a tail of the noise, and samples whose expected output is as near to a
-#: limit are not used, as noise determines whether they are clipped.
-_MIN_OUTLIER_SIGMAS, _RARE_SIGMAS = 6.0, 4.5
+#: A deviation that noise reaches rarely, in standard deviations: from there to that of outliers
+#: there are at most half as many samples as outliers, as more are a tail of the noise, and samples
+#: whose expected output is as near to a limit are not used, as noise determines whether they are
+#: clipped.
+_RARE_SIGMAS = 4.5
 #: Numbers of neighbours on each side with which a sample is compared, of samples between a jolt in
 #: the output and in the reference, of samples in a block of constant scatter, and of consecutive
 #: outliers, at most.
@@ -307,7 +307,8 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
                   level: float) -> SampleFault | None:
     """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
     measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
-    limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
+    # more for very long logs
+    limit = max(OUTLIER_THRESHOLD, float(stats.norm.isf(0.25 * level / len(output))))
     # how much the output is expected to change about each sample, and how far it jumps
     expected: Array = np.zeros(len(output))
     expected_change = jumps = expected

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.data_quality import DataQuality
@@ -58,9 +59,6 @@ _COMPENSATING_EFFECTS: Mapping[str, Effect] = {
 HEADING_WINDOW = 60.0
 #: Longest window as a share of a held-out part.
 MAX_WINDOW_SHARE = 0.75
-#: False-alarm rate of a cause, found in the whole logs, when it is selected without the held-out
-#: blocks.
-_REPEATED_ALARM_RATE = 0.01
 
 
 def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[DataQuality],
@@ -344,7 +342,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
         return None
     reduced_search = restrict_search(
         search, [drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
-        _REPEATED_ALARM_RATE)
+        FALSE_ALARM_RATE)
     named = search_causes(reduced_search)
     straight, plain, extended = (
         replace(fit_causes(reduced_search.problem, some), lasting_only=True)

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field, fields
 import math
 from typing import Any, ClassVar, TypeAlias
 
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
@@ -276,7 +277,7 @@ class Diagnosis(Record):
     heading: HeadingCurve | None = None
     noise_curve: NoiseCurve | None = None
     remarks: tuple[str, ...] = ()  # for people, one sentence each
-    false_alarm_rate: float = 0.01  # per diagnosis
+    false_alarm_rate: float = FALSE_ALARM_RATE  # per diagnosis
     logs: tuple[str, ...] = ()  # names of the files
     trace: Trace | None = None
     method: str = ''  # how it was computed, for people; empty for the method of logs in time

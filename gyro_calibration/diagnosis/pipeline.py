@@ -21,6 +21,7 @@ from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     common_channels,
@@ -150,8 +151,7 @@ _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K'
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None,
-             false_alarm_rate: float = 0.01, names: Sequence[str] = (),
-             on_progress: OnProgress = lambda share, words: None,
+             names: Sequence[str] = (), on_progress: OnProgress = lambda share, words: None,
              reference_kind: str | None = None) -> Diagnosis:
     """
     Find the causes of the difference between a simulation and logs.
@@ -162,7 +162,6 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     generator : source of the noise that fills gaps
     model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
         best
-    false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
     on_progress : is called with None and the name of each step that begins; returns whether to end
     reference_kind : of the reference, one of `gates.REFERENCE_KINDS`; None is found
@@ -190,8 +189,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         if failed is not None:
             own = given_model or GyroModel()
             return Diagnosis((failed,), (), Noise(), own.noise, None, own, own,
-                             false_alarm_rate=false_alarm_rate, logs=tuple(names[place:place + 1]),
-                             gates=passed)
+                             logs=tuple(names[place:place + 1]), gates=passed)
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
     limiting_logs = [place for place, log in enumerate(logs)
@@ -203,12 +201,12 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
             f'the errors of the reference of {where} are larger than those of the gyro, and such '
             'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
     if limiting_logs:
-        found = diagnose_by_noisy_reference(logs[0], references[0], model, false_alarm_rate,
+        found = diagnose_by_noisy_reference(logs[0], references[0], model, FALSE_ALARM_RATE,
                                             on_progress, instants[0])
     else:
         try:
             found = _diagnose_by_exact_reference(
-                logs, generator, model, false_alarm_rate, names, on_progress,
+                logs, generator, model, FALSE_ALARM_RATE, names, on_progress,
                 references, reference_kind == 'rate_command')
         finally:
             forget_fits()

@@ -46,6 +46,7 @@ from gyro_calibration.calibration.scatter import cross_validation_parts, MIN_SWE
 from gyro_calibration.calibration.selection import (
     BASIC_EFFECTS,
     distinguishing_rate,
+    FALSE_ALARM_RATE,
     find_supported_effects,
     MIN_DISTINGUISHING_SIGMAS,
     resolve_confounders,
@@ -110,7 +111,7 @@ _METHOD_TEXT = (
     'held-out sweeps; intervals are of 95 %.')
 
 
-def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rate: float = 0.01,
+def diagnose_table(table: Log | Dwells, model: GyroModel | None,
                    on_progress: OnProgress = lambda share, words: None) -> Diagnosis:
     """
     Find the causes of the difference between a simulation and the dwells of a rate table.
@@ -119,7 +120,6 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
     ----------
     table : a log without time, or its dwells
     model : that is tested; None is an ideal gyro with the best bias and scale factor
-    false_alarm_rate : false alarms per table
     on_progress : is called with the share of the work done and the name of the step that begins
 
     Raises
@@ -136,24 +136,24 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
                           'bias; record several rates, both ways')
     record = resolve_unit(inspect_record(log, model))
     dwells = replace(dwells, output=dwells.output * record.unit_factor)
-    named = name_causes(dwells, model, false_alarm_rate)
-    structures, gains = find_structure(named.fit, 0.2 * false_alarm_rate)
+    named = name_causes(dwells, model, FALSE_ALARM_RATE)
+    structures, gains = find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
     # structure along the variable of a cause, above a tenth of what that explains
     withdrawn = frozenset(
         effect for effect in named.causes if effect not in BASIC_EFFECTS
         and any(gain > 0.1 * named.misfit_reduction(effect) for name, gain in gains.items()
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
-        named = NamedCauses.of(named.fit, model, false_alarm_rate, withdrawn)
-        structures, _ = find_structure(named.fit, 0.2 * false_alarm_rate)
-    gain = (_cross_validated_gain(dwells, model, false_alarm_rate, withdrawn, on_progress)
+        named = NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
+        structures, _ = find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
+    gain = (_cross_validated_gain(dwells, model, FALSE_ALARM_RATE, withdrawn, on_progress)
             if named.causes else None)
     on_progress(0.97, 'findings')
     before = model or named.plain_model
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
     after = assemble_model(model, named.fit) if offered else before
     strongest_first = sorted(named.causes, key=lambda each: -named.misfit_reduction(each))
-    outliers = _outlier_findings(named.fit, 0.05 * false_alarm_rate)
+    outliers = _outlier_findings(named.fit, 0.05 * FALSE_ALARM_RATE)
     findings = add_remedies([*record.findings, *outliers, *(
         _cause_finding(named, effect) for effect in strongest_first)], {}, after)
     if after is not before:
@@ -165,8 +165,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
         error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
                  *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
-        false_alarm_rate=false_alarm_rate,
-        method=_METHOD_TEXT.format(share=100.0 * false_alarm_rate))
+        method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE))
 
 
 # the steps

@@ -125,8 +125,8 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     plain = np.concatenate([first.variance(angle, step) / step for angle, step in parts])
     deviation = np.sqrt(plain)
     offsets = np.cumsum([0, *(len(angle) for angle, _ in parts)])
-    starts = np.concatenate([band_starts(angle, step) + offset
-                             for (angle, step), offset in zip(parts, offsets)])
+    starts = np.concatenate([band_starts(len(angle)) + offset
+                             for (angle, _), offset in zip(parts, offsets)])
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
     # The mean variance of a band is computed from some of its coefficients.
     few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int))

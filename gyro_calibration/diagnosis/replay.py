@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 import math
 
+from gyro_calibration.calibration.heading_regression import SPECTRUM_BINS
 from gyro_calibration.diagnosis.gates import (
     MIN_SAMPLES,
     MIN_VALID_SHARE,
@@ -97,10 +98,9 @@ def coefficient_angles(count: int) -> Array:
     return np.arange(1, count) * math.pi / count
 
 
-def band_starts(angle: Array, interval: float, single_bands: int = 24,
-                ratio: float = 1.12) -> Array:
-    """Return the first index of each band of coefficients: the lowest alone, then by ratio."""
-    edges, count = list(range(min(single_bands, len(angle)))), len(angle)
+def band_starts(count: int) -> Array:
+    """Return the first index of each band of coefficients: the lowest 24 alone, then by ratio."""
+    edges, ratio = list(range(min(24, count))), 1.12
     while edges and edges[-1] * ratio + 1.0 < count:
         edges.append(int(math.ceil(edges[-1] * ratio + 0.5)))
     return np.unique([edge for edge in edges if edge < count])
@@ -138,8 +138,8 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
-#: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
-_SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
+#: Margin of the power of rounding.
+_ROUNDING_POWER_FACTOR = 1.5
 #: Samples next to a gap of at least as many whose rate is not used: the error at the end of a
 #: spline is 0.27 times as large from sample to sample. Shorter gaps change the slope by little.
 _GAP_MARGIN_SAMPLES = 4
@@ -501,6 +501,6 @@ def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
     coefficients = dct(rate, norm='ortho')
     rounding = ((step / interval) ** 2 / 12.0
                 * spline_derivative_gain(np.arange(len(rate)) * math.pi / len(rate)))
-    power = uniform_filter1d(coefficients ** 2, _SMOOTHING_BINS, mode='nearest')
+    power = uniform_filter1d(coefficients ** 2, SPECTRUM_BINS, mode='nearest')
     weight = 1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300)
     return idct(coefficients * np.clip(weight, 0.0, 1.0), norm='ortho')

@@ -24,6 +24,7 @@ import math
 from typing import TypeAlias
 
 from gyro_calibration.allan.deviation import allan_deviation
+from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.findings import (
     Curve,
@@ -50,8 +51,6 @@ from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 
 NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
-#: Probability that a frequency band of noise alone is rejected, per log.
-_BAND_REJECTION_CHANCE = 1e-3
 #: Standard deviation of a Gauss-Markov process whose Allan deviation has its peak at the floor by
 #: a bias instability of 1: the peak is at 1.89 correlation times.
 _MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
@@ -252,7 +251,7 @@ def drop_tone_bands(bands: BandEnergies) -> BandEnergies:
     while kept.sum() > len(kept) / 2:
         variance = bands.variance(bands.take(kept).fit()[0])
         chances = np.where(kept, chi2.sf(bands.energy / variance, bands.count), 1.0)
-        if chances.min() > _BAND_REJECTION_CHANCE / len(kept):
+        if chances.min() > MIN_FIT_PROBABILITY / len(kept):
             return bands.take(kept)
         kept[chances.argmin()] = False
     return bands

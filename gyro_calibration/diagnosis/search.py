@@ -26,6 +26,7 @@ from itertools import combinations
 import math
 from typing import Any
 
+from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     candidate_transforms,
@@ -94,9 +95,8 @@ _LEVEL = 0.05
 MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
 #: Number of stretches of all logs together.
 STRETCH_COUNT = 64
-#: Probability of the differences between logs below which a cause does not repeat, and variables
-#: whose causes are named only if they have the same size in all logs.
-_MIN_REPEAT_CHANCE, _REPEATING_VARIABLES = 1e-3, ('temperature', 'temperature_rate')
+#: Variables whose causes are named only if they have the same size in all logs.
+_REPEATING_VARIABLES = ('temperature', 'temperature_rate')
 
 Causes = tuple[Candidate, ...]
 #: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
@@ -574,7 +574,7 @@ def _is_repeatable(search: Search, causes: Causes, cause: Candidate) -> bool:
     alone = [replace(cause, log_index=run, values=()) for run in range(runs - 1)]
     more = 2.0 * (fit_causes(search.problem, [*causes, *alone]).log_likelihood
                   - fit_causes(search.problem, causes).log_likelihood)
-    return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
+    return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > MIN_FIT_PROBABILITY)
 
 
 # confirmation

@@ -133,8 +133,9 @@ def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: 
                 suspects.append(task)
             except Exception as error:  # of a cluster whose workers were killed by the task
                 yield task, WorkerLost(_describe_failure(error))
-        if suspects:
-            executor.shutdown(wait=True, cancel_futures=True)
+        if not suspects:
+            continue
+        executor.shutdown(wait=True, cancel_futures=True)
         for task in suspects:  # one by one, each with an executor of its own
             executor = create(1)
             try:
@@ -142,8 +143,7 @@ def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: 
             except BrokenExecutor as error:
                 yield task, WorkerLost(_describe_failure(error))
             executor.shutdown(wait=True, cancel_futures=True)
-        if suspects:
-            executor = create(workers)
+        executor = create(workers)
 
 
 def _describe_failure(error: Exception) -> str:

@@ -311,10 +311,9 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
             candidates += [(len(groups) * p_value(shows[of]), kind, name)
                            for name, of in groups.items()
                            if len({each[other] for each, one in zip(logs, of) if one}) > 1]
-        chance, owner, name = found = (max(type_chances), 'type', '') if len(
-            type_chances) > 1 else (1.0, '', '')
-        if chance >= summary.significance:
-            chance, owner, name = min([*candidates, found])
+        of_type = (max(type_chances), 'type', '') if len(type_chances) > 1 else (1.0, '', '')
+        chance, owner, name = (of_type if of_type[0] < summary.significance
+                               else min([*candidates, of_type]))
         if chance >= summary.significance:
             owner = name = ''
         units = {each['unit'] for each, one in zip(logs, shows) if one}

@@ -25,6 +25,7 @@ from functools import cache
 import re
 import struct
 
+from gyro_calibration.files import MAX_DEPTH
 from gyro_calibration.logs.log import Number
 import numpy as np
 
@@ -51,8 +52,8 @@ def z_axis_covariance(variance: float) -> tuple[float, ...]:
 NOT_REPORTED_COVARIANCE = (NOT_REPORTED, *8 * (0.0,))
 UNMEASURED_COVARIANCE = z_axis_covariance(UNMEASURED_VARIANCE)
 
-#: Largest number of fields, depth of nesting, and length of a definition in characters.
-_MAX_FIELDS, _MAX_DEPTH, _MAX_DEFINITION_LENGTH = 5000, 10, 100_000
+#: Largest number of fields, and length of a definition in characters.
+_MAX_FIELDS, _MAX_DEFINITION_LENGTH = 5000, 100_000
 DEFINITION_SEPARATOR = '=' * 80
 _STRUCT_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
                  'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
@@ -173,7 +174,7 @@ def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, pat
                 return
             yield '', code
             continue
-        if not code and (kind not in parts or depth == _MAX_DEPTH):
+        if not code and (kind not in parts or depth == MAX_DEPTH):
             raise MessageError(f'{kind} in it is not defined')
         for number in range(int(count or 1)):
             each = name if count is None else f'{name}.{number}'

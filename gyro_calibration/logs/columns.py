@@ -28,6 +28,8 @@ from typing import NamedTuple
 from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
 DEGREE = math.pi / 180.0
+#: What devices call one g, m/s².
+STANDARD_GRAVITY = 9.80665
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
@@ -67,7 +69,8 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
     'rate': ('reference_rate', _RATE_UNITS),
     'heading': ('reference_heading', _ANGLE_UNITS),
-    'acceleration': ('specific_force', {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}),
+    'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
+                                        'mg': 1e-3 * STANDARD_GRAVITY}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
     'moving': ('moving', {'1': 1.0}),
     'attitude': ('reference_heading', {'1': 1.0}),

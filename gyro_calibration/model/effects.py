@@ -78,7 +78,7 @@ class Parameter:
     # is fitted
     default: float | None = None
     bounds: tuple[float, float] = (-np.inf, np.inf)
-    begin_with: tuple[float, ...] = ()  # of a nonlinear one in the search of a diagnosis
+    begin_with: tuple[float, ...] = ()  # first values of a nonlinear one in a diagnosis
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ def _temperature_lag(channels: Channels, time_constant: float) -> Number:
 
 _THERMAL_CYCLE = ('heat and cool the resting gyro at two temperature rates, with abrupt changes '
                   'from heating to cooling')
-_FILTER_TIME = Parameter('filter_time', 's', 10.0, (1e-3, 1e4))
+_FILTER_TIME = Parameter('filter_time', 's', 10.0, (1e-3, 1e4), (0.3, 1.0, 3.0, 10.0))
 _THERMAL_HISTORY_EFFECTS = (
     Effect(
         'bias_temperature_rate',
@@ -404,7 +404,7 @@ _ENVIRONMENT_EFFECTS = (
         lambda channels, time_constant: (
             _at_each(channels, 0.0 if channels.lagged is None
                      else channels.lagged('vibration', time_constant)),),
-        (Parameter('time_constant', 's', 1.0, (1e-3, 1e4)),),
+        (Parameter('time_constant', 's', 1.0, (1e-3, 1e4), (1.0, 3.0)),),
         'rest with the motor on and off', along='vibration'),
     Effect(
         'supply_sensitivity', 'The bias changes in proportion to the supply voltage.',

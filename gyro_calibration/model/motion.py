@@ -176,8 +176,9 @@ def read_motion(path: str | Path) -> Motion:
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
         found = sorted(name for name in _COLUMN_UNITS if name in header)
-        is_log = [each[:14] for each in found] == ['reference_head', 'reference_rate']
-        if 'time_s' not in header or len(found) != 1 + is_log:
+        has_both = (len(found) == 2 and found[0].startswith('reference_heading')
+                    and found[1].startswith('reference_rate'))
+        if 'time_s' not in header or len(found) != 1 + has_both:
             given = excerpt(','.join(header)) or 'nothing'
             raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
                               'heading_deg, heading_rad, rate_dps, rate_rad_s')

@@ -24,13 +24,18 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.files import MAX_MAGNITUDE, read_bytes, suggest_nearest, to_printable
+from gyro_calibration.files import (
+    MAX_DEPTH,
+    MAX_MAGNITUDE,
+    read_bytes,
+    suggest_nearest,
+    to_printable,
+)
 import numpy as np
 import yaml
 
-#: Largest file, bytes: twice the size of a model with the covariance of 150 values; and largest
-#: depth of nested lists and names, which the stack of Python holds.
-MAX_SETTINGS_BYTES, _MAX_DEPTH = 1_000_000, 10
+#: Largest file, bytes: twice the size of a model with the covariance of 150 values.
+MAX_SETTINGS_BYTES = 1_000_000
 _INTEGER = re.compile('[-+]?[0-9]{1,400}')
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
@@ -144,8 +149,8 @@ class _Loader(yaml.BaseLoader):
             _refuse_node('an anchor or alias is not read; write out what it stands for', event)
         if event.tag is not None:
             _refuse_node('a tag is not read; leave it out', event)
-        if self._depth == _MAX_DEPTH:
-            _refuse_node(f'more than {_MAX_DEPTH} levels are nested', event)
+        if self._depth == MAX_DEPTH:
+            _refuse_node(f'more than {MAX_DEPTH} levels are nested', event)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1

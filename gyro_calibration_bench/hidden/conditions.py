@@ -155,10 +155,10 @@ class ImperfectReference:
 
 
 def hide_with_reference(names: Sequence[str], multiple: float, generator: np.random.Generator,
-                        reference: ImperfectReference, noise: str = 'mixed',
-                        duration: float = 600.0, sample_rate: float = 25.0) -> HiddenLog:
+                        reference: ImperfectReference, noise: str = 'mixed') -> HiddenLog:
     """Hide effects in a log whose reference errs; sizes are for who knows its noise."""
-    each, figures = session(generator, duration, sample_rate), draw_figures(noise, generator)
+    sample_rate = 25.0
+    each, figures = session(generator, 600.0, sample_rate), draw_figures(noise, generator)
     walk, step = reference.sizing_noise(figures.angle_random_walk, sample_rate)
     gyro = replace(draw_gyro(names, multiple, generator, [each],
                              replace(figures, angle_random_walk=walk), step), figures=figures)

@@ -455,14 +455,13 @@ def _add_sample_faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np
     return {name: column[kept] for name, column in columns.items()}, good, kept
 
 
-def _turning_rows(each: Session, count: int, generator: np.random.Generator,
-                  apart: int = 25) -> list[int]:
+def _turning_rows(each: Session, count: int, generator: np.random.Generator) -> list[int]:
     """Choose rows while it turns, not in the first or last seconds, and not close together."""
     margin = round(2.0 / each.interval)
     rows = generator.permutation(margin + np.flatnonzero(
         np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max()))
     chosen: list[int] = []
     for row in rows:
-        if len(chosen) < count and all(abs(row - other) > apart for other in chosen):
+        if len(chosen) < count and all(abs(row - other) > 25 for other in chosen):
             chosen.append(int(row))
     return chosen

@@ -85,14 +85,13 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
 
 
 def session_from_motion(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray,
-                        temperature: np.ndarray | None = None,
-                        supply: str = 'rich', force: str = 'rich') -> Session:
+                        temperature: np.ndarray | None = None) -> Session:
     """Make a recording of a given motion and temperature at evenly spaced times."""
     knots = np.interp(np.arange(time[0], time[-1] + KNOT_INTERVAL, KNOT_INTERVAL), time, rate)
     degc = np.full(len(time), 25.0) if temperature is None else lag(temperature, time[1] - time[0],
                                                                     5.0)
-    return assemble_session(generator, time - time[0], motion_from_knots(knots), degc, supply,
-                            force)
+    return assemble_session(generator, time - time[0], motion_from_knots(knots), degc, 'rich',
+                            'rich')
 
 
 def assemble_session(generator: np.random.Generator, time: np.ndarray, motion: Motion,

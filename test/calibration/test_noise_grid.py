@@ -102,7 +102,6 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
         true = (turned - BIAS * time) / SCALE
         seen = true + 7.0 * DEGREE * generator.standard_normal(len(true))
         found = fitted(time, np.zeros_like(time), turned, seen,
-                       typical_reference_noise=5.0 * DEGREE,
                        angle_random_walk=(0.02 * DEGREE,) * 2)
         errors.append(found.values[0] - SCALE)
         plain = np.polyfit(np.diff(seen), np.diff(turned), 1)[0]

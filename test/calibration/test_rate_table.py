@@ -42,10 +42,10 @@ from scipy.stats import binom, chi2
 RARE = 1e-4
 
 
-def dwells(rate, error, temperature=None, deviation=None, sweep=None):
+def dwells(rate, error, temperature=None, sweep=None):
     rate = np.asarray(rate, dtype=float)
-    return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan) if deviation is None
-                  else deviation, np.zeros(len(rate), int) if sweep is None else sweep,
+    return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan),
+                  np.zeros(len(rate), int) if sweep is None else sweep,
                   tuple(f'row {row + 1}' for row in range(len(rate))))
 
 

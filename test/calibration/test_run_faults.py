@@ -442,10 +442,3 @@ def test_the_verb_calibrates_by_turns(tmp_path, run):
     code, text, _ = run('self-calibrate', write_log(tmp_path / 'two.csv', *turned(-2)),
                         '--turns', 'nearest')
     assert code == 0 and '2 full turns clockwise' in text
-
-
-@pytest.mark.parametrize('words, said', [(['--turns', '3', '--profile', 'p.csv'],
-                                          'were both given'), (['--marking', '2'], 'omit it')])
-def test_the_verb_refuses_options_that_exclude_each_other(tmp_path, run, words, said):
-    code, _, error = run('self-calibrate', write_log(tmp_path / 'log.csv', *turned(1)), *words)
-    assert code == 2 and said in error

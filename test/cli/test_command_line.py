@@ -91,7 +91,11 @@ WRONG = {
     'emulate --protocol morse --model model.yaml': "protocol 'morse' is not known",
     'emulate --protocol fizoptika --model model.yaml': 'sensitivity is not set',
     'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
-    'reproduce newton': 'hong_park',
+    'reproduce newton': 'hong_park', 'fit log.csv --matrix': '--matrix needs --polynomial',
+    'self-calibrate log.csv --turns 3 --profile p.csv': 'were both given',
+    'self-calibrate log.csv --marking 2': 'omit it', 'export --to unity model.yaml': 'unity',
+    'export --to sdf model.yaml --span 0.001': 'is shorter than two samples',
+    'export --to sdf model.yaml --sample-rate 0': 'is out of range',
     'simulate --model model.yaml --motion waltz --out x.csv': 'waltz: there is no such motion',
     'compensate log.csv --model model.yaml --out x.csv --threshold -1': 'a number of 0 or more',
     **{f'simulate --model model.yaml --motion rest --out x.csv {option}': said

@@ -134,13 +134,3 @@ def test_the_verb_writes_a_file_and_lists_what_is_missing(run, tmp_path):
     code, text, _ = run('export', '--to', 'sdf', tmp_path / 'model.yaml', '--json')
     answer = json.loads(text)
     assert answer['text'] == out.read_text() and answer['figures']['time_offset'] == 0.013
-
-
-@pytest.mark.parametrize(('arguments', 'wanted'), [
-    (('--to', 'unity'), 'invalid choice'),
-    (('--to', 'sdf', '--span', '0.001'), 'is shorter than two samples'),
-    (('--to', 'sdf', '--sample-rate', '0'), 'is out of range')])
-def test_a_wrong_use_is_answered_in_a_sentence(run, tmp_path, arguments, wanted):
-    (tmp_path / 'model.yaml').write_text(GYRO)
-    code, _, error = run('export', *arguments, tmp_path / 'model.yaml')
-    assert code == 2 and wanted in error

@@ -51,10 +51,10 @@ from gyro_calibration.driver.protocols.protocol import (
     ROOM_TEMPERATURE,
     Sample,
     Settings,
-    STANDARD_GRAVITY,
     stateless,
     to_signed_count,
 )
+from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')

@@ -30,7 +30,6 @@ from gyro_calibration.logs.columns import COLUMNS
 
 OutputT = TypeVar('OutputT')
 
-STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
 ROOM_TEMPERATURE = 25.0  # degC; default of an emulated device
 #: Columns of the log format that hold the output, with their unit in rad/s, or in counts.
 GYRO_COLUMNS = {name: factor for name, (quantity, factor) in COLUMNS.items()

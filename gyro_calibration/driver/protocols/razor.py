@@ -41,9 +41,9 @@ from gyro_calibration.driver.protocols.protocol import (
     Reading,
     Sample,
     Settings,
-    STANDARD_GRAVITY,
     stateless,
 )
+from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
 # default output of the firmware

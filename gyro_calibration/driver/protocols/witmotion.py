@@ -39,10 +39,10 @@ from gyro_calibration.driver.protocols.protocol import (
     ROOM_TEMPERATURE,
     Sample,
     Settings,
-    STANDARD_GRAVITY,
     stateless,
     to_signed_count,
 )
+from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _FORCE_PER_COUNT = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
 _ACCELERATION, _RATE = 0x51, 0x52
