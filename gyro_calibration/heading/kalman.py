@@ -25,11 +25,9 @@ heading also the earlier error of the heading.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-import operator
-from typing import Any
 
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import averaged_process_moments, BIAS_AVERAGING_TIME, Noise
@@ -58,21 +56,25 @@ class RateIntegral:
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
         """Return the integral over both, one after the other."""
-        return self._combine(other, operator.add)
+        return RateIntegral(
+            self.duration + other.duration, self.angle + other.angle,
+            self.sensitivity + other.sensitivity, self.lost_variance + other.lost_variance,
+            self.extra_noise_variance + other.extra_noise_variance, 0.0,
+            self.block_count + other.block_count, self.block_square_sum + other.block_square_sum)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return the rest of this integral after another with which it begins."""
-        return self._combine(other, operator.sub)
-
-    def _combine(self, other: RateIntegral,
-                 combined: Callable[[Any, Any], Any]) -> RateIntegral:
         return RateIntegral(
-            combined(self.duration, other.duration), combined(self.angle, other.angle),
-            combined(self.sensitivity, other.sensitivity),
-            combined(self.lost_variance, other.lost_variance),
-            combined(self.extra_noise_variance, other.extra_noise_variance), 0.0,
-            combined(self.block_count, other.block_count),
-            combined(self.block_square_sum, other.block_square_sum))
+            self.duration - other.duration, self.angle - other.angle,
+            self.sensitivity - other.sensitivity, self.lost_variance - other.lost_variance,
+            self.extra_noise_variance - other.extra_noise_variance, 0.0,
+            self.block_count - other.block_count, self.block_square_sum - other.block_square_sum)
+
+    def with_sensitivity(self, sensitivity: Array) -> RateIntegral:
+        """Return the integral with another sensitivity, (m,)."""
+        other = copy(self)
+        other.sensitivity = sensitivity
+        return other
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class HeadingState:
             self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved,
             len(rate_integral.sensitivity))
         seen, grown = seen.copy(), grown.copy()
-        seen[self.first_value_index:] = -rate_integral.sensitivity
+        seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
         grown[HEADING_INDEX, HEADING_INDEX] += (
             rate_integral.lost_variance + rate_integral.extra_noise_variance)
         if not rate_integral.is_unobserved:
@@ -162,6 +164,15 @@ class HeadingState:
         return (float(step.observation @ self.mean),
                 float(step.observation @ self.covariance @ step.observation
                       + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
+
+    def expected_rest_angles(self, durations: Array, lost: Array, sensitivities: Array
+                             ) -> tuple[Array, Array]:
+        """Return the same of k integrals, by values as in `heading_variances`, (k,) each."""
+        seen, variances = _integrated_wander(self.noise, np.round(durations, 6))
+        rows = np.concatenate([seen, -sensitivities], axis=1)
+        return rows @ self.mean, (
+            ((rows @ self.covariance) * rows).sum(axis=1) + variances + lost
+            + self.noise.angle_random_walk ** 2 * durations)
 
     @cached_property
     def wander_rate(self) -> tuple[float, float]:
@@ -245,17 +256,22 @@ def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, varianc
     return HeadingState(noise, mean, whole)
 
 
-def heading_variances(states: list[HeadingState], rate_integrals: list[RateIntegral]) -> Array:
-    """Return the variance of the heading after each turn from its state, rad², shape (k,)."""
-    figures = np.array([(turn.duration, turn.lost_variance + turn.extra_noise_variance
-                         + state.noise.angle_random_walk ** 2 * turn.duration)
-                        for state, turn in zip(states, rate_integrals)])
+def heading_variances(states: list[HeadingState], durations: Array, lost: Array,
+                      sensitivities: Array) -> Array:
+    """
+    Return the variance of the heading after each turn from its state, rad², shape (k,).
+
+    Of the integrals of rates, given are durations, s, and variances of what was lost and of its
+    noise, rad², shape (k,), and the sensitivities, (k, m).
+
+    """
     # flicker and random walk have the same parameters in all states
-    seen, variances = _integrated_wander(states[0].noise, np.round(figures[:, 0], 6))
-    rows = np.concatenate([-seen, [turn.sensitivity for turn in rate_integrals]], axis=1)
+    seen, variances = _integrated_wander(states[0].noise, np.round(durations, 6))
+    white = np.array([state.noise.angle_random_walk for state in states]) ** 2 * durations
+    rows = np.concatenate([-seen, sensitivities], axis=1)
     rows[:, HEADING_INDEX] += 1.0
     spread = np.matmul([state.covariance for state in states], rows[:, :, None])[:, :, 0]
-    return np.asarray((spread * rows).sum(axis=1) + variances + figures[:, 1])
+    return np.asarray((spread * rows).sum(axis=1) + variances + (lost + white))
 
 
 def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:

@@ -33,9 +33,10 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     TrackStep,
 )
-from gyro_calibration.logs.log import Array, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, Mask, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is tested, s.
@@ -93,9 +94,14 @@ def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
-    """Return the value that chi squared exceeds with a probability."""
+def _chi_squared_quantile(degrees_of_freedom: float, chance: float) -> float:
     return float(chdtri(degrees_of_freedom, chance))
+
+
+def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
+    """Return the values that chi squared exceeds with a probability, shape (k,)."""
+    return np.array([_chi_squared_quantile(max(each, 1.0), chance)
+                     for each in degrees_of_freedom.tolist()])
 
 
 #: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
@@ -109,11 +115,14 @@ class EnergyDetector:
         """Begin with an empty window."""
         # ratio of the noise of the samples to that of the model, by the quietest windows
         self.noise_factor = 1.0
-        self._blocks = deque[Block]()
-        self._energies = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
+        self._blocks: Array = np.zeros((6, 0))  # of the window: rows of `Block`, sums²/counts
+        # of the last windows, energies and squared differences over those of the noise
+        self._ratios: Array = np.zeros((2, 0))
+        self._since_last_window = 0.0
+        # of the next blocks: quiet, noise factor, and limit of the samples after it, rad/s
+        self._results = deque[tuple[bool | None, float, float]]()
         self.configure(noise, false_alarms)
-        self._since_last_window, self._interval = 0.0, BLOCK_DURATION
-        self._sudden_limit: float | None = None
+        self.sudden_limit = math.inf  # largest deviation of a single sample at rest, rad/s
 
     def configure(self, noise: Noise, false_alarms: float) -> None:
         """Go on with other settings."""
@@ -124,66 +133,94 @@ class EnergyDetector:
 
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
-        self._blocks.clear()
+        self._blocks = np.zeros((6, 0))
+        self._results.clear()
 
     def add(self, block: Block) -> bool | None:
         """Add a block; tell whether the window contains only noise; None until it is full."""
-        blocks = self._blocks
-        blocks.append(block)
-        duration, count = 0.0, 0
-        for each in blocks:
-            duration += each.duration
-            count += each.count
-        while (duration - blocks[0].duration >= WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
-               and count - blocks[0].count >= _MIN_WINDOW_SAMPLES):
-            duration -= blocks[0].duration
-            count -= blocks.popleft().count
-        total = squares = differences = means = 0.0
-        for each in blocks:
-            total += each.rate_sum
-            squares += each.square_sum
-            differences += each.difference_square_sum
-            means += each.rate_sum * each.rate_sum / each.count
-        if (duration < WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
-                or count < _MIN_WINDOW_SAMPLES):
-            return None
-        self._interval, self._sudden_limit = duration / count, None
-        model_variance = self._noise.rate_variance(self._interval)
-        energy = (squares - total * total / count) / (count - 1)
-        self._update_noise_factor(block.duration, count, energy / model_variance,
-                                  0.5 * differences / count / model_variance)
-        model_variance *= self.noise_factor ** 2
-        if energy >= model_variance * _chi_squared_quantile(
-                count - 1, self._false_alarm_chance) / (count - 1):
-            return False
+        if not self._results:
+            self.look_ahead(np.array([[block.duration, block.count, block.rate_sum,
+                                       block.square_sum, block.difference_square_sum]]).T)
+        quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
+        return quiet
+
+    @property
+    def has_results(self) -> bool:
+        """Tell whether results of the next blocks are known."""
+        return bool(self._results)
+
+    def quiet_ahead(self, number: int) -> tuple[bool | None, float]:
+        """Return whether a block ahead is quiet, and the limit of its samples."""
+        limit = self._results[number - 1][2] if number else self.sudden_limit
+        return self._results[number][0], limit
+
+    def skip(self, count: int) -> None:
+        """Add blocks that were looked at, without their results."""
+        for _ in range(count):
+            _, self.noise_factor, self.sudden_limit = self._results.popleft()
+
+    def look_ahead(self, blocks: Array) -> None:
+        """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
+        kept = self._blocks.shape[1]
+        sums = np.hstack([self._blocks, np.vstack([blocks, blocks[2] ** 2 / blocks[1]])])
+        until = np.cumsum(np.pad(sums[:2], ((0, 0), (1, 0))), axis=1)
+        end = np.arange(kept, sums.shape[1]) + 1
+        least = WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE, _MIN_WINDOW_SAMPLES
+        begin = np.min([np.searchsorted(each, each[end] - shortest, side='right') - 1
+                        for each, shortest in zip(until, least)], axis=0)
+        full = begin >= 0
+        begin = np.maximum(begin, 0)
+        duration, count, total, squares, differences, means = np.add.reduceat(
+            np.pad(sums, ((0, 0), (0, 1))), np.stack([begin, end], axis=1).ravel(), axis=1)[:, ::2]
+        interval, freedom = duration / count, count - 1.0
+        energy = (squares - total * total / count) / np.maximum(freedom, 1.0)
+        variance = self._noise.rate_variance(1.0) / interval
+        factor = self._noise_factors(
+            blocks[0], freedom, np.array([energy, 0.5 * differences / count]) / variance, full)
+        variance *= factor ** 2
         # motion is slower than the samples, so that means over blocks show it far better
-        freedom = len(blocks) - 1
-        return bool(freedom < 2 or means - total * total / count
-                    < model_variance * _chi_squared_quantile(freedom, self._false_alarm_chance))
+        quiet = (energy * freedom < variance * _chi_squared_quantiles(
+            freedom, self._false_alarm_chance)) & (
+            (end - begin < 3) | (means - total * total / count < variance
+                                 * _chi_squared_quantiles(end - begin - 1.0,
+                                                          self._false_alarm_chance)))
+        limits = np.where(full, self._sample_limits(interval, factor), self.sudden_limit)
+        self._blocks = sums[:, begin[-1]:]
+        self._results.extend((each if known else None, *others) for known, each, *others in zip(
+            full.tolist(), quiet.tolist(), factor.tolist(), limits.tolist()))
 
-    def _update_noise_factor(self, duration: float, count: int, energy: float,
-                             differences: float) -> None:
-        """Update the noise of the samples by the quietest tenth of the windows."""
+    def _noise_factors(self, durations: Array, freedom: Array, ratios: Array,
+                       full: Mask) -> Array:
+        """Return the noise of the samples by the quietest tenth of the windows, shape (k,)."""
         # Vibration in a straight drive is not noise; it contributes less to differences of
-        # neighbours.
-        self._since_last_window += duration
-        if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
-            return
-        self._since_last_window = 0.0
-        self._energies.append((energy, differences))
-        if len(self._energies) >= _MIN_WINDOWS:
-            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._energies))
-            quietest *= (count - 1) / _chi_squared_quantile(count - 1, 0.9)
-            self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
+        # neighbours: the ratios, shape (2, k), are those of energies and of differences.
+        known, kept = np.flatnonzero(full), self._ratios.shape[1]
+        ends = block_ends(durations[known], WINDOW_DURATION, self._since_last_window)
+        self._since_last_window = float(
+            durations[known[ends[-1] if ends else 0:]].sum()
+            + (0.0 if ends else self._since_last_window))
+        last = known[np.array(ends, int) - 1]
+        ratios = np.hstack([self._ratios, ratios[:, last]])
+        self._ratios = ratios[:, -_MAX_WINDOWS:]
+        if not ends:
+            return np.full(len(full), self.noise_factor)
+        windows = np.lib.stride_tricks.sliding_window_view(
+            np.pad(ratios, ((0, 0), (_MAX_WINDOWS - kept, 0)), constant_values=math.inf),
+            _MAX_WINDOWS, axis=1)[:, 1:]
+        number = np.minimum(kept + 1 + np.arange(len(last)), _MAX_WINDOWS)
+        quietest = np.sort(windows)[:, np.arange(len(last)), number // 10].min(axis=0)
+        quietest *= freedom[last] / _chi_squared_quantiles(freedom[last], 0.9)
+        found = np.where(number < _MIN_WINDOWS, self.noise_factor,
+                         np.sqrt(np.clip(quietest, 1.0, _MAX_NOISE_FACTOR ** 2)))
+        return np.append(self.noise_factor, found)[
+            np.searchsorted(last, np.arange(len(full)), side='right')]
 
-    def sudden_limit(self) -> float:
-        """Return the largest deviation of a single sample at rest, rad/s."""
+    def _sample_limits(self, intervals: Array, factor: Array) -> Array:
+        """Return the largest deviation of a single sample at rest, rad/s, shape (k,)."""
         # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
-        if self._sudden_limit is None:
-            limit = mean_threshold_sigmas(round(self._interval, 9), self._sample_false_alarms)
-            self._sudden_limit = limit * self.noise_factor * math.sqrt(
-                self._noise.rate_variance(self._interval))
-        return self._sudden_limit
+        sigmas = [mean_threshold_sigmas(round(each, 9), self._sample_false_alarms)
+                  for each in intervals.tolist()]
+        return np.asarray(sigmas * factor * np.sqrt(self._noise.rate_variance(1.0) / intervals))
 
 
 @dataclass(frozen=True)
@@ -304,8 +341,9 @@ class Epoch:
     is_resting: bool
     heading: float
     pending: float
-    #: Last samples of its blocks, and integrals of the rates since the state.
-    open_integrals: list[tuple[int, RateIntegral]]
+    #: Last samples of its blocks, and integrals of the rates since the state: durations, s, lost
+    #: variances, rad², and sensitivities, shape (k, m).
+    open_integrals: list[tuple[NDArray[np.intp], Array, Array, Array]]
     end_index: int = -1  # after its last sample
 
 
@@ -338,13 +376,16 @@ class EvenSamples:
         resting = (moving if self.still is None
                    else self._integrate_sensitivity(self.rest_sensitivity))
         self.sensitivity_integrals = moving, resting  # shape (k, m) each
-        # by block: duration, integral, remaining share of a pending correction, and sums of the
-        # rates, their squares, and the squares of their steps
-        summed = (self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)
-        sums = [self._sum_by_blocks(values).tolist() for values in summed]
+        # by block: duration, count, sums of the rates, their squares and the squares of their
+        # steps; integrals, and remaining shares of a pending correction
+        self.block_sums = np.array([self._sum_by_blocks(values) for values in (
+            self.intervals, np.ones(count), self.rate, self.rate * self.rate, steps * steps)])
+        self.block_angles = self._sum_by_blocks(self.angles)
+        self.block_squares = self.block_angles ** 2 / np.maximum(
+            self.block_sums[0], MIN_SAMPLE_INTERVAL)
+        self.block_ends = np.array(self.block_stops) - 1
         self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
-        sums.insert(2, np.multiply.reduceat(self._pending_retention, self.block_starts).tolist())
-        self.block_sums = list(zip(*sums))
+        self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
 
     def _integrate_sensitivity(self, rows: Array) -> Array:
@@ -403,10 +444,12 @@ class EvenSamples:
 
     def _add_variances(self, epochs: list[Epoch]) -> None:
         """Add the variance of the heading in epochs of motion."""
-        opens = [(epoch.state, turn) for epoch in epochs for _, turn in epoch.open_integrals]
-        known = heading_variances(*map(list, zip(*opens)))
-        white = [state.noise.angle_random_walk ** 2 for state, _ in opens]
-        places = np.array([place for epoch in epochs for place, _ in epoch.open_integrals])
+        opens = [each for epoch in epochs for each in epoch.open_integrals]
+        states = [epoch.state for epoch in epochs for places, *_ in epoch.open_integrals
+                  for _ in places]
+        places, *turns = map(np.concatenate, zip(*opens))
+        known = heading_variances(states, *turns)
+        white = [state.noise.angle_random_walk ** 2 for state in states]
         until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1
         rows = np.concatenate(
             [np.arange(max(epoch.start_index, 0), epoch.end_index) for epoch in epochs])
