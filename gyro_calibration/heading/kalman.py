@@ -26,7 +26,7 @@ heading also the earlier error of the heading.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 from gyro_calibration.logs.log import Array
@@ -38,6 +38,10 @@ from scipy.linalg import pinvh
 HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = 0, 1, 2
 
 
+#: Possible variances of the rotation in a rest, rad², and their probabilities: it is none.
+STANDSTILL = np.array([[0.0], [1.0]])
+
+
 @dataclass(slots=True)
 class RateIntegral:
     """Integral of the rates over some time."""
@@ -47,7 +51,9 @@ class RateIntegral:
     sensitivity: Array  # integral of that of the rate to the calibration, shape (m,)
     lost_variance: float = 0.0  # of rotation that was not measured, rad²
     extra_noise_variance: float = 0.0  # additional variance of the noise by lost samples, rad²
-    wander_variance: float = 0.0  # of the rotation in a rest that may be a straight drive, rad²
+    #: Of a rest that may be a straight drive: possible variances of its rotation, rad², and their
+    #: probabilities, shape (2, k).
+    wander: Array = field(default_factory=lambda: STANDSTILL)
     block_count: int = 0
     block_square_sum: float = 0.0  # of the angles of blocks, over their durations, rad²/s
     #: There were no rates: the heading is constant, and errors of rates do not affect it; not to
@@ -59,7 +65,7 @@ class RateIntegral:
         return RateIntegral(
             self.duration + other.duration, self.angle + other.angle,
             self.sensitivity + other.sensitivity, self.lost_variance + other.lost_variance,
-            self.extra_noise_variance + other.extra_noise_variance, 0.0,
+            self.extra_noise_variance + other.extra_noise_variance, STANDSTILL,
             self.block_count + other.block_count, self.block_square_sum + other.block_square_sum)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
@@ -67,7 +73,7 @@ class RateIntegral:
         return RateIntegral(
             self.duration - other.duration, self.angle - other.angle,
             self.sensitivity - other.sensitivity, self.lost_variance - other.lost_variance,
-            self.extra_noise_variance - other.extra_noise_variance, 0.0,
+            self.extra_noise_variance - other.extra_noise_variance, STANDSTILL,
             self.block_count - other.block_count, self.block_square_sum - other.block_square_sum)
 
     def with_sensitivity(self, sensitivity: Array) -> RateIntegral:
@@ -140,23 +146,29 @@ class HeadingState:
         """Return the states before and after a rest given its measurement, and a covariance."""
         # The covariance is that of the state before with that after, (n, n). The measured mean
         # has the wander of the bias meanwhile in it, with which the bias at the end correlates. A
-        # `wander_variance` is in the measurement and in the heading, which is that at the end.
+        # rotation by `wander` is in the measurement and in the heading, which is that at the end.
+        # Mean and covariance are those of the mixture: the gain of each variance is a sum of two
+        # directions, that of the state and the heading.
         step = self.transition(rate_integral)
-        grown, wander = step.process_noise, rate_integral.wander_variance
+        grown, (wander, chances) = step.process_noise, rate_integral.wander
         before = self.covariance @ step.observation
         variance = float(step.observation @ before + grown[HEADING_INDEX, HEADING_INDEX]) + wander
-        after = step.retention * before - grown[HEADING_INDEX]
-        after[HEADING_INDEX] = before[HEADING_INDEX] + wander
+        innovation = rate_integral.angle - float(step.observation @ self.mean)
+        after = np.zeros((2, len(before)))
+        after[0] = step.retention * before - grown[HEADING_INDEX]
+        after[0, HEADING_INDEX], after[1, HEADING_INDEX] = before[HEADING_INDEX], 1.0
         grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
-        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance + wander
-        scaled = (rate_integral.angle - float(step.observation @ self.mean)) / variance
+        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance + chances @ wander
+        gains = np.array([np.ones(len(wander)), wander]) / variance
+        gain = gains @ chances
+        change = ((gains * (chances * (innovation ** 2 - variance))) @ gains.T
+                  - innovation ** 2 * gain[:, None] * gain)
         kept = self.covariance * step.retention
-        return (HeadingState(self.noise, self.mean + before * scaled,
-                             self.covariance - before[:, None] * before / variance),
-                HeadingState(self.noise, step.retention * self.mean + after * scaled,
-                             step.retention[:, None] * kept + grown
-                             - after[:, None] * after / variance),
-                kept - before[:, None] * after / variance)
+        return (HeadingState(self.noise, self.mean + before * (gain[0] * innovation),
+                             self.covariance + before[:, None] * before * change[0, 0]),
+                HeadingState(self.noise, step.retention * self.mean + gain * innovation @ after,
+                             step.retention[:, None] * kept + grown + after.T @ change @ after),
+                kept + before[:, None] * (change[0] @ after))
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""

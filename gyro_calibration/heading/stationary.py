@@ -49,22 +49,24 @@ _MIN_WINDOW_SAMPLES = 8
 #: the model.
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
-#: to it, correlations of neighbours with time constants of up to the longest lag, and the
-#: variances of blocks about these means: first those of a rest, then those of straight drives.
+#: to it, correlations of neighbours, and variances of blocks about these means: first those of a
+#: rest, then those of straight drives, up to bends that keep their rate for many minutes.
 #: With variances beyond `_MAX_SCATTER_RATIO` times that of white noise or of the bias, most means
 #: over 1 s are beyond the limit of `mean_threshold_sigmas`, and most windows beyond that of the
 #: energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
-                        for shared in (0.0, *np.exp(-1.0 / np.array(MEAN_LAGS[::2])))
+                        for shared in (0.0, *np.exp(-1.0 / np.array([4.0, 64.0, 1024.0])))
                         for fast in (0.0, 1.0, 4.0))]).T
 _MAX_SCATTER_RATIO = 64.0
-#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1,
-#: by which each correlation adds the same to the mean ratio of a long sum; largest total.
-_PRIOR_COUNTS = (1.0 - SCATTER_CORRELATIONS) / (1.0 + SCATTER_CORRELATIONS)
-_PRIOR_COUNTS /= _PRIOR_COUNTS[1:] @ (SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO)
+#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1, all
+#: of which are as probable; largest total.
+_PRIOR_COUNTS = np.full(
+    len(SCATTER_RATIOS), 1.0 / np.sum(SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO))
 _PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
+#: Rates at which a straight way ends, 1/s, on average after the longest lag; a rest may last.
+ENDING_RATES = (SCATTER_RATIOS > 0.0) / MEAN_LAGS[-1]
 
 
 @dataclass(slots=True)
@@ -261,20 +263,23 @@ class RestScatter:
         chances = self.counts * np.exp(possible - possible.max())
         return np.asarray(chances / chances.sum())
 
-    def mean_and_median(self, likelihood: Array, count: float) -> tuple[float, float]:
-        """Return the mean ratio of variances of sums of `count` means, and the median ratio."""
-        chances, shared = self.probabilities(likelihood), SCATTER_CORRELATIONS
-        # of a process of first order, per mean
-        sums = SCATTER_RATIOS / (1.0 - shared) ** 2 * (
-            1.0 - shared ** 2 - 2.0 * shared * (1.0 - shared ** count) / count)
-        return (float(chances @ sums),
-                float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)]))
+    def median(self, likelihood: Array) -> float:
+        """Return the median ratio."""
+        chances = self.probabilities(likelihood)
+        return float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)])
 
     def learn(self, last: Snapshot) -> None:
         """Add a detected rest that has ended."""
         kept = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
         self._learned = kept * self._learned + self.probabilities(last.log_likelihood)
         self._retention *= kept
+
+
+def sum_ratios(count: float) -> Array:
+    """Return the ratios of variances of sums of `count` means, per mean, shape (k,)."""
+    shared = SCATTER_CORRELATIONS  # of processes of first order
+    return np.asarray(SCATTER_RATIOS / (1.0 - shared) ** 2 * (
+        1.0 - shared ** 2 - 2.0 * shared * (1.0 - shared ** count) / count))
 
 
 def update_scatter(state: Array, rate: float, noise: float, white: float) -> tuple[Array, Array]:

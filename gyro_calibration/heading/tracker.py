@@ -41,6 +41,7 @@ from gyro_calibration.heading.kalman import (
     HeadingState,
     initial_state,
     RateIntegral,
+    STANDSTILL,
     TrackStep,
     WALK_INDEX,
 )
@@ -48,6 +49,7 @@ from gyro_calibration.heading.stationary import (
     Block,
     BLOCK_DURATION,
     BLOCK_RATIOS,
+    ENDING_RATES,
     EnergyDetector,
     Epoch,
     EvenSamples,
@@ -58,6 +60,7 @@ from gyro_calibration.heading.stationary import (
     SETTLING_TIME,
     SlowTurn,
     Snapshot,
+    sum_ratios,
     update_scatter,
     WINDOW_DURATION,
 )
@@ -824,7 +827,7 @@ class HeadingTracker:
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._rest_scatter.begin_rest(
             (self.bias[1] / self._state.noise.angle_random_walk) ** 2)
-        _, median = self._rest_scatter.mean_and_median(np.zeros(1), 1.0)
+        median = self._rest_scatter.median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
         self._adopt_state()
@@ -973,14 +976,16 @@ class HeadingTracker:
             * turn.duration + lost)
         likelihood += before.log_likelihood - 0.5 * (
             (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
-            - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS))
+            - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS)) - ENDING_RATES * turn.duration
         start, part, count, last = self._state, turn, len(self.steps), before.step
         if (last is not None and last.rate_integral.duration < MEAN_LAGS[-1] - TIME_TOLERANCE
-                and self._wheels_stand == (last.rate_integral.wander_variance == 0.0)):
+                and self._wheels_stand == (last.rate_integral.wander is STANDSTILL)):
             start, part = replace(last.state_before, noise=noise), last.rate_integral + turn
             count = before.step_count - 1
-        ratio, median = self._rest_scatter.mean_and_median(likelihood, max(part.duration, 1.0))
-        part.wander_variance = 0.0 if self._wheels_stand else ratio * white * part.duration
+        if not self._wheels_stand:
+            part.wander = np.array([sum_ratios(max(part.duration, 1.0)) * (white * part.duration),
+                                    self._rest_scatter.probabilities(likelihood)])
+        median = self._rest_scatter.median(likelihood)
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
                          - remaining.duration)
         self._state = start.advance_at_rest(part)
