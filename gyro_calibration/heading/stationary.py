@@ -96,13 +96,13 @@ def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def _chi_squared_quantile(degrees_of_freedom: float, chance: float) -> float:
+def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     return float(chdtri(degrees_of_freedom, chance))
 
 
 def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
     """Return the values that chi squared exceeds with a probability, shape (k,)."""
-    return np.array([_chi_squared_quantile(max(each, 1.0), chance)
+    return np.array([_chi_squared_quantile(max(round(each), 1), chance)
                      for each in degrees_of_freedom.tolist()])
 
 
@@ -117,14 +117,13 @@ class EnergyDetector:
         """Begin with an empty window."""
         # ratio of the noise of the samples to that of the model, by the quietest windows
         self.noise_factor = 1.0
-        self._blocks: Array = np.zeros((6, 0))  # of the window: rows of `Block`, sums²/counts
-        # of the last windows, energies and squared differences over those of the noise
-        self._ratios: Array = np.zeros((2, 0))
-        self._since_last_window = 0.0
+        self._blocks = deque[Block]()
+        self._ratios = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
+        self._since_last_window, self._interval = 0.0, BLOCK_DURATION
         # of the next blocks: quiet, noise factor, and limit of the samples after it, rad/s
         self._results = deque[tuple[bool | None, float, float]]()
+        self._sudden_limit: float | None = None
         self.configure(noise, false_alarms)
-        self.sudden_limit = math.inf  # largest deviation of a single sample at rest, rad/s
 
     def configure(self, noise: Noise, false_alarms: float) -> None:
         """Go on with other settings."""
@@ -135,16 +134,71 @@ class EnergyDetector:
 
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
-        self._blocks = np.zeros((6, 0))
+        self._blocks.clear()
         self._results.clear()
 
     def add(self, block: Block) -> bool | None:
         """Add a block; tell whether the window contains only noise; None until it is full."""
-        if not self._results:
-            self.look_ahead(np.array([[block.duration, block.count, block.rate_sum,
-                                       block.square_sum, block.difference_square_sum]]).T)
-        quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
-        return quiet
+        if self._results:
+            quiet, self.noise_factor, self._sudden_limit = self._results.popleft()
+            return quiet
+        blocks = self._blocks
+        blocks.append(block)
+        duration, count = 0.0, 0
+        for each in blocks:
+            duration += each.duration
+            count += each.count
+        while (duration - blocks[0].duration >= WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
+               and count - blocks[0].count >= _MIN_WINDOW_SAMPLES):
+            duration -= blocks[0].duration
+            count -= blocks.popleft().count
+        total = squares = differences = means = 0.0
+        for each in blocks:
+            total += each.rate_sum
+            squares += each.square_sum
+            differences += each.difference_square_sum
+            means += each.rate_sum * each.rate_sum / each.count
+        if (duration < WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
+                or count < _MIN_WINDOW_SAMPLES):
+            return None
+        self._interval, self._sudden_limit = duration / count, None
+        model_variance = self._noise.rate_variance(self._interval)
+        energy = (squares - total * total / count) / (count - 1)
+        self._update_noise_factor(block.duration, count, energy / model_variance,
+                                  0.5 * differences / count / model_variance)
+        model_variance *= self.noise_factor ** 2
+        if energy >= model_variance * _chi_squared_quantile(
+                count - 1, self._false_alarm_chance) / (count - 1):
+            return False
+        # motion is slower than the samples, so that means over blocks show it far better
+        freedom = len(blocks) - 1
+        return bool(freedom < 2 or means - total * total / count
+                    < model_variance * _chi_squared_quantile(freedom, self._false_alarm_chance))
+
+    def _update_noise_factor(self, duration: float, count: int, energy: float,
+                             differences: float) -> None:
+        """Update the noise of the samples by the quietest tenth of the windows."""
+        # Vibration in a straight drive is not noise; it contributes less to differences of
+        # neighbours.
+        self._since_last_window += duration
+        if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
+            return
+        self._since_last_window = 0.0
+        self._ratios.append((energy, differences))
+        if len(self._ratios) >= _MIN_WINDOWS:
+            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
+            quietest *= (count - 1) / _chi_squared_quantile(count - 1, 0.9)
+            self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
+
+    @property
+    def sudden_limit(self) -> float:
+        """Return the largest deviation of a single sample at rest, rad/s."""
+        # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
+        if self._sudden_limit is None:
+            limit = mean_threshold_sigmas(round(self._interval, 9), self._sample_false_alarms)
+            self._sudden_limit = limit * self.noise_factor * math.sqrt(
+                self._noise.rate_variance(self._interval))
+        return self._sudden_limit
 
     @property
     def has_results(self) -> bool:
@@ -159,12 +213,15 @@ class EnergyDetector:
     def skip(self, count: int) -> None:
         """Add blocks that were looked at, without their results."""
         for _ in range(count):
-            _, self.noise_factor, self.sudden_limit = self._results.popleft()
+            _, self.noise_factor, self._sudden_limit = self._results.popleft()
 
     def look_ahead(self, blocks: Array) -> None:
         """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
-        kept = self._blocks.shape[1]
-        sums = np.hstack([self._blocks, np.vstack([blocks, blocks[2] ** 2 / blocks[1]])])
+        # as `add` does one by one
+        before = np.array([(each.duration, each.count, each.rate_sum, each.square_sum,
+                            each.difference_square_sum) for each in self._blocks])
+        sums, kept = np.hstack([before.reshape(-1, 5).T, blocks]), len(before)
+        sums = np.vstack([sums, sums[2] ** 2 / sums[1]])
         until = np.cumsum(np.pad(sums[:2], ((0, 0), (1, 0))), axis=1)
         end = np.arange(kept, sums.shape[1]) + 1
         least = WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE, _MIN_WINDOW_SAMPLES
@@ -187,7 +244,9 @@ class EnergyDetector:
                                  * _chi_squared_quantiles(end - begin - 1.0,
                                                           self._false_alarm_chance)))
         limits = np.where(full, self._sample_limits(interval, factor), self.sudden_limit)
-        self._blocks = sums[:, begin[-1]:]
+        self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
+                             in sums[:5, begin[-1]:].T.tolist())
+        self._interval = float(interval[-1]) if full[-1] else self._interval
         self._results.extend((each if known else None, *others) for known, each, *others in zip(
             full.tolist(), quiet.tolist(), factor.tolist(), limits.tolist()))
 
@@ -196,14 +255,14 @@ class EnergyDetector:
         """Return the noise of the samples by the quietest tenth of the windows, shape (k,)."""
         # Vibration in a straight drive is not noise; it contributes less to differences of
         # neighbours: the ratios, shape (2, k), are those of energies and of differences.
-        known, kept = np.flatnonzero(full), self._ratios.shape[1]
+        known, kept = np.flatnonzero(full), len(self._ratios)
         ends = block_ends(durations[known], WINDOW_DURATION, self._since_last_window)
         self._since_last_window = float(
             durations[known[ends[-1] if ends else 0:]].sum()
             + (0.0 if ends else self._since_last_window))
         last = known[np.array(ends, int) - 1]
-        ratios = np.hstack([self._ratios, ratios[:, last]])
-        self._ratios = ratios[:, -_MAX_WINDOWS:]
+        ratios = np.hstack([np.array(self._ratios).reshape(-1, 2).T, ratios[:, last]])
+        self._ratios.extend(zip(*ratios[:, kept:].tolist()))
         if not ends:
             return np.full(len(full), self.noise_factor)
         windows = np.lib.stride_tricks.sliding_window_view(
@@ -263,16 +322,16 @@ class RestScatter:
         chances = self.counts * np.exp(possible - possible.max())
         return np.asarray(chances / chances.sum())
 
-    def median(self, likelihood: Array) -> float:
-        """Return the median ratio."""
-        chances = self.probabilities(likelihood)
-        return float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)])
-
     def learn(self, last: Snapshot) -> None:
         """Add a detected rest that has ended."""
         kept = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
         self._learned = kept * self._learned + self.probabilities(last.log_likelihood)
         self._retention *= kept
+
+
+def median_ratio(chances: Array) -> float:
+    """Return the median of `SCATTER_RATIOS`, which have these probabilities, shape (k,)."""
+    return float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)])
 
 
 def sum_ratios(count: float) -> Array:

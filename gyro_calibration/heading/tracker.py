@@ -55,6 +55,7 @@ from gyro_calibration.heading.stationary import (
     EvenSamples,
     MEAN_LAGS,
     mean_threshold_sigmas,
+    median_ratio,
     RestScatter,
     Samples,
     SETTLING_TIME,
@@ -827,7 +828,7 @@ class HeadingTracker:
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._rest_scatter.begin_rest(
             (self.bias[1] / self._state.noise.angle_random_walk) ** 2)
-        median = self._rest_scatter.median(np.zeros(1))
+        median = median_ratio(self._rest_scatter.probabilities(np.zeros(1)))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
         self._adopt_state()
@@ -982,10 +983,10 @@ class HeadingTracker:
                 and self._wheels_stand == (last.rate_integral.wander is STANDSTILL)):
             start, part = replace(last.state_before, noise=noise), last.rate_integral + turn
             count = before.step_count - 1
+        chances = self._rest_scatter.probabilities(likelihood)
         if not self._wheels_stand:
-            part.wander = np.array([sum_ratios(max(part.duration, 1.0)) * (white * part.duration),
-                                    self._rest_scatter.probabilities(likelihood)])
-        median = self._rest_scatter.median(likelihood)
+            part.wander = np.array([
+                sum_ratios(max(part.duration, 1.0)) * (white * part.duration), chances])
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
                          - remaining.duration)
         self._state = start.advance_at_rest(part)
@@ -993,7 +994,7 @@ class HeadingTracker:
         self._snapshots.append(Snapshot(
             self._state, self._rest_integral,
             self.deleted_heading - self._corrected_angle(self._block_integral), count + 1, step,
-            scatter_state, median, likelihood))
+            scatter_state, median_ratio(chances), likelihood))
         self._restore_steps(self._snapshots[-1])
         del self._snapshots[:-_MAX_SNAPSHOTS]
 
