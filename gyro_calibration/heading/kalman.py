@@ -25,11 +25,9 @@ heading also the earlier error of the heading.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-import operator
-from typing import Any
 
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import averaged_process_moments, BIAS_AVERAGING_TIME, Noise
@@ -38,6 +36,10 @@ from scipy.linalg import pinvh
 
 #: Indices of heading, random walk and first flicker component in the state.
 HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = 0, 1, 2
+
+
+#: Possible variances of the rotation in a rest, rad², and their probabilities: it is none.
+STANDSTILL = np.array([[0.0], [1.0]])
 
 
 @dataclass(slots=True)
@@ -49,7 +51,9 @@ class RateIntegral:
     sensitivity: Array  # integral of that of the rate to the calibration, shape (m,)
     lost_variance: float = 0.0  # of rotation that was not measured, rad²
     extra_noise_variance: float = 0.0  # additional variance of the noise by lost samples, rad²
-    wander_variance: float = 0.0  # of the rotation in a rest that may be a straight drive, rad²
+    #: Of a rest that may be a straight drive: possible variances of its rotation, rad², and their
+    #: probabilities, shape (2, k).
+    wander: Array = field(default_factory=lambda: STANDSTILL)
     block_count: int = 0
     block_square_sum: float = 0.0  # of the angles of blocks, over their durations, rad²/s
     #: There were no rates: the heading is constant, and errors of rates do not affect it; not to
@@ -58,21 +62,25 @@ class RateIntegral:
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
         """Return the integral over both, one after the other."""
-        return self._combine(other, operator.add)
+        return RateIntegral(
+            self.duration + other.duration, self.angle + other.angle,
+            self.sensitivity + other.sensitivity, self.lost_variance + other.lost_variance,
+            self.extra_noise_variance + other.extra_noise_variance, STANDSTILL,
+            self.block_count + other.block_count, self.block_square_sum + other.block_square_sum)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return the rest of this integral after another with which it begins."""
-        return self._combine(other, operator.sub)
-
-    def _combine(self, other: RateIntegral,
-                 combined: Callable[[Any, Any], Any]) -> RateIntegral:
         return RateIntegral(
-            combined(self.duration, other.duration), combined(self.angle, other.angle),
-            combined(self.sensitivity, other.sensitivity),
-            combined(self.lost_variance, other.lost_variance),
-            combined(self.extra_noise_variance, other.extra_noise_variance), 0.0,
-            combined(self.block_count, other.block_count),
-            combined(self.block_square_sum, other.block_square_sum))
+            self.duration - other.duration, self.angle - other.angle,
+            self.sensitivity - other.sensitivity, self.lost_variance - other.lost_variance,
+            self.extra_noise_variance - other.extra_noise_variance, STANDSTILL,
+            self.block_count - other.block_count, self.block_square_sum - other.block_square_sum)
+
+    def with_sensitivity(self, sensitivity: Array) -> RateIntegral:
+        """Return the integral with another sensitivity, (m,)."""
+        other = copy(self)
+        other.sensitivity = sensitivity
+        return other
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,7 @@ class HeadingState:
             self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved,
             len(rate_integral.sensitivity))
         seen, grown = seen.copy(), grown.copy()
-        seen[self.first_value_index:] = -rate_integral.sensitivity
+        seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
         grown[HEADING_INDEX, HEADING_INDEX] += (
             rate_integral.lost_variance + rate_integral.extra_noise_variance)
         if not rate_integral.is_unobserved:
@@ -138,23 +146,29 @@ class HeadingState:
         """Return the states before and after a rest given its measurement, and a covariance."""
         # The covariance is that of the state before with that after, (n, n). The measured mean
         # has the wander of the bias meanwhile in it, with which the bias at the end correlates. A
-        # `wander_variance` is in the measurement and in the heading, which is that at the end.
+        # rotation by `wander` is in the measurement and in the heading, which is that at the end.
+        # Mean and covariance are those of the mixture: the gain of each variance is a sum of two
+        # directions, that of the state and the heading.
         step = self.transition(rate_integral)
-        grown, wander = step.process_noise, rate_integral.wander_variance
+        grown, (wander, chances) = step.process_noise, rate_integral.wander
         before = self.covariance @ step.observation
         variance = float(step.observation @ before + grown[HEADING_INDEX, HEADING_INDEX]) + wander
-        after = step.retention * before - grown[HEADING_INDEX]
-        after[HEADING_INDEX] = before[HEADING_INDEX] + wander
+        innovation = rate_integral.angle - float(step.observation @ self.mean)
+        after = np.zeros((2, len(before)))
+        after[0] = step.retention * before - grown[HEADING_INDEX]
+        after[0, HEADING_INDEX], after[1, HEADING_INDEX] = before[HEADING_INDEX], 1.0
         grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
-        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance + wander
-        scaled = (rate_integral.angle - float(step.observation @ self.mean)) / variance
+        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance + chances @ wander
+        gains = np.array([np.ones(len(wander)), wander]) / variance
+        gain = gains @ chances
+        change = ((gains * (chances * (innovation ** 2 - variance))) @ gains.T
+                  - innovation ** 2 * gain[:, None] * gain)
         kept = self.covariance * step.retention
-        return (HeadingState(self.noise, self.mean + before * scaled,
-                             self.covariance - before[:, None] * before / variance),
-                HeadingState(self.noise, step.retention * self.mean + after * scaled,
-                             step.retention[:, None] * kept + grown
-                             - after[:, None] * after / variance),
-                kept - before[:, None] * after / variance)
+        return (HeadingState(self.noise, self.mean + before * (gain[0] * innovation),
+                             self.covariance + before[:, None] * before * change[0, 0]),
+                HeadingState(self.noise, step.retention * self.mean + gain * innovation @ after,
+                             step.retention[:, None] * kept + grown + after.T @ change @ after),
+                kept + before[:, None] * (change[0] @ after))
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
@@ -162,6 +176,15 @@ class HeadingState:
         return (float(step.observation @ self.mean),
                 float(step.observation @ self.covariance @ step.observation
                       + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
+
+    def expected_rest_angles(self, durations: Array, lost: Array, sensitivities: Array
+                             ) -> tuple[Array, Array]:
+        """Return the same of k integrals, by values as in `heading_variances`, (k,) each."""
+        seen, variances = _integrated_wander(self.noise, np.round(durations, 6))
+        rows = np.concatenate([seen, -sensitivities], axis=1)
+        return rows @ self.mean, (
+            ((rows @ self.covariance) * rows).sum(axis=1) + variances + lost
+            + self.noise.angle_random_walk ** 2 * durations)
 
     @cached_property
     def wander_rate(self) -> tuple[float, float]:
@@ -245,17 +268,22 @@ def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, varianc
     return HeadingState(noise, mean, whole)
 
 
-def heading_variances(states: list[HeadingState], rate_integrals: list[RateIntegral]) -> Array:
-    """Return the variance of the heading after each turn from its state, rad², shape (k,)."""
-    figures = np.array([(turn.duration, turn.lost_variance + turn.extra_noise_variance
-                         + state.noise.angle_random_walk ** 2 * turn.duration)
-                        for state, turn in zip(states, rate_integrals)])
+def heading_variances(states: list[HeadingState], durations: Array, lost: Array,
+                      sensitivities: Array) -> Array:
+    """
+    Return the variance of the heading after each turn from its state, rad², shape (k,).
+
+    Of the integrals of rates, given are durations, s, and variances of what was lost and of its
+    noise, rad², shape (k,), and the sensitivities, (k, m).
+
+    """
     # flicker and random walk have the same parameters in all states
-    seen, variances = _integrated_wander(states[0].noise, np.round(figures[:, 0], 6))
-    rows = np.concatenate([-seen, [turn.sensitivity for turn in rate_integrals]], axis=1)
+    seen, variances = _integrated_wander(states[0].noise, np.round(durations, 6))
+    white = np.array([state.noise.angle_random_walk for state in states]) ** 2 * durations
+    rows = np.concatenate([-seen, sensitivities], axis=1)
     rows[:, HEADING_INDEX] += 1.0
     spread = np.matmul([state.covariance for state in states], rows[:, :, None])[:, :, 0]
-    return np.asarray((spread * rows).sum(axis=1) + variances + figures[:, 1])
+    return np.asarray((spread * rows).sum(axis=1) + variances + (lost + white))
 
 
 def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:

@@ -160,9 +160,10 @@ def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
         [(state.mean[HEADING_INDEX], state.covariance[HEADING_INDEX, HEADING_INDEX])
          for state in states]).T
     # share of the rates in the heading: 1 in motion, in a rest that of a straight drive
-    share = np.array([1.0 if not step.is_resting else step.rate_integral.wander_variance / (
-        step.rate_integral.wander_variance + step.state_before.noise.angle_random_walk ** 2
-        * step.rate_integral.duration) for step in steps] or [1.0])
+    share = np.array([1.0 if not step.is_resting else step.rate_integral.wander[1] @ (
+        step.rate_integral.wander[0] / (
+            step.rate_integral.wander[0] + step.state_before.noise.angle_random_walk ** 2
+            * step.rate_integral.duration)) for step in steps] or [1.0])
     place = np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(share) - 1)
     turned = integrate(time, _remove_spikes(time, rate))
     followed = turned - np.interp(time, ends, np.interp(ends, time, turned))

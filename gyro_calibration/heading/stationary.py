@@ -33,9 +33,10 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     TrackStep,
 )
-from gyro_calibration.logs.log import Array, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, Mask, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is tested, s.
@@ -48,22 +49,24 @@ _MIN_WINDOW_SAMPLES = 8
 #: the model.
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
-#: to it, correlations of neighbours with time constants of up to the longest lag, and the
-#: variances of blocks about these means: first those of a rest, then those of straight drives.
+#: to it, correlations of neighbours, and variances of blocks about these means: first those of a
+#: rest, then those of straight drives, up to bends that keep their rate for many minutes.
 #: With variances beyond `_MAX_SCATTER_RATIO` times that of white noise or of the bias, most means
 #: over 1 s are beyond the limit of `mean_threshold_sigmas`, and most windows beyond that of the
 #: energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
-                        for shared in (0.0, *np.exp(-1.0 / np.array(MEAN_LAGS[::2])))
+                        for shared in (0.0, *np.exp(-1.0 / np.array([4.0, 64.0, 1024.0])))
                         for fast in (0.0, 1.0, 4.0))]).T
 _MAX_SCATTER_RATIO = 64.0
-#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1,
-#: by which each correlation adds the same to the mean ratio of a long sum; largest total.
-_PRIOR_COUNTS = (1.0 - SCATTER_CORRELATIONS) / (1.0 + SCATTER_CORRELATIONS)
-_PRIOR_COUNTS /= _PRIOR_COUNTS[1:] @ (SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO)
+#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1, all
+#: of which are as probable; largest total.
+_PRIOR_COUNTS = np.full(
+    len(SCATTER_RATIOS), 1.0 / np.sum(SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO))
 _PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
+#: Rates at which a straight way ends, 1/s, on average after the longest lag; a rest may last.
+ENDING_RATES = (SCATTER_RATIOS > 0.0) / MEAN_LAGS[-1]
 
 
 @dataclass(slots=True)
@@ -94,8 +97,13 @@ def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
 
 @lru_cache(maxsize=1024)
 def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
-    """Return the value that chi squared exceeds with a probability."""
     return float(chdtri(degrees_of_freedom, chance))
+
+
+def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
+    """Return the values that chi squared exceeds with a probability, shape (k,)."""
+    return np.array([_chi_squared_quantile(max(round(each), 1), chance)
+                     for each in degrees_of_freedom.tolist()])
 
 
 #: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
@@ -110,10 +118,12 @@ class EnergyDetector:
         # ratio of the noise of the samples to that of the model, by the quietest windows
         self.noise_factor = 1.0
         self._blocks = deque[Block]()
-        self._energies = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
-        self.configure(noise, false_alarms)
+        self._ratios = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
         self._since_last_window, self._interval = 0.0, BLOCK_DURATION
+        # of the next blocks: quiet, noise factor, and limit of the samples after it, rad/s
+        self._results = deque[tuple[bool | None, float, float]]()
         self._sudden_limit: float | None = None
+        self.configure(noise, false_alarms)
 
     def configure(self, noise: Noise, false_alarms: float) -> None:
         """Go on with other settings."""
@@ -125,9 +135,13 @@ class EnergyDetector:
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
         self._blocks.clear()
+        self._results.clear()
 
     def add(self, block: Block) -> bool | None:
         """Add a block; tell whether the window contains only noise; None until it is full."""
+        if self._results:
+            quiet, self.noise_factor, self._sudden_limit = self._results.popleft()
+            return quiet
         blocks = self._blocks
         blocks.append(block)
         duration, count = 0.0, 0
@@ -170,12 +184,13 @@ class EnergyDetector:
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
         self._since_last_window = 0.0
-        self._energies.append((energy, differences))
-        if len(self._energies) >= _MIN_WINDOWS:
-            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._energies))
+        self._ratios.append((energy, differences))
+        if len(self._ratios) >= _MIN_WINDOWS:
+            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
             quietest *= (count - 1) / _chi_squared_quantile(count - 1, 0.9)
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
+    @property
     def sudden_limit(self) -> float:
         """Return the largest deviation of a single sample at rest, rad/s."""
         # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
@@ -184,6 +199,89 @@ class EnergyDetector:
             self._sudden_limit = limit * self.noise_factor * math.sqrt(
                 self._noise.rate_variance(self._interval))
         return self._sudden_limit
+
+    @property
+    def has_results(self) -> bool:
+        """Tell whether results of the next blocks are known."""
+        return bool(self._results)
+
+    def quiet_ahead(self, number: int) -> tuple[bool | None, float]:
+        """Return whether a block ahead is quiet, and the limit of its samples."""
+        limit = self._results[number - 1][2] if number else self.sudden_limit
+        return self._results[number][0], limit
+
+    def skip(self, count: int) -> None:
+        """Add blocks that were looked at, without their results."""
+        for _ in range(count):
+            _, self.noise_factor, self._sudden_limit = self._results.popleft()
+
+    def look_ahead(self, blocks: Array) -> None:
+        """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
+        # as `add` does one by one
+        before = np.array([(each.duration, each.count, each.rate_sum, each.square_sum,
+                            each.difference_square_sum) for each in self._blocks])
+        sums, kept = np.hstack([before.reshape(-1, 5).T, blocks]), len(before)
+        sums = np.vstack([sums, sums[2] ** 2 / sums[1]])
+        until = np.cumsum(np.pad(sums[:2], ((0, 0), (1, 0))), axis=1)
+        end = np.arange(kept, sums.shape[1]) + 1
+        least = WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE, _MIN_WINDOW_SAMPLES
+        begin = np.min([np.searchsorted(each, each[end] - shortest, side='right') - 1
+                        for each, shortest in zip(until, least)], axis=0)
+        full = begin >= 0
+        begin = np.maximum(begin, 0)
+        duration, count, total, squares, differences, means = np.add.reduceat(
+            np.pad(sums, ((0, 0), (0, 1))), np.stack([begin, end], axis=1).ravel(), axis=1)[:, ::2]
+        interval, freedom = duration / count, count - 1.0
+        energy = (squares - total * total / count) / np.maximum(freedom, 1.0)
+        variance = self._noise.rate_variance(1.0) / interval
+        factor = self._noise_factors(
+            blocks[0], freedom, np.array([energy, 0.5 * differences / count]) / variance, full)
+        variance *= factor ** 2
+        # motion is slower than the samples, so that means over blocks show it far better
+        quiet = (energy * freedom < variance * _chi_squared_quantiles(
+            freedom, self._false_alarm_chance)) & (
+            (end - begin < 3) | (means - total * total / count < variance
+                                 * _chi_squared_quantiles(end - begin - 1.0,
+                                                          self._false_alarm_chance)))
+        limits = np.where(full, self._sample_limits(interval, factor), self.sudden_limit)
+        self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
+                             in sums[:5, begin[-1]:].T.tolist())
+        self._interval = float(interval[-1]) if full[-1] else self._interval
+        self._results.extend((each if known else None, *others) for known, each, *others in zip(
+            full.tolist(), quiet.tolist(), factor.tolist(), limits.tolist()))
+
+    def _noise_factors(self, durations: Array, freedom: Array, ratios: Array,
+                       full: Mask) -> Array:
+        """Return the noise of the samples by the quietest tenth of the windows, shape (k,)."""
+        # Vibration in a straight drive is not noise; it contributes less to differences of
+        # neighbours: the ratios, shape (2, k), are those of energies and of differences.
+        known, kept = np.flatnonzero(full), len(self._ratios)
+        ends = block_ends(durations[known], WINDOW_DURATION, self._since_last_window)
+        self._since_last_window = float(
+            durations[known[ends[-1] if ends else 0:]].sum()
+            + (0.0 if ends else self._since_last_window))
+        last = known[np.array(ends, int) - 1]
+        ratios = np.hstack([np.array(self._ratios).reshape(-1, 2).T, ratios[:, last]])
+        self._ratios.extend(zip(*ratios[:, kept:].tolist()))
+        if not ends:
+            return np.full(len(full), self.noise_factor)
+        windows = np.lib.stride_tricks.sliding_window_view(
+            np.pad(ratios, ((0, 0), (_MAX_WINDOWS - kept, 0)), constant_values=math.inf),
+            _MAX_WINDOWS, axis=1)[:, 1:]
+        number = np.minimum(kept + 1 + np.arange(len(last)), _MAX_WINDOWS)
+        quietest = np.sort(windows)[:, np.arange(len(last)), number // 10].min(axis=0)
+        quietest *= freedom[last] / _chi_squared_quantiles(freedom[last], 0.9)
+        found = np.where(number < _MIN_WINDOWS, self.noise_factor,
+                         np.sqrt(np.clip(quietest, 1.0, _MAX_NOISE_FACTOR ** 2)))
+        return np.append(self.noise_factor, found)[
+            np.searchsorted(last, np.arange(len(full)), side='right')]
+
+    def _sample_limits(self, intervals: Array, factor: Array) -> Array:
+        """Return the largest deviation of a single sample at rest, rad/s, shape (k,)."""
+        # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
+        sigmas = [mean_threshold_sigmas(round(each, 9), self._sample_false_alarms)
+                  for each in intervals.tolist()]
+        return np.asarray(sigmas * factor * np.sqrt(self._noise.rate_variance(1.0) / intervals))
 
 
 @dataclass(frozen=True)
@@ -224,20 +322,23 @@ class RestScatter:
         chances = self.counts * np.exp(possible - possible.max())
         return np.asarray(chances / chances.sum())
 
-    def mean_and_median(self, likelihood: Array, count: float) -> tuple[float, float]:
-        """Return the mean ratio of variances of sums of `count` means, and the median ratio."""
-        chances, shared = self.probabilities(likelihood), SCATTER_CORRELATIONS
-        # of a process of first order, per mean
-        sums = SCATTER_RATIOS / (1.0 - shared) ** 2 * (
-            1.0 - shared ** 2 - 2.0 * shared * (1.0 - shared ** count) / count)
-        return (float(chances @ sums),
-                float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)]))
-
     def learn(self, last: Snapshot) -> None:
         """Add a detected rest that has ended."""
         kept = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
         self._learned = kept * self._learned + self.probabilities(last.log_likelihood)
         self._retention *= kept
+
+
+def median_ratio(chances: Array) -> float:
+    """Return the median of `SCATTER_RATIOS`, which have these probabilities, shape (k,)."""
+    return float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)])
+
+
+def sum_ratios(count: float) -> Array:
+    """Return the ratios of variances of sums of `count` means, per mean, shape (k,)."""
+    shared = SCATTER_CORRELATIONS  # of processes of first order
+    return np.asarray(SCATTER_RATIOS / (1.0 - shared) ** 2 * (
+        1.0 - shared ** 2 - 2.0 * shared * (1.0 - shared ** count) / count))
 
 
 def update_scatter(state: Array, rate: float, noise: float, white: float) -> tuple[Array, Array]:
@@ -304,8 +405,9 @@ class Epoch:
     is_resting: bool
     heading: float
     pending: float
-    #: Last samples of its blocks, and integrals of the rates since the state.
-    open_integrals: list[tuple[int, RateIntegral]]
+    #: Last samples of its blocks, and integrals of the rates since the state: durations, s, lost
+    #: variances, rad², and sensitivities, shape (k, m).
+    open_integrals: list[tuple[NDArray[np.intp], Array, Array, Array]]
     end_index: int = -1  # after its last sample
 
 
@@ -338,13 +440,16 @@ class EvenSamples:
         resting = (moving if self.still is None
                    else self._integrate_sensitivity(self.rest_sensitivity))
         self.sensitivity_integrals = moving, resting  # shape (k, m) each
-        # by block: duration, integral, remaining share of a pending correction, and sums of the
-        # rates, their squares, and the squares of their steps
-        summed = (self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)
-        sums = [self._sum_by_blocks(values).tolist() for values in summed]
+        # by block: duration, count, sums of the rates, their squares and the squares of their
+        # steps; integrals, and remaining shares of a pending correction
+        self.block_sums = np.array([self._sum_by_blocks(values) for values in (
+            self.intervals, np.ones(count), self.rate, self.rate * self.rate, steps * steps)])
+        self.block_angles = self._sum_by_blocks(self.angles)
+        self.block_squares = self.block_angles ** 2 / np.maximum(
+            self.block_sums[0], MIN_SAMPLE_INTERVAL)
+        self.block_ends = np.array(self.block_stops) - 1
         self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
-        sums.insert(2, np.multiply.reduceat(self._pending_retention, self.block_starts).tolist())
-        self.block_sums = list(zip(*sums))
+        self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
 
     def _integrate_sensitivity(self, rows: Array) -> Array:
@@ -403,10 +508,12 @@ class EvenSamples:
 
     def _add_variances(self, epochs: list[Epoch]) -> None:
         """Add the variance of the heading in epochs of motion."""
-        opens = [(epoch.state, turn) for epoch in epochs for _, turn in epoch.open_integrals]
-        known = heading_variances(*map(list, zip(*opens)))
-        white = [state.noise.angle_random_walk ** 2 for state, _ in opens]
-        places = np.array([place for epoch in epochs for place, _ in epoch.open_integrals])
+        opens = [each for epoch in epochs for each in epoch.open_integrals]
+        states = [epoch.state for epoch in epochs for places, *_ in epoch.open_integrals
+                  for _ in places]
+        places, *turns = map(np.concatenate, zip(*opens))
+        known = heading_variances(states, *turns)
+        white = [state.noise.angle_random_walk ** 2 for state in states]
         until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1
         rows = np.concatenate(
             [np.arange(max(epoch.start_index, 0), epoch.end_index) for epoch in epochs])

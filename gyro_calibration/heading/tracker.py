@@ -41,6 +41,7 @@ from gyro_calibration.heading.kalman import (
     HeadingState,
     initial_state,
     RateIntegral,
+    STANDSTILL,
     TrackStep,
     WALK_INDEX,
 )
@@ -48,22 +49,33 @@ from gyro_calibration.heading.stationary import (
     Block,
     BLOCK_DURATION,
     BLOCK_RATIOS,
+    ENDING_RATES,
     EnergyDetector,
     Epoch,
     EvenSamples,
     MEAN_LAGS,
     mean_threshold_sigmas,
+    median_ratio,
     RestScatter,
     Samples,
     SETTLING_TIME,
     SlowTurn,
     Snapshot,
+    sum_ratios,
     update_scatter,
     WINDOW_DURATION,
 )
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import (
+    Array,
+    CACHE_BLOCK_SAMPLES,
+    DEGREE,
+    Mask,
+    MIN_SAMPLE_INTERVAL,
+    Number,
+)
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
@@ -418,17 +430,23 @@ class HeadingTracker:
                             self.is_resting, found[begin:end])
         if not self._block.duration:
             piece.epochs.append(self._new_epoch(-1))
-        for number, until in enumerate(piece.block_stops):
-            if number in piece.whole_blocks and self._take_block(piece, number):
+        number = 0
+        while number < len(piece.block_stops):
+            if number == piece.whole_blocks.start and piece.whole_blocks:
+                self._energy.look_ahead(piece.block_sums[:, number:piece.whole_blocks.stop])
+            if number in piece.whole_blocks:
+                number += self._pass_blocks(piece, number)
+            until = piece.block_stops[number]
+            number += 1
+            if number - 1 in piece.whole_blocks and self._take_block(piece, number - 1):
                 if self._state_version != piece.epochs[-1].state_version:
                     piece.close_epoch(until - 1)
                     piece.epochs.append(self._new_epoch(until - 1))
                 elif not self.is_resting:
-                    piece.epochs[-1].open_integrals.append(
-                        (until - 1, self._with_unbiased_sensitivity(self._open_integral)))
+                    piece.epochs[-1].open_integrals.append(self._open_row(until - 1))
                 continue
-            piece.close_epoch(piece.block_starts[number])
-            for place in range(piece.block_starts[number], until):
+            piece.close_epoch(piece.block_starts[number - 1])
+            for place in range(piece.block_starts[number - 1], until):
                 piece.last_at_rest = self.is_resting
                 known = float(usual[place])
                 self._take_sample(*given.sample(begin + place), gap=(0, known))
@@ -445,8 +463,132 @@ class HeadingTracker:
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
-                     self._pending_correction,
-                     [(place, self._with_unbiased_sensitivity(self._open_integral))])
+                     self._pending_correction, [self._open_row(place)])
+
+    def _open_row(self, place: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
+        """Return the open integral after a sample as that of an `Epoch`."""
+        turn = self._with_unbiased_sensitivity(self._open_integral)
+        return (np.array([place]), np.array([turn.duration]),
+                np.array([turn.lost_variance + turn.extra_noise_variance]),
+                turn.sensitivity[None, :])
+
+    def _pass_blocks(self, piece: EvenSamples, number: int) -> int:
+        """Take the whole blocks before the next in which a decision falls; return their number."""
+        if (piece.wheels is not None or not self._energy.has_results
+                or piece.last_at_rest != self.is_resting):
+            return 0
+        passed = (self._count_quiet_blocks(piece, number) if self.is_resting
+                  else self._count_moving_blocks(piece, number))
+        if not passed:
+            return 0
+        here = slice(number, number + passed)
+        durations, angles, squares = (
+            piece.block_sums[0, here], piece.block_angles[here], piece.block_squares[here])
+        rows = piece.sensitivity_integrals[self.is_resting][here]
+        whole = RateIntegral(
+            float(durations.sum()), float(angles.sum()), rows.sum(axis=0), block_count=passed,
+            block_square_sum=float(squares.sum()))
+        blocks = [RateIntegral(duration, angle, row, block_count=1, block_square_sum=square)
+                  for duration, angle, row, square in zip(
+                      durations.tolist(), angles.tolist(), rows, squares.tolist())]
+        turned = self._corrected_angle(whole)
+        if self.is_resting:
+            self.deleted_heading += turned
+            self._rest_blocks.extend(blocks)
+        else:
+            decayed = float(piece.block_retentions[here].prod())
+            self.heading += turned + self._pending_correction * (1.0 - decayed)
+            self._pending_correction *= decayed
+            turn, ends = self._open_integral, piece.block_ends[here]
+            until = turn.duration + np.cumsum(durations)
+            piece.epochs[-1].open_integrals.append((
+                ends, until, np.full(passed, turn.lost_variance + turn.extra_noise_variance),
+                self._unbiased_sensitivity(until, turn.sensitivity + np.cumsum(rows, axis=0),
+                                           None if piece.still is None else piece.still[ends])))
+            self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
+            self._hold_blocks(*blocks)
+        self._open_integral += whole
+        self._open_variance = None
+        end = piece.block_stops[number + passed - 1] - 1
+        time, rate = float(piece.time[end]), float(piece.rate[end])
+        used = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
+        self._last_sample = time, rate, rate, used[end]
+        self._interval, self._last_time = float(piece.intervals[end]), time
+        self._wheel_motion_time = time
+        self._still_sensitivity = None if piece.still is None else piece.still[end]
+        self._energy.skip(passed)
+        return passed
+
+    def _count_quiet_blocks(self, piece: EvenSamples, number: int) -> int:
+        """Return how many of the next whole blocks are at rest before a decision."""
+        duration, passed = self._open_integral.duration, 0
+        begin = piece.block_starts[number]
+        until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
+        end = piece.block_stops[until - 1]
+        rates = np.abs(piece.rate[begin:end] - self._wander_rate
+                       + piece.rest_sensitivity[begin:end] @ self._calibration_errors)
+        peaks = np.maximum.reduceat(rates, np.array(piece.block_starts[number:until]) - begin)
+        for peak, more in zip(peaks.tolist(), piece.block_sums[0, number:until].tolist()):
+            quiet, limit = self._energy.quiet_ahead(passed)
+            duration += more
+            if (quiet is False or peak > math.hypot(limit, self._bias_margin)
+                    or duration >= _STEP_DURATION - TIME_TOLERANCE):
+                return passed
+            passed += 1
+        return passed - 1
+
+    def _count_moving_blocks(self, piece: EvenSamples, number: int) -> int:
+        """Return how many of the next whole blocks are in motion before a decision."""
+        until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
+        begin, end = 0, len(self._recent_blocks)
+        durations = [*(each.duration for each in self._recent_blocks),
+                     *piece.block_sums[0, number:until].tolist()]
+        held, tested, first = self._held_integral.duration, list[int](), list[int]()
+        beyond = self._open_integral.duration - held
+        while end < len(durations) - 1:
+            held += durations[end]
+            end += 1
+            while (end - begin > 2
+                   and held - durations[begin] >= WINDOW_DURATION - TIME_TOLERANCE):
+                held -= durations[begin]
+                beyond += durations[begin]
+                begin += 1
+            quiet, _ = self._energy.quiet_ahead(end - len(self._recent_blocks) - 1)
+            if (quiet and self._quiet_duration != WINDOW_DURATION
+                    or beyond >= _STEP_DURATION - TIME_TOLERANCE):
+                end -= 1
+                break
+            if quiet and held >= WINDOW_DURATION - TIME_TOLERANCE and end - begin > 1:
+                tested.append(end)
+                first.append(begin + 1)
+        if tested:
+            stands = self._stands(piece, number, np.array(durations), np.array(first),
+                                  np.array(tested))
+            if stands.any():
+                end = tested[int(np.argmax(stands))] - 1
+        return max(end - len(self._recent_blocks), 0)
+
+    def _stands(self, piece: EvenSamples, number: int, durations: Array, first: Array,
+                last: Array) -> Mask:
+        """Tell of parts of recent and next blocks whether their means are those of a rest."""
+        recent, count = self._recent_blocks, len(durations) - len(self._recent_blocks)
+        here = slice(number, number + count)
+        rows = np.zeros((len(durations) + 1, 3 + len(self._calibration_errors)))
+        rows[1:, 0] = durations
+        for row, each in zip(rows[1:], recent):
+            row[1], row[2] = each.angle, each.lost_variance + each.extra_noise_variance
+            row[3:] = each.sensitivity
+        rows[1 + len(recent):, 1] = piece.block_angles[here]
+        rows[1 + len(recent):, 3:] = piece.sensitivity_integrals[False][here]
+        until = np.cumsum(rows, axis=0)
+        held = until[last] - until[first]
+        if piece.still is not None:
+            held[:, 3:] = held[:, :1] * piece.still[
+                piece.block_ends[here][last - len(recent) - 1]]
+        expected, variances = self._state.expected_rest_angles(
+            held[:, 0], held[:, 2], held[:, 3:])
+        return np.asarray(np.abs(held[:, 1] - expected)
+                          < self._sigmas[WINDOW_DURATION] * np.sqrt(variances))
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
@@ -457,19 +599,20 @@ class HeadingTracker:
         if self.is_resting:
             rates = (piece.rate[begin:end] - self._wander_rate
                      + rows[begin:end] @ self._calibration_errors)
-            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
+            limit = math.hypot(self._energy.sudden_limit, self._bias_margin)
             if driven or rates.max() > limit or rates.min() < -limit:
                 return False
-        part, block, sums = self._block_integral, self._block, piece.block_sums[number]
-        part.duration, part.angle, decayed, *block_sums = sums
-        block.rate_sum, block.square_sum, block.difference_square_sum = block_sums
+        part = self._block_integral
+        part.duration, part.angle = (float(piece.block_sums[0, number]),
+                                     float(piece.block_angles[number]))
+        decayed = float(piece.block_retentions[number])
         part.sensitivity = piece.sensitivity_integrals[self.is_resting][number]
         if self.is_resting != piece.last_at_rest:
             assert self._last_sample is not None
             part.sensitivity = (part.sensitivity + piece.half_intervals[begin]
                                 * (self._last_sample[3] - rows[begin - 1]))
             piece.last_at_rest = self.is_resting
-        block.duration, block.count = part.duration, end - begin
+        self._block.duration = part.duration
         turned = self._corrected_angle(part)
         if self.is_resting:
             self.deleted_heading += turned
@@ -527,7 +670,7 @@ class HeadingTracker:
         _, rate, _, sensitivity = self._last_sample
         self._block.add(duration, rate, before)
         if self.is_resting:
-            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
+            limit = math.hypot(self._energy.sudden_limit, self._bias_margin)
             if wheels or abs(rate - self._rate_error(sensitivity)) > limit:
                 self._revert_to_motion(0.0)
         self._wheels_moved = self._wheels_moved or bool(wheels)
@@ -558,7 +701,7 @@ class HeadingTracker:
         if wheels:
             # a constant turn has the energy of a rest: no blocks are held while wheels move
             self._enter_motion(WINDOW_DURATION)
-        self._hold_block(part)
+        self._hold_blocks(part)
         beyond = self._open_integral.duration - self._held_integral.duration
         if beyond >= _STEP_DURATION - TIME_TOLERANCE:
             self._advance_state(self._held_integral)
@@ -581,14 +724,16 @@ class HeadingTracker:
         self._open_variance = None
         return part
 
-    def _hold_block(self, part: RateIntegral) -> None:
+    def _hold_blocks(self, *parts: RateIntegral) -> None:
         """Hold the last blocks, which may be the begin of a rest."""
-        self._recent_blocks.append(part)
-        self._held_integral += part
+        self._recent_blocks.extend(parts)
+        held = sum(each.duration for each in self._recent_blocks)
         least = self._quiet_duration - TIME_TOLERANCE
         while (len(self._recent_blocks) > 2
-               and self._held_integral.duration - self._recent_blocks[0].duration >= least):
-            self._held_integral -= self._recent_blocks.popleft()
+               and held - self._recent_blocks[0].duration >= least):
+            held -= self._recent_blocks.popleft().duration
+        first, *others = self._recent_blocks
+        self._held_integral = sum(others, first)
 
     def _held_rest_integral(self) -> RateIntegral:
         """Return the held integral without its first block, in which the robot may move."""
@@ -683,7 +828,7 @@ class HeadingTracker:
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._rest_scatter.begin_rest(
             (self.bias[1] / self._state.noise.angle_random_walk) ** 2)
-        _, median = self._rest_scatter.mean_and_median(np.zeros(1), 1.0)
+        median = median_ratio(self._rest_scatter.probabilities(np.zeros(1)))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
         self._adopt_state()
@@ -832,14 +977,16 @@ class HeadingTracker:
             * turn.duration + lost)
         likelihood += before.log_likelihood - 0.5 * (
             (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
-            - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS))
+            - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS)) - ENDING_RATES * turn.duration
         start, part, count, last = self._state, turn, len(self.steps), before.step
         if (last is not None and last.rate_integral.duration < MEAN_LAGS[-1] - TIME_TOLERANCE
-                and self._wheels_stand == (last.rate_integral.wander_variance == 0.0)):
+                and self._wheels_stand == (last.rate_integral.wander is STANDSTILL)):
             start, part = replace(last.state_before, noise=noise), last.rate_integral + turn
             count = before.step_count - 1
-        ratio, median = self._rest_scatter.mean_and_median(likelihood, max(part.duration, 1.0))
-        part.wander_variance = 0.0 if self._wheels_stand else ratio * white * part.duration
+        chances = self._rest_scatter.probabilities(likelihood)
+        if not self._wheels_stand:
+            part.wander = np.array([
+                sum_ratios(max(part.duration, 1.0)) * (white * part.duration), chances])
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
                          - remaining.duration)
         self._state = start.advance_at_rest(part)
@@ -847,7 +994,7 @@ class HeadingTracker:
         self._snapshots.append(Snapshot(
             self._state, self._rest_integral,
             self.deleted_heading - self._corrected_angle(self._block_integral), count + 1, step,
-            scatter_state, median, likelihood))
+            scatter_state, median_ratio(chances), likelihood))
         self._restore_steps(self._snapshots[-1])
         del self._snapshots[:-_MAX_SNAPSHOTS]
 
@@ -870,16 +1017,21 @@ class HeadingTracker:
         if (self._sensitivity_slope is None or self._still_sensitivity is None
                 or turn.is_unobserved):
             return turn
-        bias = self._state.wander_rate[0] - float(
-            self._still_sensitivity @ self._state.calibration_errors[0])
-        unbiased = turn + self._zero_integral
-        unbiased.sensitivity = turn.sensitivity - turn.duration * bias * self._sensitivity_slope
-        return unbiased
+        return turn.with_sensitivity(self._unbiased_sensitivity(
+            turn.duration, turn.sensitivity, self._still_sensitivity))
+
+    def _unbiased_sensitivity(self, duration: Number, sensitivity: Array,
+                              still: Array | None) -> Array:
+        """Return sensitivities for rates without their bias, (m,), or (k, m) by durations (k,)."""
+        if self._sensitivity_slope is None or still is None:
+            return sensitivity
+        bias = self._wander_rate - still @ self._calibration_errors
+        return sensitivity - np.multiply.outer(duration * bias, self._sensitivity_slope)
 
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
         return (turn + self._zero_integral if self._still_sensitivity is None
-                else replace(turn, sensitivity=turn.duration * self._still_sensitivity))
+                else turn.with_sensitivity(turn.duration * self._still_sensitivity))
 
     def _adopt_state(self) -> None:
         """Adopt the new state and the noise of the samples; the heading does not jump."""

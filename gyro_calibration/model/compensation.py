@@ -85,8 +85,8 @@ def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
         modelled, unexplained = model.rate_from_channels(
             Channels(seen, seen, used) if environment is None
             else environment.with_rate(seen, seen))
-        computed = abs(modelled) < _MAX_COMPUTABLE_RATE
-        if computed is not True and not np.all(computed):
+        if _mask_outside(modelled, -_MAX_COMPUTABLE_RATE, _MAX_COMPUTABLE_RATE) is not False:
+            computed = abs(modelled) < _MAX_COMPUTABLE_RATE
             replaced: Number = np.where(computed, modelled, seen)
             modelled = replaced[()]
             unexplained = unexplained | np.logical_not(computed)
