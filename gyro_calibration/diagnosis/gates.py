@@ -69,7 +69,7 @@ from gyro_calibration.logs.quality import (
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
@@ -195,10 +195,15 @@ def reference_rate(log: Log) -> Array | None:
     return np.where(known, np.gradient(smooth, log.time), np.nan)
 
 
+#: Degree of the splines through headings.
+SPLINE_DEGREE = 5
+
+
 def spline_rate(time: Array, heading: Array) -> Array:
-    """Return the rate of a heading by a cubic spline, gaps interpolated, rad/s, shape (n,)."""
+    """Return the rate of a heading by a quintic spline, gaps interpolated, rad/s, shape (n,)."""
     known = np.isfinite(heading)
-    return np.asarray(CubicSpline(time, np.interp(time, time[known], heading[known]))(time, 1))
+    return np.asarray(make_interp_spline(
+        time, np.interp(time, time[known], heading[known]), SPLINE_DEGREE)(time, 1))
 
 
 def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:

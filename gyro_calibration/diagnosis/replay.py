@@ -32,6 +32,7 @@ from gyro_calibration.diagnosis.gates import (
     MIN_VALID_SHARE,
     resample_reference,
     select_reference,
+    SPLINE_DEGREE,
     spline_rate,
 )
 from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
@@ -44,7 +45,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 from scipy.signal import oaconvolve
 
@@ -79,8 +80,9 @@ class NoiseShape:
 
 
 def spline_derivative_gain(angle: Array) -> Array:
-    """Return the variance of white noise after a cubic spline's derivative, interval 1."""
-    return (3.0 * np.sin(angle) / (2.0 + np.cos(angle))) ** 2
+    """Return the variance of white noise after a quintic spline's derivative, interval 1."""
+    return (5.0 * (10.0 * np.sin(angle) + np.sin(2.0 * angle))
+            / (33.0 + 26.0 * np.cos(angle) + np.cos(2.0 * angle))) ** 2
 
 
 def cosine_transform(values: Array) -> Array:
@@ -141,8 +143,8 @@ MAX_POINTS = 50_000
 #: Margin of the power of rounding.
 _ROUNDING_POWER_FACTOR = 1.5
 #: Samples next to a gap of at least as many whose rate is not used: the error at the end of a
-#: spline is 0.27 times as large from sample to sample. Shorter gaps change the slope by little.
-_GAP_MARGIN_SAMPLES = 4
+#: spline is 0.43 times as large from sample to sample. Shorter gaps change the slope by little.
+_GAP_MARGIN_SAMPLES = 6
 #: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
 #: sign are 3 sigma. Largest share of corners.
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
@@ -465,7 +467,8 @@ def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Ar
     for part in find_runs(~long):  # a line over a gap bends the spline beside it
         at = time[part][~lost[part]]
         if len(at) > 2 * _GAP_MARGIN_SAMPLES:
-            rate[part] = CubicSpline(at, heading[part][~lost[part]])(time[part], 1)
+            rate[part] = make_interp_spline(
+                at, heading[part][~lost[part]], SPLINE_DEGREE)(time[part], 1)
     near = maximum_filter1d(lost, 3) | maximum_filter1d(long, 2 * _GAP_MARGIN_SAMPLES + 1)
     raw = np.where(near, np.nan, rate)
     if heading_step:
@@ -478,14 +481,14 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     Return where the rate of a heading has corners that its samples do not resolve, shape (n,).
 
     At a corner, a spline through the heading and the trapezoidal integral of the output differ by
-    a 24th of the fourth difference, which passes for a dead zone or a slip. That of a smooth
+    a 72nd of the sixth difference, which passes for a dead zone or a slip. That of a smooth
     motion is small at any acceleration; where a noisy reference has bends everywhere, none are
     excluded.
 
     """
-    bend = np.abs(np.diff(np.pad(rate, 2, mode='edge'), 4)) / 24.0
+    bend = np.abs(np.diff(np.pad(rate, 3, mode='edge'), 6)) / 72.0
     white = white_noise_deviation((output - rate)[valid])
-    sharp = maximum_filter1d(bend > _CORNER_NOISE_SHARE * white + rounding, 5)
+    sharp = maximum_filter1d(bend > _CORNER_NOISE_SHARE * white + rounding, 7)
     rounded = rounding > math.sqrt(6.0) * white  # most of what looks white is of the steps
     return np.zeros_like(sharp) if rounded or sharp[valid].mean() > _MAX_CORNER_SHARE else sharp
 

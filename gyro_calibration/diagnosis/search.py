@@ -82,6 +82,8 @@ MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
 MIN_TONE_PERIODS = 20
 #: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
 SLIP_DURATIONS, MAX_SLIPS = (0.0, 0.1, 0.4), 20
+#: Least time between two slips, and between a slip and a gap where the heading is rounded, s.
+_SLIP_INTERVAL = 1.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
 MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 #: Half-width of the range in which a shape is refined, in logarithms.
@@ -372,7 +374,7 @@ def find_slips(fit: RegressionFit) -> list[Scored]:
 
 def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
                width: float) -> Scored:
-    """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
+    """Return slips of one duration, apart from each other, with evidence for the times scanned."""
     time = np.arange(replay.point_count) * replay.point_interval
     likely = math.log(len(indices) * len(SLIP_DURATIONS))
     size, deviation = _matched_filter(white, factor, time, width)
@@ -380,10 +382,11 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     value = 0.5 * (size[indices] / deviation) ** 2 - likely - VALUE_PENALTY
     # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
     # of an encoder is constant at rest, and differs by up to a step between two rests. What the
-    # gyro turns in a gap is not known.
+    # gyro turns in a gap is not known, nor is the rounding error there.
     is_temporary = wide[indices] / size[indices] < 0.3
+    unknown = _SLIP_INTERVAL if replay.heading_step else 2.0 * width
     near_gap = maximum_filter1d(replay.filled_points,
-                                2 * math.ceil(2.0 * width / replay.point_interval) + 1)
+                                2 * math.ceil(unknown / replay.point_interval) + 1)
     value[is_temporary | near_gap[indices]
           | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
     chosen: list[float] = []
@@ -392,7 +395,7 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
         if (value[place] <= 0.0 and chosen) or len(chosen) == MAX_SLIPS:
             break
         at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
-        if all(abs(at - other) > 1.0 for other in chosen):
+        if all(abs(at - other) > _SLIP_INTERVAL for other in chosen):
             chosen.append(at)
             total += float(value[place])
     penalty = likely * len(chosen)

@@ -287,6 +287,13 @@ def test_a_random_walk_that_exceeds_white_noise_within_a_minute_is_no_other_caus
 
 # faults of a record
 
+@pytest.mark.parametrize('name, seed', [('saturation', 24103), ('heading_sensitivity', 190)])
+def test_corners_between_the_samples_of_a_heading_are_no_nonlinearity(name, seed):
+    log, = hidden_in([name], 5.0, seed, 'white', REFERENCES[1])
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    assert names_of(found) == [name], told(log, found)
+
+
 @pytest.mark.parametrize('seed', [1, 4])
 def test_no_slip_of_the_reference_is_named_in_a_gap_of_the_gyro(seed):
     log, = hidden_in(['stuck_samples'], 5.0, seed, 'flicker', REFERENCES[2])
