@@ -42,9 +42,9 @@ from scipy.stats import binom, chi2
 RARE = 1e-4
 
 
-def dwells(rate, error, temperature=None, sweep=None):
+def dwells(rate, error, temperature=None, sweep=None, deviation=np.nan):
     rate = np.asarray(rate, dtype=float)
-    return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan),
+    return Dwells(rate, rate + error, temperature, deviation + np.zeros(len(rate)),
                   np.zeros(len(rate), int) if sweep is None else sweep,
                   tuple(f'row {row + 1}' for row in range(len(rate))))
 
