@@ -181,7 +181,7 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
     # of exact values above their rounding, or what is rounded would be explained, and the Gram
     # matrix of a dwell that is exact beside others would be singular
     size = (rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1))
-            + 1e-12 * fastest + 1e-3 * float(np.nanmax(used.deviation, initial=0.0)))
+            + 1e-12 * fastest + 1e-3 * float(np.nan_to_num(used.deviation).max(initial=0.0)))
     relative = size / fastest
     units = np.array([size, relative, size, relative])[:_count_scatter_terms(used)]
 
