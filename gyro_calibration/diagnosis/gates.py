@@ -22,7 +22,7 @@ errors exceed those of the gyro, decide how a log is diagnosed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -195,15 +195,15 @@ def reference_rate(log: Log) -> Array | None:
     return np.where(known, np.gradient(smooth, log.time), np.nan)
 
 
-#: Degree of the splines through headings.
-SPLINE_DEGREE = 5
-
-
 def spline_rate(time: Array, heading: Array) -> Array:
     """Return the rate of a heading by a quintic spline, gaps interpolated, rad/s, shape (n,)."""
     known = np.isfinite(heading)
-    return np.asarray(make_interp_spline(
-        time, np.interp(time, time[known], heading[known]), SPLINE_DEGREE)(time, 1))
+    return heading_spline(time, np.interp(time, time[known], heading[known]))(time, 1)
+
+
+def heading_spline(time: Array, heading: Array) -> Callable[[Array, int], Array]:
+    """Return the quintic spline through a heading, by time and the order of its derivative."""
+    return make_interp_spline(time, heading, 5)
 
 
 def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:

@@ -28,11 +28,11 @@ import math
 
 from gyro_calibration.calibration.heading_regression import SPECTRUM_BINS
 from gyro_calibration.diagnosis.gates import (
+    heading_spline,
     MIN_SAMPLES,
     MIN_VALID_SHARE,
     resample_reference,
     select_reference,
-    SPLINE_DEGREE,
     spline_rate,
 )
 from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
@@ -45,7 +45,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
-from scipy.interpolate import make_interp_spline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 from scipy.signal import oaconvolve
 
@@ -467,8 +466,7 @@ def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Ar
     for part in find_runs(~long):  # a line over a gap bends the spline beside it
         at = time[part][~lost[part]]
         if len(at) > 2 * _GAP_MARGIN_SAMPLES:
-            rate[part] = make_interp_spline(
-                at, heading[part][~lost[part]], SPLINE_DEGREE)(time[part], 1)
+            rate[part] = heading_spline(at, heading[part][~lost[part]])(time[part], 1)
     near = maximum_filter1d(lost, 3) | maximum_filter1d(long, 2 * _GAP_MARGIN_SAMPLES + 1)
     raw = np.where(near, np.nan, rate)
     if heading_step:

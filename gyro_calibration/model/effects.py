@@ -404,6 +404,7 @@ _ENVIRONMENT_EFFECTS = (
         lambda channels, time_constant: (
             _at_each(channels, 0.0 if channels.lagged is None
                      else channels.lagged('vibration', time_constant)),),
+        # the noise of a mean square over less would attenuate it
         (Parameter('time_constant', 's', 1.0, (1e-3, 1e4), (1.0, 3.0)),),
         'rest with the motor on and off', along='vibration'),
     Effect(
