@@ -60,12 +60,19 @@ from gyro_calibration.diagnosis.regression import (
     is_rate_distortion,
     likelihood_with,
     likelihood_without,
+    MIN_INDEPENDENT_SHARE,
     RegressionFit,
     RegressionProblem,
 )
-from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
+from gyro_calibration.diagnosis.replay import (
+    coefficient_angles,
+    cosine_transform,
+    inverse_cosine_transform,
+    Replay,
+)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
+from scipy.fft import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
@@ -132,7 +139,7 @@ class Search:
     candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
     # causes that are scanned for over all frequencies or times
-    scanned_causes: frozenset[str] = frozenset(MAX_PER_LOG)
+    scanned_causes: frozenset[str] = frozenset({'bias_step', *MAX_PER_LOG})
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
     # columns_cache, step_cache: caches of columns and of steps, by the named causes
@@ -184,7 +191,7 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
     search = Search(problem, found, rate / len(places), on_progress=on_progress,
-                    scanned_causes=frozenset(MAX_PER_LOG).difference(without))
+                    scanned_causes=Search.scanned_causes.difference(without))
     shown = search.candidate_evidence(fit)
     return replace(search, unidentifiable=frozenset(
         cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
@@ -256,8 +263,12 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
             mean = float(logsumexp(found[own])) - math.log(len(own))
             first.append((replace(search.candidates[best], penalty=float(found[best]) - mean),
                           float(found[best])))
-    scans = {'interference_tone': find_tones, 'reference_slip': find_slips}
-    return first + [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)]
+    scans = {'interference_tone': find_tones, 'reference_slip': find_slips,
+             'bias_step': find_steps}
+    first += [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)]
+    likeliest = {each.cause: (each, evidence) for each, evidence in sorted(
+        first, key=lambda scored: scored[1] - scored[0].penalty)}
+    return list(likeliest.values())
 
 
 def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
@@ -352,6 +363,46 @@ def _amplitude(replay: Replay, values: Array, frequency: float) -> float:
     """Return the amplitude of a frequency in samples."""
     wave = np.exp(-2.0j * np.pi * frequency * replay.channels.time[replay.valid])
     return float(2.0 * np.abs(np.mean(values[replay.valid] * wave)))
+
+
+def find_steps(fit: RegressionFit) -> list[Scored]:
+    """
+    Return the clearest step of the bias at any time, under the likeliest noise.
+
+    Beside a random walk that soon exceeds the white noise, a step shows for a short time only.
+
+    """
+    found, evidence = [], []
+    covariance = (fit.inverse_information[fit.best_noise]
+                  * fit.residual_squares[fit.best_noise] / fit.degrees_of_freedom)
+    problem = fit.problem
+    for run, (replay, white, *rows) in enumerate(zip(
+            problem.replays, fit.residual_transforms(), *map(problem.split_by_log, fit.columns))):
+        factor = fit.whitening_factors()[run]
+        whitening = factor / problem.split_by_log(problem.deviation)[run]
+        # products of a step at each point with the residual, the columns, and itself
+        pull, *crossing = [np.cumsum(inverse_cosine_transform(whitening * factor * each)[::-1])[::-1]
+                           for each in (white, *rows)]
+        power = (whitening / np.sin(0.5 * coefficient_angles(replay.point_count))) ** 2
+        power = np.append(0.0, power / (2.0 * replay.point_count))
+        whole = 0.5 * (power.sum() - fft(power).real)
+        left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
+        shown = left > MIN_INDEPENDENT_SHARE * whole
+        # as far from the ends as the first of equally spaced times
+        margin = replay.point_count // (MAX_STEP_TIMES + 1)
+        evidence.append(np.where(shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[
+            margin:-margin])
+        first = replay.channels.time[replay.valid][0] + margin * replay.point_interval
+        best = int(evidence[-1].argmax())
+        # so many points are about as likely
+        width = np.exp(logsumexp(evidence[-1] - evidence[-1][best]))
+        found.append(effect_candidate(
+            'bias_step', float(first + best * replay.point_interval), log_index=run,
+            half_width=1.5 * float(min(width, margin)) * replay.point_interval))
+    every = np.concatenate(evidence)
+    mean = float(logsumexp(every)) - math.log(len(every))
+    return _best_of_scan([(replace(each, penalty=float(own.max()) - mean), float(own.max()))
+                          for each, own in zip(found, evidence)])
 
 
 def find_slips(fit: RegressionFit) -> list[Scored]:
