@@ -345,7 +345,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
 
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
-    follows = follows_rate(replays) and (is_command or is_late(replays))
+    follows = follows_rate(replays) and (is_command or is_late(plain))
     settled = None
     if not follows:
         found = _search_replays(replays, rate, on_progress)

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.diagnosis.candidates import effect_candidate
@@ -29,9 +30,11 @@ from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
 from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
 from gyro_calibration.diagnosis.noisy_reference import MAX_GYRO_LAG
+from gyro_calibration.diagnosis.regression import likelihood_with, RegressionFit
 from gyro_calibration.diagnosis.replay import (
     cosine_transform,
     kernel_lags,
+    LONGEST_LAG,
     MIN_RESPONSE_POWER,
     Replay,
     response_kernels,
@@ -49,6 +52,9 @@ _MOTION_EFFECTS = ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_no
                    'heading_sensitivity')
 #: Longest lag of a motion as a share of the duration of a log.
 _MAX_LAG_SHARE = 0.1
+#: Number of lags of a gyro that are compared with longer ones, and probability by which those have
+#: to be likelier.
+_LAGS_OF_GYRO, _LATE_LEVEL = 4, 0.05
 
 
 @dataclass(frozen=True)
@@ -69,21 +75,21 @@ class FollowedReference:
             remedy='use a measured rate or heading as the reference')
 
 
-def is_late(replays: Sequence[Replay]) -> bool:
+def is_late(fit: RegressionFit) -> bool:
     """
     Tell whether the output is later than the reference rate of logs by more than a gyro would be.
 
-    The headings of a motion and of one that is late differ by the rate times the delay.
+    By the likelihood under the noises of the logs: a random walk of the bias turns the output by
+    far more than a delay does.
 
     """
-    delays = []
-    for each in replays:
-        rate = each.resample(each.channels.rate)
-        difference = np.cumsum(each.resample(each.channels.output - each.reference))
-        columns = np.column_stack([
-            rate, np.cumsum(rate), np.arange(len(rate)), np.ones(len(rate))])
-        delays.append(-each.point_interval * np.linalg.lstsq(columns, difference)[0][0])
-    return float(np.mean(delays)) > MAX_GYRO_LAG
+    def likelihood(*lags: float) -> float:
+        return max(likelihood_with(fit, effect_candidate('time_offset', each)) for each in lags)
+
+    of_gyro = max(fit.log_likelihood, likelihood(
+        *np.linspace(0.0, MAX_GYRO_LAG, _LAGS_OF_GYRO + 1)[1:].tolist()))
+    return likelihood(*np.geomspace(MAX_GYRO_LAG, LONGEST_LAG, 5 * _LAGS_OF_GYRO)[1:].tolist()
+                      ) > of_gyro - math.log(_LATE_LEVEL)
 
 
 def follows_rate(replays: Sequence[Replay]) -> bool:

@@ -107,9 +107,9 @@ def band_starts(count: int) -> Array:
     return np.unique([edge for edge in edges if edge < count])
 
 
-#: Share of a variance that is small, of two noises; and logarithm of the ratio of the variances of
-#: neighbouring random walks.
-_SMALL_NOISE_SHARE, _WALK_STEP = 0.1, 0.9
+#: Share of a variance that is small, of two noises; and largest steps between neighbouring random
+#: walks, as logarithm of the ratio of their variances and in its standard deviations.
+_SMALL_NOISE_SHARE, _WALK_STEP, _WALK_SIGMAS = 0.1, 0.9, 3.0
 
 
 def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) -> list[NoiseShape]:
@@ -119,22 +119,27 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     The random walk ranges from a small part of the white noise at the lowest frequency of the log
     to as much as the white noise at its highest. A Gauss-Markov process, which flicker may
     replace, has a correlation time between some samples and this duration. Combinations in which
-    one of them is small beside the other at all frequencies are left out.
+    one of them is small beside the other at all frequencies are left out. The variance of a walk
+    alone is known the better, the more coefficients it dominates.
 
     """
     small, lowest = _SMALL_NOISE_SHARE, (math.pi / duration) ** 2
-    walks = [0.0, *np.geomspace(small * lowest, 1.0 / interval ** 2, 1 + math.ceil(
-        -math.log(small * lowest * interval ** 2) / _WALK_STEP))]
+    highest, alone = 1.0 / interval ** 2, [small * lowest]
+    while alone[-1] < highest:
+        sigma = math.sqrt(2.0 * math.pi / (duration * math.sqrt(alone[-1])))
+        alone.append(alone[-1] * math.exp(min(_WALK_SIGMAS * sigma, _WALK_STEP)))
+    walks = [0.0, *np.geomspace(alone[0], highest, 1 + math.ceil(
+        math.log(highest / alone[0]) / _WALK_STEP))]
     times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
     # by their spectral density at frequency 0 relative to white noise
     strong = [(level, time) for time in times for level in np.geomspace(0.3, 1000.0, 7)]
-    plain = [NoiseShape(walk, level / (2.0 * time), time, rounding_ratio)
-             for walk in walks for level, time in [(0.0, 1.0), *strong]
-             if not walk or not level
-             or small * lowest < walk / level < 1.0 / (small * time ** 2)]
     corners = np.geomspace(0.1 / duration, 0.3 / interval, 14)
-    return plain + [NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
-                    for walk in walks[::4] for corner in corners]
+    return [*(NoiseShape(walk, rounding_ratio=rounding_ratio) for walk in (0.0, *alone)),
+            *(NoiseShape(walk, level / (2.0 * time), time, rounding_ratio)
+              for walk in walks for level, time in strong
+              if not walk or small * lowest < walk / level < 1.0 / (small * time ** 2)),
+            *(NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
+              for walk in walks[::4] for corner in corners)]
 
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
@@ -151,7 +156,7 @@ _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
 
 #: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1;
 #: and least power of an independent response to the command as a share of the strongest.
-_LEAD, _LONGEST_LAG, _LAG_RATIO, MIN_RESPONSE_POWER = 0.1, 5.0, 0.05, 1e-12
+_LEAD, LONGEST_LAG, _LAG_RATIO, MIN_RESPONSE_POWER = 0.1, 5.0, 0.05, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +300,7 @@ def response_kernels(interval: float) -> Array:
 
     """
     lags = [-_leading_lags(interval), 1 - _leading_lags(interval)]
-    while lags[-1] * interval < _LONGEST_LAG:
+    while lags[-1] * interval < LONGEST_LAG:
         lags.append(lags[-1] + max(round(_LAG_RATIO * lags[-1]), 1))
     hats = np.array([np.interp(np.arange(lags[0], lags[-1] + 1), lags, each)
                      for each in np.eye(len(lags))])

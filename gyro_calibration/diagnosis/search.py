@@ -372,33 +372,33 @@ def find_steps(fit: RegressionFit) -> list[Scored]:
     Beside a random walk that soon exceeds the white noise, a step shows for a short time only.
 
     """
+    best, split_by_log = fit.best_noise, fit.problem.split_by_log
+    covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
+        fit.degrees_of_freedom)
     found, evidence = [], []
-    covariance = (fit.inverse_information[fit.best_noise]
-                  * fit.residual_squares[fit.best_noise] / fit.degrees_of_freedom)
-    problem = fit.problem
-    for run, (replay, white, *rows) in enumerate(zip(
-            problem.replays, fit.residual_transforms(), *map(problem.split_by_log, fit.columns))):
-        factor = fit.whitening_factors()[run]
-        whitening = factor / problem.split_by_log(problem.deviation)[run]
+    for run, (replay, factor, deviation, residual, *columns) in enumerate(zip(
+            fit.problem.replays, fit.whitening_factors(), split_by_log(fit.problem.deviation),
+            fit.residual_transforms(), *map(split_by_log, fit.columns))):
+        count, interval = replay.point_count, replay.point_interval
         # products of a step at each point with the residual, the columns, and itself
-        pull, *crossing = [np.cumsum(inverse_cosine_transform(whitening * factor * each)[::-1])[::-1]
-                           for each in (white, *rows)]
-        power = (whitening / np.sin(0.5 * coefficient_angles(replay.point_count))) ** 2
-        power = np.append(0.0, power / (2.0 * replay.point_count))
-        whole = 0.5 * (power.sum() - fft(power).real)
+        pull, *products = [
+            np.cumsum(inverse_cosine_transform(factor ** 2 / deviation * each)[::-1])[::-1]
+            for each in (residual, *columns)]
+        power = (factor / deviation / np.sin(0.5 * coefficient_angles(count))) ** 2 / (2.0 * count)
+        whole = 0.5 * (power.sum() - fft(np.append(0.0, power)).real)
+        crossing = np.reshape(products, (len(columns), count))
         left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
         shown = left > MIN_INDEPENDENT_SHARE * whole
         # as far from the ends as the first of equally spaced times
-        margin = replay.point_count // (MAX_STEP_TIMES + 1)
-        evidence.append(np.where(shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[
-            margin:-margin])
-        first = replay.channels.time[replay.valid][0] + margin * replay.point_interval
-        best = int(evidence[-1].argmax())
-        # so many points are about as likely
-        width = np.exp(logsumexp(evidence[-1] - evidence[-1][best]))
-        found.append(effect_candidate(
-            'bias_step', float(first + best * replay.point_interval), log_index=run,
-            half_width=1.5 * float(min(width, margin)) * replay.point_interval))
+        margin = max(count // (MAX_STEP_TIMES + 1), 1)
+        own = np.where(shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[margin:-margin]
+        top = int(own.argmax())
+        # number of points that are about as likely
+        width = min(float(np.exp(logsumexp(own - own[top]))), margin)
+        time = float(replay.channels.time[replay.valid][0]) + (margin + top) * interval
+        found.append(effect_candidate('bias_step', time, log_index=run,
+                                      half_width=1.5 * width * interval))
+        evidence.append(own)
     every = np.concatenate(evidence)
     mean = float(logsumexp(every)) - math.log(len(every))
     return _best_of_scan([(replace(each, penalty=float(own.max()) - mean), float(own.max()))
@@ -693,8 +693,8 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """
     Return the gain of each cause on held-out stretches in standard deviations.
 
-    Given the others, it is scaled to fit best without each stretch in turn. Slips are single
-    events.
+    Given the others, it is scaled to fit best without each stretch in turn. No other stretch
+    shows a single event: slips, and a step of the bias that a random walk soon hides.
 
     """
     full, found = fit_causes(search.problem, causes), []
@@ -711,6 +711,9 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
         before = np.concatenate(rest.whitened_series(full))
         added = before - off
         score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
+        if known.log_index is not None and information.max() > 0.5 * information.sum():
+            found.append(math.inf)
+            continue
         size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
         found.append(prediction_sigmas(
             0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))

@@ -285,6 +285,41 @@ def test_a_random_walk_that_exceeds_white_noise_within_a_minute_is_no_other_caus
     assert names_of(found) in (['rate_random_walk'], ['bias_instability']), told(log, found)
 
 
+def in_fast_walk(crossing, seed, step_sigmas=0.0):
+    """
+    Return a log of dwells at exact rates, and its step of the bias, rad/s, and the time of it, s.
+
+    The walk of the bias exceeds the white noise after a crossing time, s. One sigma of the step is
+    that of the bias by the best filter: of a pair of such errors, before and after it.
+
+    """
+    generator, interval, count, white = np.random.default_rng(seed), 0.04, 7500, 4e-4
+    walk, time = np.sqrt(3.0) * white / crossing, np.arange(count) * interval
+    dwells = generator.choice([0.0, *generator.uniform(-1.5, 1.5, 3)], 50)
+    rate = np.convolve(np.repeat(dwells, count // 50), np.ones(8) / 8, 'same')
+    at, step = generator.uniform(30.0, 270.0), step_sigmas * np.sqrt(2.0 * white * walk)
+    output = (rate + 1e-3 + white / np.sqrt(interval) * generator.standard_normal(count)
+              + walk * np.sqrt(interval) * np.cumsum(generator.standard_normal(count))
+              + step * (time > at))
+    return Log(time=time, output=output, reference_rate=rate), step, at
+
+
+@pytest.mark.parametrize('crossing, seed', [(0.5, 1), (0.5, 2), (3.0, 1), (3.0, 2)])
+def test_a_step_of_the_bias_is_found_at_any_time_of_a_fast_random_walk(crossing, seed):
+    log, step, at = in_fast_walk(crossing, seed, 12.0)
+    found = diagnose([log], np.random.default_rng(seed))
+    assert names_of(found) == ['bias_step']
+    for name, true in (('bias_step', step), ('step_time', at)):
+        value = found.findings[0].parameters[name]
+        assert abs(value.estimate - true) < 4.0 * value.deviation
+
+
+@pytest.mark.parametrize('seed', [6, 8])
+def test_a_fast_random_walk_is_no_lag_of_the_motion(seed):
+    found = diagnose([in_fast_walk(0.5, seed)[0]], np.random.default_rng(seed))
+    assert not found.findings and 'lag of its own' not in found.cannot_show.get('time_offset', '')
+
+
 # faults of a record
 
 @pytest.mark.parametrize('name, seed', [('saturation', 24103), ('heading_sensitivity', 190)])
