@@ -29,6 +29,7 @@ from gyro_calibration.logs.quality import (
     cross_rotation,
     find_runs,
     quantization_step,
+    robust_deviation,
     white_noise_deviation,
 )
 import numpy as np
@@ -49,6 +50,8 @@ _WHITE_CORRELATION_RATIO = -0.5
 #: Noise of a reference rate that is not white is detected from so many standard deviations on, in
 #: this quietest share of the log, in blocks of so many samples.
 _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
+#: Number of spans of a log whose scatter is estimated: to 4 %.
+_USUAL_SPANS = 500
 #: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
 #: the errors of an encoder are at most so many times its rounding error.
 MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
@@ -249,6 +252,24 @@ def is_course(log: Log) -> bool:
                                                     MIN_COURSE_NOISE)
 
 
+def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> Array:
+    """
+    Return the usual bend and change of a heading difference over a span, rad, shape (2,).
+
+    They are the standard deviations of its second difference over halves of the span, which is
+    that of the end of a random walk, and of its change beyond the bias, by their medians; 0 where
+    no span is known.
+
+    """
+    starts = np.linspace(time[0], time[-1] - span, _USUAL_SPANS)
+    first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
+                           for share in (0.0, 0.5, 1.0))
+    changes = np.array([first - 2.0 * middle + last, last - first - bias * span])
+    known = np.isfinite(changes[0])
+    return (np.array([robust_deviation(each[known]) for each in changes]) if known.any()
+            else np.zeros(2))
+
+
 def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     """
     Return a log without headings that are repeated while the gyro turns, as of a lost marker.
@@ -257,7 +278,8 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     a straight line, which may be its bias, by more than a random walk does (Brownian bridge, at
     1 %), and the error of the reference and its step; or where it changes beyond its usual bias by
     that. The reference must then jump rather by what the gyro turned than not at all: a bias may
-    drift in a rest. The random walk is that of the difference to the reference elsewhere.
+    drift in a rest. The random walk is that of the difference to the reference elsewhere, or the
+    scatter of that difference over as long a time, if it is larger, as that of a wandering bias.
 
     """
     heading = log.reference_heading
@@ -290,7 +312,10 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
                                + 2.0 * usual.constant_error)
         unseen = own[-1] - bias * (end - begin)
         jump = heading[after] - heading[rows[-1]] - (turned[after] - turned[rows[-1]])
-        if max(np.abs(off).max(), abs(unseen)) > most and abs(jump - unseen) < abs(jump):
+        excess = np.array([np.abs(off).max(), abs(unseen)]) - step
+        if (excess.max() > most - step and abs(jump - unseen) < abs(jump)
+                and (excess > bound * _usual_changes(log.time, turned - moving, bias,
+                                                     end - begin)).any()):
             kept[rows[1:]] = np.nan
             lost.append((float(begin), float(end), float(np.ptp(own))))
     if not lost:

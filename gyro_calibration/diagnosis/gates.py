@@ -696,7 +696,7 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
     for _ in range(3):
         values = np.linalg.lstsq(columns[kept], change[kept], rcond=None)[0]
         off = change - columns @ values
-        kept = np.abs(off) <= 6.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-15
+        kept = np.abs(off) <= 6.0 * robust_deviation(off) + 1e-15
         # With long rests, all turns of the gyro are outlying if the reference makes others; and
         # with a rate that stays the same, all others, while the rest has nothing in common.
         if (kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum()
