@@ -50,8 +50,8 @@ _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catche
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
 #: Averaging time of the jitter, and time for which older stamps may come after a clock was set, s.
 _RECENT_DURATION = 10.0
-#: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz on:
-#: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
+#: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz
+#: on: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
 _MIN_LATENESS = 0.5e-3
 #: Largest lateness with a correct sequence, s, above the 16 ms of a burst. Without it, stamps at
 #: 1 kHz are 5.6 ms off instead of 0.06 ms where the host is later by 10 ms for 5 s of each 15 s.
