@@ -38,15 +38,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import TwistStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
 from processes import apart, end, node_command  # noqa: E402
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data, QoSProfile  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from rig import now, Robot, RosRobot  # noqa: E402
+from rig import INTERVAL, Robot  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-4}\n'
 FULL_RATE = math.radians(40.0)
 TELEOP = 0.3  # rad/s
@@ -84,6 +87,97 @@ HEADER = ['fault', 'turned after it, deg', 'zero commanded after, s',
 
 def _short(text, most=150):
     return ' '.join(text.split())[:most].replace('|', '/')
+
+
+def now():
+    """Return the steady clock, s."""
+    return time.clock_gettime(STEADY)
+
+
+class RosRobot:
+    """
+    A `Robot` on topics: cmd_vel in; odom, imu/data_raw and, if it is simulated, /clock out.
+
+    A thread steps it by the steady clock; the executor of the node is spun by the caller. `speed`
+    is that of /clock, which stamps follow; None for stamps by the node's clock. `commands` are
+    those that came, with their times, `headings` the true ones by the stamp, ns, and `moments` by
+    the steady clock. A fault sets that `clock_stands`, with the stamps; `also` is called with each
+    Imu message: a second driver.
+
+    """
+
+    def __init__(self, node, robot, speed=None):
+        self.robot, self.node, self.also = robot, node, None
+        self.clock_stands = False
+        self.commands, self.headings, self.moments = [], {}, []
+        self._speed, self._lock, self._last = speed, threading.Lock(), None
+        quality = QoSProfile(depth=100)
+        self._imu = node.create_publisher(Imu, 'imu/data_raw', quality)
+        self._odometry = node.create_publisher(Odometry, 'odom', quality)
+        self._clock = node.create_publisher(Clock, '/clock', 10) if speed else None
+        node.create_subscription(TwistStamped, 'cmd_vel', self._on_command, quality)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _on_command(self, message):
+        rate = message.twist.angular.z
+        with self._lock:
+            self.commands.append((now(), rate))
+            self.robot.command(rate)
+
+    def _run(self):
+        interval = INTERVAL / (self._speed or 1.0)
+        due = now()
+        while not self._stop.wait(max(0.0, due - now())):
+            due = max(due + interval, now() - 0.5)  # a computer that slept does not hurry
+            with self._lock:
+                self._publish(self.robot.step())
+
+    def _publish(self, reading):
+        self.moments.append((now(), reading.heading))
+        stamp = self._stamp(reading)
+        self.headings[stamp] = reading.heading
+        header = {'sec': stamp // 10 ** 9, 'nanosec': stamp % 10 ** 9}
+        if self._clock and not self.clock_stands:
+            clock = Clock()
+            clock.clock.sec, clock.clock.nanosec = header['sec'], header['nanosec']
+            self._clock.publish(clock)
+        odometry = Odometry()
+        _set(odometry.header, header, 'odom')
+        odometry.child_frame_id = 'base_link'
+        odometry.pose.pose.orientation.z = math.sin(0.5 * reading.heading)
+        odometry.pose.pose.orientation.w = math.cos(0.5 * reading.heading)
+        odometry.twist.twist.angular.z = reading.rate
+        self._odometry.publish(odometry)
+        if reading.output is not None:
+            imu = Imu()
+            _set(imu.header, header, 'gyro')
+            imu.angular_velocity.z = reading.output
+            imu.orientation_covariance[0] = imu.linear_acceleration_covariance[0] = -1.0
+            self._imu.publish(imu)
+            if self.also:
+                self.also(imu)
+
+    def _stamp(self, reading):
+        """Return the stamp in ns: of the simulation, or of the node's clock."""
+        if not (self.clock_stands or self.robot.stamps_stand) or self._last is None:
+            self._last = (round(reading.stamp * 1e9) if self._speed
+                          else self.node.get_clock().now().nanoseconds)
+        return self._last
+
+    def turned_since(self, since):
+        """Return the angle turned since a time of the steady clock, rad, in either direction."""
+        after = [heading for time_, heading in self.moments if time_ >= since]
+        return sum(abs(b - a) for a, b in zip(after, after[1:]))
+
+    def close(self):
+        self._stop.set()
+        self._thread.join()
+
+
+def _set(header, stamp, frame):
+    header.stamp.sec, header.stamp.nanosec, header.frame_id = stamp['sec'], stamp['nanosec'], frame
 
 
 class SecondCommander:
@@ -145,7 +239,7 @@ class Stage:
 
     def start(self, *, parameters=None, speed=None, **robot):
         """Start robot and node, and wait until the robot has rested for a while."""
-        self.robot = RosRobot(self.node, Robot(**robot), speed=speed, stamped=True)
+        self.robot = RosRobot(self.node, Robot(**robot), speed)
         self.closing.callback(self.robot.close)
         self.other = SecondCommander(self.node)
         self.closing.callback(self.other.close)

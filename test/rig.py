@@ -11,10 +11,10 @@
 """
 A small robot, and a pipeline joined to it as the node joins them, with a clock that a test steps.
 
-`Robot` computes: commands in, odometry and the samples of a gyro out. `RosRobot` joins it to
-topics, in a thread. `Rig` joins it to a pipeline without rclpy and without waiting: a run of 24 s
-takes a fraction of a second, and a call of `Rig.step` does what the compensation node does in the
-interval of one sample. All units are SI; angles are counter-clockwise positive.
+`Robot` computes: commands in, odometry and the samples of a gyro out. `Rig` joins it to a pipeline
+without rclpy and without waiting: a run of 24 s takes a fraction of a second, and a call of
+`Rig.step` does what the compensation node does in the interval of one sample. All units are SI;
+angles are counter-clockwise positive.
 
 """
 
@@ -22,24 +22,12 @@ from collections import deque
 from dataclasses import dataclass
 import math
 import random
-import threading
-import time
 
 from gyro_calibration.ros.calibration_session import PROFILE
 from gyro_calibration.ros.inputs import parameter_values, Velocity
 from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
 
-try:
-    from geometry_msgs.msg import Twist, TwistStamped
-    from nav_msgs.msg import Odometry
-    from rclpy.qos import QoSProfile
-    from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import Imu
-except ImportError:
-    pass  # the fixture `ros` skips every test that needs them, and says why
-
 INTERVAL = 0.01  # s between samples
-STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 
 @dataclass(frozen=True)
@@ -100,98 +88,6 @@ class Robot:
                   + self._random.gauss(0.0, self.noise))
         return Reading(self._stamp, None if self.unplugged else self.distort(output), self.heading,
                        self.rate)
-
-
-class RosRobot:
-    """
-    A `Robot` on topics: cmd_vel in; odom, imu/data_raw and, if it is simulated, /clock out.
-
-    A thread steps it by the steady clock; the executor of the node is spun by the caller. `speed`
-    is that of /clock, which stamps follow; None for stamps by the node's clock. `commands` are
-    those that came, with their times, `headings` the true ones by the stamp, ns, and `moments` by
-    the steady clock. A test sets `clock_absent` or `clock_stands`, with the stamps; `also` is
-    called with each Imu message: a second driver.
-
-    """
-
-    def __init__(self, node, robot, *, speed=None, stamped=False):
-        self.robot, self.node, self.also = robot, node, None
-        self.clock_absent = self.clock_stands = False
-        self.commands, self.headings, self.moments = [], {}, []
-        self._speed, self._lock, self._last = speed, threading.Lock(), None
-        quality = QoSProfile(depth=100)
-        self._imu = node.create_publisher(Imu, 'imu/data_raw', quality)
-        self._odometry = node.create_publisher(Odometry, 'odom', quality)
-        self._clock = node.create_publisher(Clock, '/clock', 10) if speed else None
-        self._heard = node.create_subscription(
-            TwistStamped if stamped else Twist, 'cmd_vel', self._on_command, quality)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _on_command(self, message):
-        rate = getattr(message, 'twist', message).angular.z
-        with self._lock:
-            self.commands.append((now(), rate))
-            self.robot.command(rate)
-
-    def _run(self):
-        interval = INTERVAL / (self._speed or 1.0)
-        due = now()
-        while not self._stop.wait(max(0.0, due - now())):
-            due = max(due + interval, now() - 0.5)  # a computer that slept does not hurry
-            with self._lock:
-                self._publish(self.robot.step())
-
-    def _publish(self, reading):
-        self.moments.append((now(), reading.heading))
-        stamp = self._stamp(reading)
-        self.headings[stamp] = reading.heading
-        header = {'sec': stamp // 10 ** 9, 'nanosec': stamp % 10 ** 9}
-        if self._clock and not (self.clock_absent or self.clock_stands):
-            clock = Clock()
-            clock.clock.sec, clock.clock.nanosec = header['sec'], header['nanosec']
-            self._clock.publish(clock)
-        odometry = Odometry()
-        _set(odometry.header, header, 'odom')
-        odometry.child_frame_id = 'base_link'
-        odometry.pose.pose.orientation.z = math.sin(0.5 * reading.heading)
-        odometry.pose.pose.orientation.w = math.cos(0.5 * reading.heading)
-        odometry.twist.twist.angular.z = reading.rate
-        self._odometry.publish(odometry)
-        if reading.output is not None:
-            imu = Imu()
-            _set(imu.header, header, 'gyro')
-            imu.angular_velocity.z = reading.output
-            imu.orientation_covariance[0] = imu.linear_acceleration_covariance[0] = -1.0
-            self._imu.publish(imu)
-            if self.also:
-                self.also(imu)
-
-    def _stamp(self, reading):
-        """Return the stamp in ns: of the simulation, or of the node's clock."""
-        if not (self.clock_stands or self.robot.stamps_stand) or self._last is None:
-            self._last = (round(reading.stamp * 1e9) if self._speed
-                          else self.node.get_clock().now().nanoseconds)
-        return self._last
-
-    def turned_since(self, since):
-        """Return the angle turned since a time of the steady clock, rad, in either direction."""
-        after = [heading for time_, heading in self.moments if time_ >= since]
-        return sum(abs(b - a) for a, b in zip(after, after[1:]))
-
-    def close(self):
-        self._stop.set()
-        self._thread.join()
-
-
-def _set(header, stamp, frame):
-    header.stamp.sec, header.stamp.nanosec, header.frame_id = stamp['sec'], stamp['nanosec'], frame
-
-
-def now():
-    """Return the steady clock, s."""
-    return time.clock_gettime(STEADY)
 
 
 BEGIN = 1_700_000_000  # s since 1970

@@ -43,7 +43,7 @@ _TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALTERNATIVE_LIMIT = 6.0
 #: A combination that is likelier by this in -2 ln likelihood, but has too many terms, widens the
-#: bounds.
+#: bounds. At 0 those of the angle random walk are 6 to 35 % wider, and hold the truth as often.
 _WIDENING_LIMIT = 1.0
 #: Least p-value of the residuals of an accepted fit.
 _MIN_P_VALUE = 0.05

@@ -293,7 +293,7 @@ def _read_notes(path: str) -> dict[str, str]:
 
 # the record of a log
 
-#: Shortest log for slow effects and for the bias at rest, s.
+#: Shortest log for slow effects and for the bias at rest, s: in less, white noise hides them.
 _MIN_LOG_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'

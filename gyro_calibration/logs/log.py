@@ -585,7 +585,8 @@ class _AxisRotation:
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.
 _FULL_TURN_MARGIN = 0.1
-#: Largest ratio of a gyro's rate to that of its reference, either way, in the same unit.
+#: Largest ratio of a gyro's rate to that of its reference, either way, in the same unit: half way,
+#: as a factor, to 2, the least by which full scales are confused.
 MAX_PLAUSIBLE_FACTOR = 1.4
 
 

@@ -25,7 +25,7 @@ from scipy.special import ndtri
 #: sensitivity in data sheets of MEMS gyros (MPU-6050: 2 %).
 MISALIGNMENT_DEVIATION = 0.02
 #: Least alignment of codes on a lattice (length of the mean phasor): 1 for exact codes, 0 for
-#: continuous values.
+#: continuous values; codes may deviate by 0.13 steps rms.
 _MIN_ALIGNMENT = 0.7
 
 

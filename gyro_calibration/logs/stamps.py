@@ -32,8 +32,8 @@ SHORT_RATIO = 0.5
 #: Share of short intervals in a log above which its stamps are taken to come in bursts.
 _MIN_BURST_SHARE = 0.02
 
-#: Least number of windows in a record. Windows do not cross gaps of more than 1 / LONG of the
-#: record, and longer windows do not show a motion.
+#: Least number of windows in a record. None crosses a gap of more than this part of the record,
+#: and longer windows do not show a motion.
 MIN_WINDOWS = 50
 
 

@@ -27,7 +27,8 @@ import numpy as np
 
 #: Plausible temperatures, degC, where no valid range is stated.
 _PLAUSIBLE_TEMPERATURES = (-100.0, 200.0)
-#: The response is inverted where the slope of the output over the rate is at least this, 1.
+#: The response is inverted where the slope of the output over the rate is at least this, 1: noise
+#: is amplified up to ten times.
 _MIN_OUTPUT_SLOPE = 0.1
 #: Python floats need no error state of numpy; setting one for each sample would cost time.
 _NO_ERROR_STATE = nullcontext()

@@ -76,7 +76,8 @@ FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 SAMPLE_TIMEOUT = 5.0
 DRIVE_SAMPLE_TIMEOUT = 0.25  # s; likewise of a drive; four intervals of a slower gyro
 STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
-MIN_TURN_ANGLE = 1.0 * DEGREE  # rad; least change of the odometry heading that shows a turn
+#: Least change of the odometry heading that shows a turn, rad: beyond the slack of wheels at rest.
+MIN_TURN_ANGLE = 1.0 * DEGREE
 _MAX_NODE_PAUSE = 1.0  # s; after a longer one in a drive the base has stopped, or turned on
 
 ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '

@@ -36,12 +36,12 @@ from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_TURN_RATE
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-_PART_DURATION = 1.0  # s; of the parts of a stretch that are compared
+_PART_DURATION = 1.0  # s; of the parts of a stretch that are compared: a push shows in one
 _MIN_REPEAT_DURATION = 0.25  # s; repeated values that last as long are a fault
 #: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
-_MAX_DECELERATION = 20.0  # rad/s²; of a robot
+_MAX_DECELERATION = 20.0  # rad/s²; of a robot: six times the default of Nav2's controllers
 #: Height of a pulse, in medians of the steps before it, that no vibration has: 5 of 1.2 million
 #: samples of cars and turntables are higher.
 _MIN_PULSE_RATIO = 10.0

@@ -191,13 +191,15 @@ class RosTime:
         self._last_poll = now
 
 
-#: Largest age of a velocity that is used, s.
+#: Largest age of a velocity that is used, s; slower odometry shows nothing.
 MAX_VELOCITY_AGE = 1.0
-#: Longest motion after the last command to move, s.
+#: Longest motion after the last command to move, s: the default time-out of ros2_control's
+#: diff_drive_controller.
 COASTING_DURATION = 0.5
-#: Largest speeds of wheels at standstill, m/s and rad/s.
+#: Largest speeds of wheels at standstill, m/s and rad/s: what turns slower adds to the bias at
+#: rest, 0.011 deg/s at most.
 STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
-#: Least rate of a turn by odometry, rad/s.
+#: Least rate of a turn by odometry, rad/s: 2.9 deg/s, beyond the bias of a gyro.
 MIN_TURN_RATE = 0.05
 #: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
 MAX_ANGULAR_ACCELERATION = 3.2

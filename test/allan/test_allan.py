@@ -160,12 +160,15 @@ def stamps(count):
     return np.arange(count) * INTERVAL
 
 
-def test_lost_samples_are_counted_and_do_not_change_the_figures():
+@pytest.mark.parametrize('gap, longest', [(0, 50.0), (1000, 5.0)])
+def test_lost_samples_are_counted_and_do_not_change_the_figures(gap, longest):
+    """Also 40 % of them, in gaps of 10 s."""
     generator = np.random.default_rng(10)
     rate = simulate_noise(WHITE, 100_000, INTERVAL, generator)
     kept = generator.random(100_000) > 0.001
-    kept[[0, -1]] = True
     kept[50_000:50_500] = False
+    kept[np.abs(np.arange(100_000) % 2500 - 1200) < 0.5 * gap] = False
+    kept[[0, -1]] = True
     record = build_rest_record(
         stamps(100_000)[kept] + 0.0005 * generator.random(kept.sum()), rate[kept])
     assert (np.isnan(record.rate).sum() == (~kept).sum()
@@ -174,7 +177,7 @@ def test_lost_samples_are_counted_and_do_not_change_the_figures():
     assert record.interval == pytest.approx(INTERVAL, rel=1e-6)
     assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(
         1e-3, rel=0.02)
-    times = [0.01, 0.1, 1.0, 10.0, 50.0]
+    times = [0.01, 0.1, 1.0, longest]
     np.testing.assert_allclose(*(allan_deviation(each, INTERVAL, times).deviation
                                  for each in (record.rate, rate)), rtol=0.05)
 
@@ -208,7 +211,7 @@ def moved(kind):
             'dead': (time, np.full(50_000, 0.01)),
             'dies': (time, np.where(time > 400.0, 0.01, rate)),
             'few': (time[:99], rate[:99]),
-            'lost': (time, np.where(generator.random(50_000) < 0.4, np.nan, rate)),
+            'lost': (time, np.where(generator.random(50_000) < 0.5, np.nan, rate)),
             'tatters': (time + 5.0 * np.cumsum(generator.random(50_000) < 0.015), rate),
             'uneven': (np.cumsum(0.006 + 0.008 * generator.random(50_000)
                                  + 0.05 * np.sin(time / 80.0) ** 2), rate)}[kind]
@@ -220,7 +223,7 @@ def moved(kind):
      ('jolt', r'moved.*from (199|200)\.\d+ s on'), ('swing', 'the record contains something'),
      ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
      ('tatters', r'10 ms apart.*--rate'), ('few', '99 samples.*at least 100'),
-     ('lost', '40 % of the samples are lost'), ('uneven', 'no even interval.*--rate')])
+     ('lost', 'wanted 4 octaves.*without losses'), ('uneven', 'no even interval.*--rate')])
 def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
         record = build_rest_record(*moved(kind))

@@ -122,23 +122,18 @@ def test_every_answer_has_a_picture(run_model, tmp_path):
         (tmp_path / 'picture.png').unlink()
 
 
-def test_a_diagnosis_names_its_causes_and_writes_its_files(tmp_path):
+def test_a_diagnosis_names_its_causes_writes_its_files_and_shows_its_report(tmp_path):
     rate = np.tile(np.linspace(-1.0, 1.0, 21), 6)
     output = rate + 0.02 * rate ** 3 + 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
-    found = diagnose(Log(output=output, reference_rate=rate))
+    log = Log(output=output, reference_rate=rate)
+    assert repr(log) == '<Log: 126 rows of output, reference_rate>'
+    found = diagnose(log)
     assert 'cubic_nonlinearity' in found.causes
     found.write(tmp_path)
     assert read_model(tmp_path / 'model.yaml').terms == found.model.terms
     assert repr(found.model).startswith('<GyroModel: ') and 'cubic_nonl' in repr(found.model)
-
-
-def test_a_diagnosis_shows_its_report_and_its_charts_in_a_notebook(tmp_path):
-    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    rate = np.tile(np.linspace(-1.0, 1.0, 21), 6)
-    log = Log(output=rate + 0.02 * rate ** 3, reference_rate=rate)
-    found = diagnose(log)
-    assert repr(log) == '<Log: 126 rows of output, reference_rate>'
     assert 'cubic nonlinearity' in found._repr_html_() and 'iframe srcdoc' in found._repr_html_()
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
     figure = found.plot(tmp_path / 'picture.png')
     assert 'rate [deg/s]' in [axes.get_xlabel() for axes in figure.axes]
 

@@ -12,105 +12,33 @@
 The compensation node: its messages, parameters and services, and drives of a small robot.
 
 What it computes and decides is tested in test_pipeline.py and test_calibration_session.py. Here
-are its messages, by a node that nobody spins, and what needs a process of its own on real DDS.
-Tests wait for events; they accept that a machine that delays samples by 0.25 s ends a drive.
+are its messages and services, by a node that nobody spins, and drives of a process on real DDS.
 
 """
 
+from contextlib import ExitStack
+from dataclasses import replace
+import itertools
 import math
-import os
-import signal
-import time
 
 from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
-from rig import now, Robot, RosRobot
 
 try:
-    from diagnostic_msgs.msg import DiagnosticArray
     from gyro_calibration.ros.compensation_node import CompensationNode
-    from gyro_calibration.ros.runner import LATCHED_QOS
     from rclpy.qos import ReliabilityPolicy
+    from robot_faults import Fault, FAULTS, Stage
     from sensor_msgs.msg import Imu
     from std_srvs.srv import Trigger
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
 MODEL = 'effects: {bias: {bias: 0.01}}\nnoise: {angle_random_walk: 7.0e-4}\n'
-
-
-PACE = 0.0015  # s between messages: stamps run 7 times faster than the clock
-
-
-class FakeGyro:
-    """Publishes raw rates with stamps of its own clock, and collects what the node makes of it."""
-
-    def __init__(self, ros, wait_until):
-        self.ros, self.wait_until, self.number = ros, wait_until, 0
-        self._publisher = ros.publisher(Imu, 'imu/data_raw', 1000)
-        self.imu = ros.collect(Imu, 'imu/data')
-        self.status = ros.collect(DiagnosticArray, '/compensation_node/calibration_status',
-                                  LATCHED_QOS)
-        self.meet()
-
-    def meet(self):
-        """
-        Rest until a node that was just started receives samples; begin at heading zero.
-
-        A node that is started anew needs no second gyro: two publishers would be an error.
-
-        """
-        self.imu.clear(), self.status.clear()
-        self.wait_until(lambda: self.send(0.0) or self.imu and self.status, 60.0, 'the node')
-        last = sample(self.number - 1, 0.0).header.stamp
-        self.wait_until(lambda: self.imu[-1].header.stamp == last, what='the last')
-        assert self.call('reset_heading').success
-        self.imu.clear()
-
-    def send(self, rate):
-        self._publisher.publish(sample(self.number, float(rate)))
-        self.number += 1
-
-    def play(self, rates, until=lambda: False):
-        """Publish many samples, and return when the node has taken the last one."""
-        received = len(self.imu)
-        for sent, rate in enumerate(rates, 1):
-            self.send(rate)
-            time.sleep(PACE)
-            if sent % 100 == 0:  # a machine that is busy elsewhere must not overrun the queues
-                self.wait_until(lambda: len(self.imu) >= received + sent - 300,  # noqa: B023
-                                what='the node to keep up')
-            if until():
-                break
-        self.wait_until(lambda: len(self.imu) >= received + sent, what=f'{sent} samples')
-
-    def call_later(self, name):
-        return self.ros.call(Trigger, f'/compensation_node/{name}')
-
-    def call(self, name):
-        response = self.call_later(name)
-        self.wait_until(response.done, what=f'the response of {name}')
-        return response.result()
-
-    def calibrating(self):
-        return bool(self.status) and self.status[-1].status[0].message.startswith('calibrating')
-
-
-@pytest.fixture
-def start(start_node, ros, wait_until, tmp_path):
-    (tmp_path / 'model.yaml').write_text(MODEL)
-
-    def start():
-        parameters = {'calibration_file': tmp_path / 'calibration.yaml', 'stationary.threshold': 0}
-        return start_node('compensation_node', parameters), FakeGyro(ros, wait_until)
-    return start
-
-
-def rest(mean, count):
-    return mean + 1e-3 * np.random.default_rng(0).standard_normal(count)
+#: What a drive ends by where the machine is busy.
+HELD_UP = 'no sample came', 'this computer was busy'
 
 
 @pytest.fixture
@@ -219,138 +147,59 @@ def test_parameters_are_checked_described_and_taken_on_at_once(hold):
     assert held.node.get_parameter('heading_frame').value == 'odom'
 
 
-def test_services_answer_when_they_are_done_and_the_result_outlives_the_node(
-        start, start_node, wait_until, tmp_path):
-    node, gyro = start()
-    assert not gyro.call('cancel_calibration').success
-    first = gyro.call_later('calibrate_bias')
-    wait_until(gyro.calibrating, what='the calibration to begin')
-    second = gyro.call('calibrate_bias')
-    assert not second.success and 'in progress' in second.message
-    gyro.play(rest(0.02, 500))
-    assert not first.done()
-    assert gyro.call('cancel_calibration').success
-    wait_until(first.done)
+def test_services_answer_when_they_are_done_and_the_result_outlives_the_node(hold, tmp_path):
+    numbers = itertools.count()
+
+    def call(name):
+        return held.call(f'/compensation_node/{name}', Trigger)
+
+    def play(rate, count):
+        for noise in 1e-3 * np.random.default_rng(0).standard_normal(count):
+            held.send('/imu/data_raw', sample(next(numbers), rate + noise))
+        held.tick()
+    held = hold(stationary__threshold=0)
+    play(0.0, 300)
+    assert not call('cancel_calibration').success and not call('finish_calibration').success
+    first = call('calibrate_bias')
+    assert not first.done() and 'in progress' in call('calibrate_bias').message
+    play(0.02, 500)
+    assert not first.done() and call('cancel_calibration').success
     assert first.result().message == 'refused: cancelled'
-    again = gyro.call_later('calibrate_bias')
-    wait_until(gyro.calibrating)
-    gyro.play(rest(0.02, 1700), until=again.done)
-    wait_until(again.done, what='the answer')
-    assert again.result().success, again.result().message
-    assert not gyro.call('finish_calibration').success
+    again = call('calibrate_bias')
+    play(0.02, 1700)
+    assert again.done() and again.result().success, again.result().message
     assert read_model(tmp_path / 'calibration.yaml').self_calibration.bias == pytest.approx(
         0.02, abs=4e-4)
-    assert node.stop() == 0
-    start_node('compensation_node', parameters={'calibration_file': tmp_path / 'calibration.yaml',
-                                                'stationary.threshold': 0})
-    gyro.meet()
-    assert 'bias 1.14' in gyro.status[-1].status[0].message
-    gyro.play(np.full(20, 0.32))
-    assert gyro.imu[-1].angular_velocity.z == pytest.approx(0.3, abs=1e-3)
+    held = hold(stationary__threshold=0)
+    status, = held.sent['/compensation_node/calibration_status'][-1].status
+    assert 'bias 1.14' in status.message
+    play(0.32, 20)
+    assert held.sent['/imu/data'][-1].angular_velocity.z == pytest.approx(0.3, abs=5e-3)
 
 
-# Drives under faults
+# Drives under faults, by the benchmark of them: node and robot on real DDS
 
 
-FULL_RATE = math.radians(40.0)
-PROFILE = 'time_s,rate_dps\n0,0\n1,0\n1.5,45\n4.5,45\n5,0\n6,0\n6.5,-45\n9.5,-45\n10,0\n11,0\n'
-HELD_UP = 'no sample came', 'this computer was busy'
+def killed_softly(stage):
+    stage.process.terminate()
+    assert stage.process.wait(30.0) == 0
 
 
-class Stage:
-
-    def __init__(self, ros, wait_until, start_node, folder):
-
-        self.ros, self.wait_until, self._start_node, self._folder = (
-            ros, wait_until, start_node, folder)
-        self.samples, self.reports = ros.collect(Imu, 'imu/data'), []
-        ros.node.create_subscription(DiagnosticArray, '/diagnostics',
-                                     lambda array: self.reports.append(array.status[0]), 10)
-        self.closing = []
-
-    def robot(self, **how):
-        self.base = RosRobot(self.ros.node, Robot(noise=5e-3), **how)
-        self.closing.append(self.base.close)
-        return self.base
-
-    def node(self, **parameters):
-        """Start the node, and return when it has received samples of a robot at rest."""
-        (self._folder / 'model.yaml').write_text(MODEL)
-        (self._folder / 'profile.csv').write_text(PROFILE)
-        given = {'model_file': self._folder / 'model.yaml',
-                 'calibration_file': self._folder / 'calibration.yaml',
-                 'calibration.profile_file': self._folder / 'profile.csv',
-                 'calibration.drive': 'true', **parameters}
-        before = len(self.samples)
-        self.process = self._start_node('compensation_node', given)
-        self.wait_until(lambda: len(self.samples) > before + 150, 60.0, 'imu/data')
-        return self.process
-
-    def call(self, name='calibrate'):
-        return self.ros.call(Trigger, f'/compensation_node/{name}')
-
-    def is_held_up(self, message):
-        """Tell whether a refusal is the fault of a busy machine, on which /clock comes late."""
-        return any(f'refused: {words}' in message for words in HELD_UP) or (
-            'refused: ROS time stands still' in message and os.getloadavg()[0] > os.cpu_count())
-
-    def drive(self):
-        """Calibrate until the robot turns at full rate, and return the answer to come."""
-        for _ in range(5):
-            answer = self.call()
-            self.wait_until(
-                lambda: abs(self.base.robot.rate) > FULL_RATE or answer.done(),  # noqa: B023
-                60.0, 'full rate')
-            if not answer.done():
-                return answer
-            assert self.is_held_up(answer.result().message)
-            self.wait_until(lambda: abs(self.base.robot.rate) < 1e-4, what='the robot to stand')
-            time.sleep(1.0)  # a command is remembered for so long
-        raise AssertionError('the machine held up five drives')
-
-    def refused(self, answer, words, begin):
-        self.wait_until(answer.done, 30.0, 'the answer')
-        message = answer.result().message
-        assert not answer.result().success
-        assert any(each in message for each in (words, *HELD_UP)), message
-        self.wait_until(lambda: self.base.commands[-1][1] == 0.0, 10.0, 'a zero')
-        driven = [when for when, rate in self.base.commands if rate and when > begin]
-        return max(driven, default=begin) - begin
-
-    def says(self, words):
-        self.wait_until(lambda: any(words in each.message and each.level == each.ERROR
-                                    for each in list(self.reports)), 30.0, words)
-
-
-@pytest.fixture
-def stage(ros, wait_until, start_node, tmp_path):
-    stage = Stage(ros, wait_until, start_node, tmp_path)
-    yield stage
-    for close in stage.closing:
-        close()
-
-
-def test_without_a_clock_of_the_simulation_nothing_drives_and_where_it_stops_the_robot_does(stage):
-    robot = stage.robot(speed=1.0)
-    robot.clock_absent = True
-    stage.node(use_sim_time='true')
-    answer = stage.call()
-    stage.wait_until(answer.done, what='the answer')
-    assert 'ROS time stands still' in answer.result().message
-    stage.says('ROS time stands still')
-    assert not any(rate for _, rate in robot.commands)
-    robot.clock_absent = False
-    stage.wait_until(lambda: 'ROS time stands still' not in stage.reports[-1].message)
-    answer = stage.drive()
-    begin, robot.clock_stands = now(), True
-    assert stage.refused(answer, 'ROS time stands still', begin) < 2.0
-
-
-def test_a_node_that_is_ended_in_mid_run_commands_zero_first_and_answers(stage):
-    robot = stage.robot()
-    node = stage.node()
-    stage.drive()
-    assert node.stop(signal.SIGTERM) == 0
-    assert 'refused: this node was ended' in node.output
-    stage.wait_until(lambda: robot.commands[-1][1] == 0.0, what='a zero')
-    stage.wait_until(lambda: abs(robot.robot.rate) < 0.01, what='the robot to stand')
+@pytest.mark.parametrize('name, words', [
+    ('clock_absent', 'ROS time stands still'), ('clock_paused', 'ROS time stands still'),
+    ('ended', 'this node was ended')])
+def test_a_fault_ends_a_drive_with_a_zero_and_an_answer(ros_domain, tmp_path, name, words):
+    """Where a busy machine ended the drive before the fault did, it is tried again."""
+    fault = replace({**FAULTS, 'ended': Fault('', killed_softly)}[name], seconds=3.0)
+    for _ in range(5):
+        with ExitStack() as closing:
+            stage = Stage(tmp_path, closing)
+            row = fault.row(stage)
+        if not any(f'refused: {each}' in row.answer for each in HELD_UP):
+            break
+    printed = (tmp_path / 'node.txt').read_text()
+    assert words in (printed if name == 'ended' else row.answer)
+    assert 'Traceback' not in printed and not row.still
+    driven = any(rate for _, rate in stage.robot.commands)
+    assert row.zero < 2.0 if driven else name == 'clock_absent'
+    assert name == 'ended' or (row.level == 'ERROR' and words in row.message)

@@ -70,13 +70,14 @@ def test_raw_rates_are_integrated_by_the_trapezoid_rule_without_wrapping_until_a
     assert rig.feed(rates[-1:])[0].heading == pytest.approx(rates[-1] * INTERVAL, abs=1e-7)
 
 
-@pytest.mark.parametrize('jump, turned, count, words', [
-    (0.49, 0.25, {'lost_samples': 49, 'restarts': 0}, ''),
-    (-5.0, 0.0, {'restarts': 1}, 'jumps back by 4.990'),
-    (3.0, 0.0, {'restarts': 1}, 'no samples for 3.010')])
+@pytest.mark.parametrize('jump, turned, count, words, given', [
+    (0.49, 0.25, {'lost_samples': 49, 'restarts': 0}, '', {}),
+    (-5.0, 0.0, {'restarts': 1}, 'jumps back by 4.990', {}),
+    (3.0, 0.0, {'restarts': 1}, 'no samples for 3.010', {}),
+    (3.0, 1.505, {'lost_samples': 300, 'restarts': 0}, '', {'maximum_gap': 20.0})])
 def test_a_short_gap_is_bridged_and_after_a_jump_of_the_stamps_integration_begins_anew(
-        tmp_path, jump, turned, count, words):
-    rig = Rig(tmp_path, model='')
+        tmp_path, jump, turned, count, words, given):
+    rig = Rig(tmp_path, model='', **given)
     heading = rig.feed(np.full(100, 0.5))[-1].heading + turned
     rig.skip(jump, steady=abs(jump))
     assert rig.feed([0.5])[0].heading == pytest.approx(heading, abs=1e-6)
