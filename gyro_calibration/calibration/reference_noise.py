@@ -301,23 +301,25 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
     seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
     bias = float(np.median(np.diff((turned - heading)[seconds]) / np.diff(log.time[seconds])))
-    following = np.append(known, known[-1])[
-        np.searchsorted(known, [rows[-1] for rows in runs]) + 1]
+    first, last = np.array([rows[[0, -1]] for rows in runs]).T
+    following = np.append(known, known[-1])[np.searchsorted(known, last) + 1]
+    spans = log.time[last] - log.time[first]
+    unseen = turned[last] - turned[first] - bias * spans
+    jumps = heading[following] - heading[last] - (turned[following] - turned[last])
+    # the error of a jump, and by how much it is likelier with what the gyro turned than without
+    error = float(np.median(np.minimum(np.abs(jumps), np.abs(jumps - unseen))))
+    jumps_as_gyro = jumps ** 2 - (jumps - unseen) ** 2 > (2.0 * bound * error) ** 2
     kept, lost = heading.copy(), []
-    for rows, after in zip(runs, following):
-        begin, end = log.time[rows[[0, -1]]]
+    for place in np.flatnonzero(jumps_as_gyro):
+        rows, span = runs[place], float(spans[place])
         own = turned[rows[0]:rows[-1] + 1] - turned[rows[0]]
-        off = own - own[-1] * (log.time[rows[0]:rows[-1] + 1] - begin) / (end - begin)
-        most = step + bound * (usual.total_walk * math.sqrt(end - begin)
-                               + 2.0 * usual.constant_error)
-        unseen = own[-1] - bias * (end - begin)
-        jump = heading[after] - heading[rows[-1]] - (turned[after] - turned[rows[-1]])
-        excess = np.array([np.abs(off).max(), abs(unseen)]) - step
-        if (excess.max() > most - step and abs(jump - unseen) < abs(jump)
-                and (excess > bound * _usual_changes(log.time, turned - moving, bias,
-                                                     end - begin)).any()):
+        off = own - own[-1] * (log.time[rows[0]:rows[-1] + 1] - log.time[rows[0]]) / span
+        errors = np.maximum(
+            usual.total_walk * math.sqrt(span) + 2.0 * usual.constant_error,
+            _usual_changes(log.time, turned - moving, bias, span))
+        if (np.array([np.abs(off).max(), abs(unseen[place])]) > step + bound * errors).any():
             kept[rows[1:]] = np.nan
-            lost.append((float(begin), float(end), float(np.ptp(own))))
+            lost.append((*log.time[rows[[0, -1]]].tolist(), float(np.ptp(own))))
     if not lost:
         return log, []
     begin, end, angle = max(lost, key=lambda each: each[1] - each[0])

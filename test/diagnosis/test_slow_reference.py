@@ -124,3 +124,16 @@ def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():
     still = diagnose([replace(log, reference_heading=0.0 * tracked)], np.random.default_rng(0))
     assert [each.name for each in still.gates if each.passed is False] == ['motion']
     assert still.verdict == 'mismatched'
+
+
+@pytest.mark.parametrize('seed', [1, 2, 7])
+def test_rests_in_which_the_bias_wanders_are_no_lost_reference(seed):
+    generator, interval, count, white = np.random.default_rng(seed), 0.1, 12000, 1e-4
+    dwells = np.where(np.arange(60) % 3, generator.uniform(-1.5, 1.5, 60), 0.0)
+    rate = np.convolve(np.repeat(dwells, count // 60), np.ones(3) / 3.0, 'same')
+    # a random walk that exceeds the white noise after a second
+    output = (rate + white / np.sqrt(interval) * generator.standard_normal(count)
+              + np.sqrt(3.0 * interval) * white * np.cumsum(generator.standard_normal(count)))
+    heading = np.append(0.0, np.cumsum(0.5 * interval * (rate[1:] + rate[:-1])))
+    log = Log(time=interval * np.arange(count), output=output, reference_heading=heading)
+    assert drop_repeated_headings(log)[1] == []
