@@ -711,7 +711,9 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
         before = np.concatenate(rest.whitened_series(full))
         added = before - off
         score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
-        if known.log_index is not None and information.max() > 0.5 * information.sum():
+        # errors of a response to a command are events of the motion
+        if (known.log_index is not None and information.max() > 0.5 * information.sum()
+                and search.problem.replays[known.log_index].command is None):
             found.append(math.inf)
             continue
         size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
