@@ -37,7 +37,9 @@ from gyro_calibration.logs.quality import (
     mark_rows,
     mask_outliers,
     mask_repeated_samples,
+    noise_before_rounding,
     quantization_step,
+    rounding_product,
 )
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.logs.stamps import Integers as Numbers
@@ -671,10 +673,9 @@ def _find_rounding(output: Array, dwells: Sequence[Numbers]) -> Array:
     """
     Return step and noise of the samples of each dwell, rad/s, shape (n, 2).
 
-    Over all places in a step q, the variance of the samples is that of the noise, v, and ``q² /
-    12``, less that of the rounding of their mean (`rounding_covariance`). Up to ``q² / 4`` it
-    depends on the place, so such dwells have one v. Where most dwells are on one step each, their
-    steps may be those of their rates; then the whole output shows it.
+    Up to a quarter of a squared step, the variance of the samples depends on the place in the
+    step, so such dwells have one noise. Where most dwells are on one step each, their steps may be
+    those of their rates; then the whole output shows it.
 
     """
     is_noisy = np.median([np.ptp(output[rows]) for rows in dwells]) > 0.0
@@ -685,21 +686,8 @@ def _find_rounding(output: Array, dwells: Sequence[Numbers]) -> Array:
     variances = np.array([float(np.var(output[rows])) for rows in dwells]) / step ** 2
     if (quiet := variances <= 0.25).any():
         variances[quiet] = variances[quiet].mean()
-    noise = np.linspace(0.0, 1.0, 1001)
-    samples = noise + 1.0 / 12.0 - _rounding_series(noise, np.zeros(1))
-    return step * np.column_stack([np.ones(len(dwells)), np.sqrt(np.interp(
-        variances, samples, noise))])
-
-
-def _rounding_series(noise: Array, place: Array) -> Array:
-    """Return the mean product of the errors of two rounded means, steps²."""
-    total = np.zeros(np.broadcast_shapes(noise.shape, place.shape))
-    for order in range(1, 30):
-        part = np.exp(-4.0 * (np.pi * order) ** 2 * noise) / (2.0 * (np.pi * order) ** 2)
-        total += part * np.cos(2.0 * np.pi * order * place)
-        if part.max(initial=0.0) < 1e-9:
-            break
-    return total
+    return step * np.column_stack([np.ones(len(dwells)),
+                                   np.sqrt(noise_before_rounding(variances))])
 
 
 def rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
@@ -708,11 +696,9 @@ def rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
 
     The mean of a value x with normal noise of variance v, rounded to a step q, is a periodic
     function of x. Where in a step x lies is not known, but how far two values lie apart is; the
-    mean product of their errors is ``q² / (2 π²) sum(exp(-4 π² k² v / q²) cos(2 π k (x - y) / q)
-    / k²)``, k from 1 on: for x = y it is q² / 12 without noise, and nothing from v = q² / 4 on
-    (Widrow and Kollar 2008, Quantization Noise). Of two dwells, v is the mean, with half of the
-    variance of the distance: of the bias between dwells of nearly one rate, beyond the steps, and
-    of the scale, by the rounding of the fastest rate.
+    mean product of their errors is `rounding_product`. Of two dwells, v is the mean, with half of
+    the variance of the distance: of the bias between dwells of nearly one rate, beyond the steps,
+    and of the scale, by the rounding of the fastest rate.
 
     """
     place, wander = _place_in_steps(rate, output, rounding)
@@ -720,7 +706,7 @@ def rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
     noise = 0.5 * (noise[:, None] + noise + wander * (1.0 - np.eye(len(rate))))
     noise = noise + (apart / max(float(np.abs(place).max()), 1e-300)) ** 2 / 24.0
     is_alike = np.abs(np.log(rounding[:, :1] / rounding[:, 0])) < 1e-6
-    return (_rounding_series(noise, apart) * rounding[:, :1] * rounding[:, 0] * is_alike)
+    return (rounding_product(noise, apart) * rounding[:, :1] * rounding[:, 0] * is_alike)
 
 
 def _place_in_steps(rate: Array, output: Array, rounding: Array) -> tuple[Array, float]:
