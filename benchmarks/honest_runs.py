@@ -135,6 +135,13 @@ def wobble(draw: np.random.Generator) -> Array:
     return rate + draw.uniform(0.02, 0.15) * DEGREE * np.gradient(np.sin(phase), STEP)
 
 
+def wide_wobble(draw: np.random.Generator) -> Array:
+    """Wobble with the wheels by 0.3 deg."""
+    rate = exact(draw)
+    phase = draw.uniform(0.0, 2.0 * math.pi) + np.cumsum(np.abs(rate)) * STEP * draw.uniform(1, 12)
+    return rate + 0.3 * DEGREE * np.gradient(np.sin(phase), STEP)
+
+
 def lag(draw: np.random.Generator) -> Array:
     """Follow with a lag of first order of 0.05 to 0.3 s."""
     constant = draw.uniform(0.05, 0.3)
@@ -220,11 +227,12 @@ def hand_turn(draw: np.random.Generator) -> Array:
 
 Robot = Callable[[np.random.Generator], Array]
 HONEST: dict[str, Robot] = {
-    'as commanded': exact, 'wobble': wobble, 'lag': lag, 'second order': follower,
-    'ramps softer than commanded': soft_ramps, 'encoder of 0.5 deg': follower,
-    'slip up to 1 % of each turn': slipping, 'even slip up to 1 %': slipping_evenly,
-    'wobble, lag and slip': everything,
-    f'lag{SHORT}': lag, f'second order{SHORT}': follower,
+    'as commanded': exact, 'wobble': wobble, 'wobble of 0.3 deg': wide_wobble, 'lag': lag,
+    'second order': follower, 'ramps softer than commanded': soft_ramps,
+    'encoder of 0.5 deg': follower, 'slip up to 1 % of each turn': slipping,
+    'even slip up to 1 %': slipping_evenly, 'wobble, lag and slip': everything,
+    'output in steps of 0.1 to 0.5 deg/s': lag, f'lag{SHORT}': lag,
+    f'second order{SHORT}': follower,
 }
 DISHONEST: dict[str, Robot] = {
     'steady yaw': steady_yaw, 'yaw for a while': yaw_for_a_while,
@@ -242,6 +250,9 @@ def tried(kind: str, gyro: Gyro, seed: tuple[int, ...]) -> tuple[Array, Array] |
     output = ((1.0 + s) * rate + b + drift
               + gyro.white / math.sqrt(STEP) * draw.standard_normal(len(TIME)))
     motion = motion_from_rates(*breakpoints())
+    if kind.startswith('output in steps'):
+        step = draw.uniform(0.1, 0.5) * DEGREE
+        output = step * np.round(output / step)
     if kind.startswith('encoder'):
         at = np.arange(0.0, 20.5, 0.05)
         heading = np.interp(at, TIME, np.cumsum(rate) * STEP - 0.5 * STEP * rate)

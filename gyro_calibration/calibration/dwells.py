@@ -20,7 +20,7 @@ Ramps, the settling of the gyro after them, outliers and repeated samples are le
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import compress
 import math
 from typing import NamedTuple
@@ -37,7 +37,9 @@ from gyro_calibration.logs.quality import (
     mark_rows,
     mask_outliers,
     mask_repeated_samples,
+    noise_before_rounding,
     quantization_step,
+    rounding_product,
 )
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.logs.stamps import Integers as Numbers
@@ -78,6 +80,9 @@ class Dwells:
     location: tuple[str, ...]  # of each dwell in its file, for messages
     remarks: tuple[str, ...] = ()  # on what was found and left out, one sentence each
     rows: tuple[Numbers, ...] = ()  # of the log, whose mean each dwell is
+    # step of a coarse output, and standard deviation of the noise of its samples before they are
+    # rounded, both rad/s, shape (n, 2); empty where the steps do not matter
+    rounding: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def __len__(self) -> int:
         return len(self.rate)
@@ -131,7 +136,8 @@ def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
     temperature = None if dwells.temperature is None else dwells.temperature[mask]
     return Dwells(dwells.rate[mask], dwells.output[mask], temperature, dwells.deviation[mask],
                   dwells.sweep[mask], tuple(compress(dwells.location, mask)), dwells.remarks,
-                  tuple(compress(dwells.rows, mask)))
+                  tuple(compress(dwells.rows, mask)),
+                  dwells.rounding[mask] if len(dwells.rounding) else dwells.rounding)
 
 
 def join_dwells(parts: Sequence[Dwells]) -> Dwells:
@@ -156,7 +162,9 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
                   np.concatenate([part.deviation for part in parts]), np.concatenate(
                       [part.sweep + number for part, number in zip(parts, first_sweep)]),
                   sum((part.location for part in parts), ()), remarks,
-                  sum((part.rows for part in parts), ()))
+                  sum((part.rows for part in parts), ()),
+                  np.concatenate([part.rounding for part in parts])
+                  if all(len(part.rounding) for part in parts) else np.empty((0, 2)))
 
 
 def require_output(log: Log) -> Array:
@@ -200,15 +208,48 @@ def dwells_from_table(log: Log) -> Dwells:
     sweep = (number_sweeps(rate) if names is None else np.array(
         [list(dict.fromkeys(names)).index(names[row]) for row in rows]))
     try:
-        deviation = np.array(log.others.get('deviation_dps', [math.nan] * len(log)),
-                             dtype=float)[rows] * DEGREE
+        deviation: Array = np.array(log.others.get(
+            'deviation_dps', [math.nan] * len(log)), dtype=float)[rows] * DEGREE
     except ValueError as error:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
-    return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
+    output = output[rows]
+    rounding: Array = np.empty((0, 2))
+    if not (deviation > 0.0).any():  # that of the steps is the only one that is known
+        rounding = _coarse_rounding(rate, output, np.column_stack(
+            [np.full(len(rows), _table_step(output, rate)), np.zeros(len(rows))]))
+        deviation = _independent_rounding(rate, output, rounding)
+    return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
                   np.where(deviation > 0.0, deviation, np.nan), sweep,
                   tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
-                  tuple(np.split(rows, len(rows))))
+                  tuple(np.split(rows, len(rows))), rounding)
+
+
+def _table_step(output: Array, rate: Array) -> float:
+    """
+    Return the step of the outputs of a rate table, rad/s; 0 without one.
+
+    It is the largest step that all differences are multiples of: that of the gyro where its
+    samples are all alike, or of the digits that were written. Where the rates explain it, as those
+    of a gyro without errors, it is at most 1 deg/s.
+
+    """
+    step = _largest_divisor(output - output[0])
+    return (_largest_divisor(np.append(output - output[0], DEGREE))
+            if step > 0.5 * _largest_divisor(rate - rate[0]) else step)
+
+
+def _largest_divisor(values: Array) -> float:
+    """Return the greatest common divisor of values, to 1e-9 of the largest; else 0."""
+    values = np.abs(values)
+    smallest = 1e-9 * float(values.max(initial=0.0))
+    while (values > smallest).any():
+        divisor = float(values[values > smallest].min())
+        rest = np.abs(values - divisor * np.rint(values / divisor))
+        if (rest <= smallest).all():
+            return divisor
+        values = np.append(rest, divisor)
+    return 0.0
 
 
 def number_sweeps(rate: Array) -> Numbers:
@@ -409,13 +450,13 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     if share <= FEW_DWELLS_SHARE:
         remarks.append(f'only {100.0 * share:.0f} % of the time is in dwells; '
                        '--method likelihood uses all of it')
-    rate, output, deviation = _average(samples, dwells)
+    rate, output, deviation, rounding = _average(samples, dwells)
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None
                   else np.array([temperature[rows].mean() for rows in dwells]), deviation,
                   number_sweeps(rate),
                   tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
-                  tuple(remarks), tuple(row[rows] for rows in dwells))
+                  tuple(remarks), tuple(row[rows] for rows in dwells), rounding)
 
 
 def _find_straight(samples: _Samples) -> list[slice]:
@@ -590,14 +631,16 @@ def _format_occurrences(number: int) -> str:
 
 # means
 
-def _average(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array, Array]:
+def _average(samples: _Samples,
+             dwells: Sequence[Numbers]) -> tuple[Array, Array, Array, Array]:
     """
     Return reference rate, output and its standard deviation of each dwell (Ojeda et al., eq. 6).
 
     Heading and integral of the output are averaged with the same weights, so that deviations of
     the table from its steady rate are the same in both. The deviation is that of four to twelve
     batches of at least 0.75 s, in which a vibration of the table and the response of the gyro's
-    filter average out; nan where it is not known. The rounding of the output adds its own.
+    filter average out; nan where it is not known. The rounding of the output adds its own, and is
+    returned, too.
 
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
@@ -620,33 +663,81 @@ def _average(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array
     # same in all dwells under white noise.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
+    rounding = _coarse_rounding(rate, output, _find_rounding(samples.output, dwells))
     deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2
-                        + _rounding_variance(samples.output, dwells))
-    return rate, output, np.where(deviation > 0.0, deviation, np.nan)
+                        + _independent_rounding(rate, output, rounding) ** 2)
+    return rate, output, np.where(deviation > 0.0, deviation, np.nan), rounding
 
 
-def _rounding_variance(output: Array, dwells: Sequence[Numbers]) -> Array:
+def _find_rounding(output: Array, dwells: Sequence[Numbers]) -> Array:
     """
-    Return the variance of the mean of each dwell due to the steps of its output, shape (n,).
+    Return step and noise of the samples of each dwell, rad/s, shape (n, 2).
 
-    The mean of a value with normal noise of variance v, rounded to a step q, is a periodic
-    function of the value; its error has the variance ``q² / (2 π²) sum(exp(-4 π² k² v / q²) /
-    k²)``, k from 1 on: q² / 12 without noise, and nothing from v = q² / 4 on (Widrow and Kollar
-    2008, Quantization Noise). v is such that ``v + q² / 12`` less this is the variance of the
-    samples. Dwells that are rounded to the same step have the same error, so each of n has n
-    times this variance.
+    Up to a quarter of a squared step, the variance of the samples depends on the place in the
+    step, so such dwells have one noise. Where most dwells are on one step each, their steps may be
+    those of their rates; then the whole output shows it.
 
     """
-    step = quantization_step(output)
+    is_noisy = np.median([np.ptp(output[rows]) for rows in dwells]) > 0.0
+    step = (quantization_step(output[np.concatenate(dwells)]) if is_noisy
+            else _largest_divisor(np.unique(output) - output.min()))
     if not step:
-        return np.zeros(len(dwells))
-    noise, order = np.linspace(0.0, 1.0, 1001), np.arange(1, 100)[:, None]
-    error = np.sum(np.exp(-4.0 * (np.pi * order) ** 2 * noise) / order ** 2, axis=0) / (
-        2.0 * np.pi ** 2)
-    variances = [float(np.var(output[rows])) / step ** 2 for rows in dwells]
-    means = np.array([output[rows].mean() for rows in dwells])
-    alike = np.sum(np.abs(means - means[:, None]) < 0.5 * step, axis=1)
-    return alike * step ** 2 * np.interp(variances, noise + 1.0 / 12.0 - error, error)
+        return np.zeros((len(dwells), 2))
+    variances = np.array([float(np.var(output[rows])) for rows in dwells]) / step ** 2
+    if (quiet := variances <= 0.25).any():
+        variances[quiet] = variances[quiet].mean()
+    return step * np.column_stack([np.ones(len(dwells)),
+                                   np.sqrt(noise_before_rounding(variances))])
+
+
+def rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
+    """
+    Return the covariance of the means of dwells due to the steps of the output, shape (n, n).
+
+    The mean of a value x with normal noise of variance v, rounded to a step q, is a periodic
+    function of x. Where in a step x lies is not known, but how far two values lie apart is; the
+    mean product of their errors is `rounding_product`. Of two dwells, v is the mean, with half of
+    the variance of the distance: of the bias between dwells of nearly one rate, beyond the steps,
+    and of the scale, by the rounding of the fastest rate.
+
+    """
+    place, wander = _place_in_steps(rate, output, rounding)
+    noise, apart = (rounding[:, 1] / rounding[:, 0]) ** 2, place[:, None] - place
+    noise = 0.5 * (noise[:, None] + noise + wander * (1.0 - np.eye(len(rate))))
+    noise = noise + (apart / max(float(np.abs(place).max()), 1e-300)) ** 2 / 24.0
+    is_alike = np.abs(np.log(rounding[:, :1] / rounding[:, 0])) < 1e-6
+    return (rounding_product(noise, apart) * rounding[:, :1] * rounding[:, 0] * is_alike)
+
+
+def _place_in_steps(rate: Array, output: Array, rounding: Array) -> tuple[Array, float]:
+    """Return the expected outputs, shape (n,), and the variance of the bias, both by the steps."""
+    turned, step = rate * fit_scale(output, rate)[1], rounding[:, 0]
+    changes = np.diff(((output - turned) / step)[np.argsort(turned)])
+    # by the median, which outlying dwells do not change: 0.455 of a variance
+    variance = float(np.median(changes ** 2)) / 0.91 - 1.0 / 12.0 if len(changes) else 0.0
+    return turned / step, max(variance, 0.0)
+
+
+def _coarse_rounding(rate: Array, output: Array, rounding: Array) -> Array:
+    """Return the rounding, or none where noise and wander of the bias average it out."""
+    if not rounding.any():
+        return np.empty((0, 2))
+    noise = float(np.min(rounding[:, 1] / rounding[:, 0])) ** 2
+    # from 0.5 on the series is below 1e-9, and the errors are a small part of the scatter
+    return (rounding if noise + 0.5 * _place_in_steps(rate, output, rounding)[1] < 0.5
+            else np.empty((0, 2)))
+
+
+def _independent_rounding(rate: Array, output: Array, rounding: Array) -> Array:
+    """
+    Return deviations of independent errors as large as those by the steps, rad/s, shape (n,).
+
+    Of n dwells with the same error, each has n times its variance.
+
+    """
+    if not len(rounding):
+        return np.zeros(len(rate))
+    return np.sqrt(np.maximum(rounding_covariance(rate, output, rounding), 0.0).sum(axis=1))
 
 
 def _encoder_deviation(heading: Array, step: float, duration: float) -> float:

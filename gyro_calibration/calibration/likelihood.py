@@ -95,6 +95,11 @@ class ScaleBiasFit:
     goodness: GoodnessOfFit | None = None
     # standard deviation between the turns of a profile of the fraction that each lost, 1
     slip_deviation: float = 0.0
+    # by how much both headings differ that the fit leaves unexplained: that of the random walk
+    # over the run, from and to 0, with their root mean square, which is 1 / √6 of it, rad
+    heading_difference: float = math.nan
+    # variance of a mean at a constant rate by the steps of the output, (rad/s)²
+    rounding_variance: float = 0.0
     # drift of a reference in motion against the rests in which it stands, and half its interval of
     # 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
@@ -796,6 +801,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         math.sqrt(averaged_covariance[2, 2]),
         np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end), *start,
         residual_squares, dof, slip_deviation=_rms_slip(data, averages, slip_deviation),
+        heading_difference=math.sqrt(6.0 * np.mean(np.cumsum(estimate.residual) ** 2)),
         response_deviation=response_deviation,
         misalignment=estimate.values[of_axes],
         misalignment_covariance=averaged_covariance[of_axes, of_axes])

@@ -37,6 +37,7 @@ from gyro_calibration.calibration.dwells import (
     MIN_TEMPERATURE_SPREAD,
     Numbers,
     OUTLIER_THRESHOLD,
+    rounding_covariance,
     select_dwells,
 )
 from gyro_calibration.calibration.likelihood import robust_residual
@@ -353,9 +354,17 @@ class Uncertainty:
         likely = weights > 1e-4 * weights.sum()
         weights = weights[likely] / weights[likely].sum()
         size = misfit[likely] / dof
-        return cls(weights, offsets[likely] / lengths,
-                   inverses[likely] * size[:, None, None] / np.outer(lengths, lengths), dof,
-                   np.concatenate(sizes)[likely] * np.sqrt(size)[:, None])
+        covariances = inverses[likely] * size[:, None, None]
+        if len(dwells.rounding):
+            # errors by the steps of the output are known: a small residual does not remove them
+            whiten = Whitener(dwells, scatter).whiten
+            sizes_known, directions = np.linalg.eigh(rounding_covariance(
+                dwells.rate, dwells.output, dwells.rounding))
+            known = np.linalg.pinv(whiten(columns / lengths)) @ whiten(
+                directions * np.sqrt(np.maximum(sizes_known, 0.0)))
+            covariances += np.maximum(1.0 - size, 0.0)[:, None, None] * (known @ known.T)
+        return cls(weights, offsets[likely] / lengths, covariances / np.outer(lengths, lengths),
+                   dof, np.concatenate(sizes)[likely] * np.sqrt(size)[:, None])
 
     def half_width(self, probability: float) -> Array:
         """Return half of the intervals about the fitted values of a probability, shape (m,)."""

@@ -42,7 +42,14 @@ from gyro_calibration.calibration.run_faults import (
     split_run,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise_deviation
+from gyro_calibration.logs.quality import (
+    noise_before_rounding,
+    quantization_step,
+    refuse_dead,
+    refuse_saturated,
+    rounding_product,
+    white_noise_deviation,
+)
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion, motion_from_rates
@@ -192,10 +199,13 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     # slip that all turns have; the root mean square of slips between zero and a largest one is
     # twice their standard deviation
     scale = 1.0 + fit.scale_factor_error
+    rounding = 0.0 if motion.rate is None else _rounding_variance(rate if output is None
+                                                                  else output)
     unobservable = np.diag(
-        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
-         noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2])
-    fit = replace(fit, covariance=fit.covariance + unobservable,
+        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2
+         + rounding / float(np.mean(rate ** 2)),
+         noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2 + rounding])
+    fit = replace(fit, covariance=fit.covariance + unobservable, rounding_variance=rounding,
                   goodness=_goodness_of_fit(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
@@ -205,6 +215,15 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     _refuse_fit(fit, run, motion, limits, white_noise)
     _refuse_shared_noise(fit, white_noise, noise)
     return fit
+
+
+def _rounding_variance(output: Array) -> float:
+    """Return the variance of a mean at a constant rate by the steps of an output, (rad/s)²."""
+    step = quantization_step(output)
+    if not step:
+        return 0.0
+    noise = noise_before_rounding(np.array([(white_noise_deviation(output) / step) ** 2]))
+    return step ** 2 * float(rounding_product(noise, np.zeros(1))[0])
 
 
 def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) -> None:
@@ -336,11 +355,11 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     has_slipped = excess_angle > limits.max_stretch_residual and sigmas > MIN_SLIP_SIGMAS
     slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
             else '')
-    # against measured headings the deviations include the noise of mount and encoder
-    unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
+    # against measured headings the deviations include the noise of mount and encoder; a wobble
+    # with the wheels passes for noise of the rate, but does not accumulate in the heading
     noise_ratio = (fit.goodness.noise_ratio if fit.goodness
                    else fit.angle_random_walk / max(white_noise, 1e-300))
-    strays = (motion.rate is not None and unexplained_angle > limits.max_unexplained_angle
+    strays = (motion.rate is not None and fit.heading_difference > limits.max_unexplained_angle
               and noise_ratio > limits.max_noise_ratio)
     if (has_slipped or strays or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
@@ -456,12 +475,15 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
     white_deviation, mean = _deviation_of_mean(corrected), float(corrected.mean())
     half_difference = _half_difference(corrected)
-    variance = rest_variance(noise, duration, white_deviation, half_difference)
+    variance = (rest_variance(noise, duration, white_deviation, half_difference)
+                + fit.rounding_variance / (1.0 + fit.scale_factor_error) ** 2)
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale, updated = 1.0 + fit.scale_factor_error, fit
     if np.isfinite(fit.covariance).all():
         gain, covariance = combine_with_rest(fit.covariance, scale * mean, scale ** 2 * variance)
         s, b = (gain * scale * mean + (fit.scale_factor_error, fit.bias)).tolist()
+        # run and rest may be on the same place of a step
+        covariance[1, 1] = max(covariance[1, 1], fit.rounding_variance)
         updated = replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
     check = RestCheck(mean, deviation, max(limits.max_rest_rate,
                                            -float(ndtri(0.5 * false_refusal_rate)) * deviation),
@@ -520,7 +542,7 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     # the few increments of the rest may by chance have less than the noise of the gyro
     known_ratio = max(noise.angle_random_walk / at_rest.angle_random_walk, 1.0)
     variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
-                + float(noise.mean_change_variance(duration, duration)))
+                + float(noise.mean_change_variance(duration, duration)) + fit.rounding_variance)
     sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
     stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
     if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot

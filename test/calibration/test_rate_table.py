@@ -16,6 +16,7 @@ import math
 from gyro_calibration.calibration.dwells import (
     Dwells,
     dwells_from_table,
+    extract_dwells,
     find_dwells,
     select_dwells,
 )
@@ -218,3 +219,28 @@ def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
     # errors at the rates of one table are correlated: 10 tables of 12 values each determine the
     # share to 0.02
     assert min(map(np.mean, held)) > 0.95 - 4.0 * 0.02
+
+
+# coarse steps
+
+@pytest.mark.parametrize('has_time', [False, True], ids=['table', 'log'])
+def test_the_steps_of_an_output_without_noise_are_in_the_deviations(has_time):
+    """On 0.2.0 the bias of three rates was stated to 1e-14 deg/s, 0.07 deg/s off."""
+    draw, step, scores = np.random.default_rng(3), 0.2, []
+    for rates in ([0, 45, -45], [0, 1, -1, 2, -2, 5, -5], [0, 33.3, -33.3, 78]):
+        for _ in range(4):
+            s, b = 0.004 * draw.standard_normal(), 0.3 * draw.standard_normal()
+            turned = np.tile(np.array(rates, float), 3)
+            time = None
+            if has_time:
+                turned = np.convolve(np.repeat(turned, 90), np.ones(20) / 20, mode='same')
+                time = np.arange(len(turned)) / 20
+            output = step * np.round(((1.0 + s) * turned + b) / step)
+            dwells = extract_dwells(Log(time, output * DEGREE, reference_rate=turned * DEGREE))
+            fit = fit_effects(dwells, [BIAS, SCALE_FACTOR_ERROR])
+            deviations = np.sqrt(np.diag(fit.model.covariance))
+            assert deviations[0] < step * DEGREE
+            scores.append((np.array([term.values[0] for term in fit.terms])
+                           - [b * DEGREE, s]) / deviations)
+    assert np.abs(scores).max() < 3.5
+    assert np.mean(np.abs(scores) < 1.96) >= 0.85
