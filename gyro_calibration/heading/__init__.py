@@ -11,7 +11,7 @@
 """
 Rates to heading: gaps, integration, standstill, bias, and the uncertainty of the result.
 
-Reading order: `integration`, `kalman`, `stationary`, `tracker`, `bias_table`,
-`heading_estimator`, `log_compensation`.
+Reading order: `integration`, `kalman`, `stationary`, `steady_rates`, `tracker`,
+`bias_table`, `heading_estimator`, `log_compensation`.
 
 """

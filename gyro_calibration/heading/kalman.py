@@ -212,6 +212,13 @@ class HeadingState:
         covariance[index, index] += variance
         return replace(self, covariance=covariance)
 
+    def with_bias_change(self, change: float, variance: float, duration: float) -> HeadingState:
+        """Return the state with a change of the bias, rad/s, that was there for a time, s."""
+        change_of = np.zeros(len(self.mean))
+        change_of[HEADING_INDEX], change_of[WALK_INDEX] = -duration, 1.0
+        return replace(self, mean=self.mean + change * change_of,
+                       covariance=self.covariance + variance * np.outer(change_of, change_of))
+
     def condition_on_heading(self, heading: float, variance: float) -> HeadingState:
         """Return the state given a later estimate of its heading, rad, and variance, rad²."""
         own = self.covariance[HEADING_INDEX, HEADING_INDEX]

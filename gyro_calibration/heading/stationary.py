@@ -51,19 +51,19 @@ _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
 #: to it, correlations of neighbours, and variances of blocks about these means: first those of a
 #: rest, then those of straight drives, up to bends that keep their rate for many minutes.
-#: With variances beyond `_MAX_SCATTER_RATIO` times that of white noise or of the bias, most means
+#: With variances beyond `MAX_SCATTER_RATIO` times that of white noise or of the bias, most means
 #: over 1 s are beyond the limit of `mean_threshold_sigmas`, and most windows beyond that of the
 #: energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
                         for shared in (0.0, *np.exp(-1.0 / np.array([4.0, 64.0, 1024.0])))
                         for fast in (0.0, 1.0, 4.0))]).T
-_MAX_SCATTER_RATIO = 64.0
+MAX_SCATTER_RATIO = 64.0
 #: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1, all
 #: of which are as probable; largest total.
-_PRIOR_COUNTS = np.full(
-    len(SCATTER_RATIOS), 1.0 / np.sum(SCATTER_RATIOS[1:] <= _MAX_SCATTER_RATIO))
-_PRIOR_COUNTS[0] = 3.0
+PRIOR_COUNTS = np.full(
+    len(SCATTER_RATIOS), 1.0 / np.sum(SCATTER_RATIOS[1:] <= MAX_SCATTER_RATIO))
+PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
 #: Rates at which a straight way ends, 1/s, on average after the longest lag; a rest may last.
 ENDING_RATES = (SCATTER_RATIOS > 0.0) / MEAN_LAGS[-1]
@@ -96,13 +96,13 @@ def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
+def chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     return float(chdtri(degrees_of_freedom, chance))
 
 
-def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
+def chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
     """Return the values that chi squared exceeds with a probability, shape (k,)."""
-    return np.array([_chi_squared_quantile(max(round(each), 1), chance)
+    return np.array([chi_squared_quantile(max(round(each), 1), chance)
                      for each in degrees_of_freedom.tolist()])
 
 
@@ -167,13 +167,13 @@ class EnergyDetector:
         self._update_noise_factor(block.duration, count, energy / model_variance,
                                   0.5 * differences / count / model_variance)
         model_variance *= self.noise_factor ** 2
-        if energy >= model_variance * _chi_squared_quantile(
+        if energy >= model_variance * chi_squared_quantile(
                 count - 1, self._false_alarm_chance) / (count - 1):
             return False
         # motion is slower than the samples, so that means over blocks show it far better
         freedom = len(blocks) - 1
         return bool(freedom < 2 or means - total * total / count
-                    < model_variance * _chi_squared_quantile(freedom, self._false_alarm_chance))
+                    < model_variance * chi_squared_quantile(freedom, self._false_alarm_chance))
 
     def _update_noise_factor(self, duration: float, count: int, energy: float,
                              differences: float) -> None:
@@ -187,7 +187,7 @@ class EnergyDetector:
         self._ratios.append((energy, differences))
         if len(self._ratios) >= _MIN_WINDOWS:
             quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
-            quietest *= (count - 1) / _chi_squared_quantile(count - 1, 0.9)
+            quietest *= (count - 1) / chi_squared_quantile(count - 1, 0.9)
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
     @property
@@ -238,11 +238,11 @@ class EnergyDetector:
             blocks[0], freedom, np.array([energy, 0.5 * differences / count]) / variance, full)
         variance *= factor ** 2
         # motion is slower than the samples, so that means over blocks show it far better
-        quiet = (energy * freedom < variance * _chi_squared_quantiles(
+        quiet = (energy * freedom < variance * chi_squared_quantiles(
             freedom, self._false_alarm_chance)) & (
             (end - begin < 3) | (means - total * total / count < variance
-                                 * _chi_squared_quantiles(end - begin - 1.0,
-                                                          self._false_alarm_chance)))
+                                 * chi_squared_quantiles(end - begin - 1.0,
+                                                         self._false_alarm_chance)))
         limits = np.where(full, self._sample_limits(interval, factor), self.sudden_limit)
         self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
                              in sums[:5, begin[-1]:].T.tolist())
@@ -270,7 +270,7 @@ class EnergyDetector:
             _MAX_WINDOWS, axis=1)[:, 1:]
         number = np.minimum(kept + 1 + np.arange(len(last)), _MAX_WINDOWS)
         quietest = np.sort(windows)[:, np.arange(len(last)), number // 10].min(axis=0)
-        quietest *= freedom[last] / _chi_squared_quantiles(freedom[last], 0.9)
+        quietest *= freedom[last] / chi_squared_quantiles(freedom[last], 0.9)
         found = np.where(number < _MIN_WINDOWS, self.noise_factor,
                          np.sqrt(np.clip(quietest, 1.0, _MAX_NOISE_FACTOR ** 2)))
         return np.append(self.noise_factor, found)[
@@ -312,9 +312,9 @@ class RestScatter:
 
     def begin_rest(self, bias_ratio: float) -> None:
         """Begin a rest with a ratio of the variance of the bias, over 1 s, to the white noise."""
-        passes = _MAX_SCATTER_RATIO * max(bias_ratio, 1.0) >= SCATTER_RATIOS
+        passes = MAX_SCATTER_RATIO * max(bias_ratio, 1.0) >= SCATTER_RATIOS
         # numbers of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,)
-        self.counts = self._learned + self._retention * _PRIOR_COUNTS * passes
+        self.counts = self._learned + self._retention * PRIOR_COUNTS * passes
 
     def probabilities(self, likelihood: Array) -> Array:
         """Return the probability of each scatter, shape (k,)."""
@@ -405,6 +405,8 @@ class Epoch:
     is_resting: bool
     heading: float
     pending: float
+    bias_doubt: float  # (rad/s)²
+    begin_time: float  # of the heading, s
     #: Last samples of its blocks, and integrals of the rates since the state: durations, s, lost
     #: variances, rad², and sensitivities, shape (k, m).
     open_integrals: list[tuple[NDArray[np.intp], Array, Array, Array]]
@@ -484,9 +486,12 @@ class EvenSamples:
                               + state.noise.angle_random_walk ** 2
                               / (WINDOW_DURATION if epoch.is_resting else interval[here]))
             found[here, 4] = epoch.is_resting
+            doubt = epoch.bias_doubt * (self.time[here] - epoch.begin_time) ** 2
+            found[here, 3] += epoch.bias_doubt
             if epoch.is_resting:
                 variance = float(state.covariance[HEADING_INDEX, HEADING_INDEX])
                 found[here, :3] = epoch.heading, variance + epoch.pending ** 2, 0.0
+                found[here, 1] += doubt
                 continue
             moving.append(epoch)
             found[here, 2] = self.rate[here] + rows @ values - offset
@@ -502,7 +507,7 @@ class EvenSamples:
             np.cumsum(turned, out=turned)
             first = here.start - epoch.start_index
             found[here, 0] = (turned - pending)[first:]
-            found[here, 1] = pending[first:] ** 2
+            found[here, 1] = pending[first:] ** 2 + doubt
         if moving:
             self._add_variances(moving)
 

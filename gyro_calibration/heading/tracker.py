@@ -65,6 +65,7 @@ from gyro_calibration.heading.stationary import (
     update_scatter,
     WINDOW_DURATION,
 )
+from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
     Array,
     CACHE_BLOCK_SAMPLES,
@@ -180,6 +181,9 @@ class HeadingTracker:
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
+        # None with wheels, which tell of rests
+        self._steady_rates: SteadyRates | None = SteadyRates(covariance)
+        self._heading_begin_time = self._last_time
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
         self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
         if self._last_sample is not None:
@@ -242,6 +246,7 @@ class HeadingTracker:
         """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
         self._advance_to_last_sample()
         self.heading, self._suspected_turn = heading, None
+        self._heading_begin_time = self._last_time
         self._filtered_turn = self._erroneous_turn = 0.0
         self._state = self._state.with_heading(heading, variance)
         self._begin_anew()
@@ -256,7 +261,8 @@ class HeadingTracker:
     @property
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
-        unknown = self._pending_correction ** 2 + self._erroneous_turn ** 2
+        unknown = (self._pending_correction ** 2 + self._erroneous_turn ** 2
+                   + self.doubt_variance(self._last_time))
         if self.is_resting:
             return float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]) + unknown
         if self._open_variance is None:
@@ -266,6 +272,15 @@ class HeadingTracker:
         return (self._open_variance + self._filtered_turn ** 2
                 + self._state.noise.angle_random_walk ** 2 * part.duration
                 + part.lost_variance + part.extra_noise_variance + unknown)
+
+    @property
+    def bias_doubt(self) -> float:
+        """Return the deviation, rad/s, of the bias if another steady rate was that of a rest."""
+        return math.sqrt(0.0 if self._steady_rates is None else self._steady_rates.variance)
+
+    def doubt_variance(self, time: Number) -> Number:
+        """Return the variance of the heading at a stamp, s, by `bias_doubt`, rad²."""
+        return (self.bias_doubt * (time - self._heading_begin_time)) ** 2
 
     # Samples
 
@@ -320,6 +335,7 @@ class HeadingTracker:
         if last is None:
             self._remember([time], [rate])
             self._last_time = self._motion_start_time = self._wheel_motion_time = time
+            self._heading_begin_time = time
             self.rate = rate - self._rate_error(sensitivity)
             return ''
         interval = time - last[0]
@@ -463,7 +479,8 @@ class HeadingTracker:
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
-                     self._pending_correction, [self._open_row(place)])
+                     self._pending_correction, self.bias_doubt ** 2, self._heading_begin_time,
+                     [self._open_row(place)])
 
     def _open_row(self, place: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
         """Return the open integral after a sample as that of an `Epoch`."""
@@ -687,6 +704,8 @@ class HeadingTracker:
         part = self._close_block()
         if wheels is not False:
             self._wheel_motion_time = self._last_time
+        if wheels is not None:
+            self._steady_rates = None
         if self.is_resting:
             self._rest_blocks.append(part)
             self._wheels_stand = wheels is False
@@ -827,7 +846,7 @@ class HeadingTracker:
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._rest_scatter.begin_rest(
-            (self.bias[1] / self._state.noise.angle_random_walk) ** 2)
+            (self._state_bias(self.sensitivity)[1] / self._state.noise.angle_random_walk) ** 2)
         median = median_ratio(self._rest_scatter.probabilities(np.zeros(1)))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
@@ -853,6 +872,8 @@ class HeadingTracker:
             self._rest_scatter.learn(self._snapshots[-1])
         self._state, self.deleted_heading = snapshot.state, snapshot.deleted_heading
         self._open_integral = turn
+        if self._steady_rates is not None:
+            self._steady_rates.remove(turn)
         self._restore_steps(snapshot)
         self._enter_motion(max(lag, WINDOW_DURATION))
         self._advance_state()
@@ -943,12 +964,38 @@ class HeadingTracker:
         remaining = remaining or self._zero_integral
         turn, self._open_integral = self._open_integral - remaining, remaining
         if turn.duration > TIME_TOLERANCE:
+            end = self._last_time - self._block_integral.duration - remaining.duration
+            still = self._with_still_sensitivity(turn)
             if self.is_resting:
-                self._advance_at_rest(self._with_still_sensitivity(turn), remaining)
+                self._advance_at_rest(still, remaining)
             else:
-                self._propagate_state(
-                    turn, self._last_time - self._block_integral.duration - remaining.duration)
+                self._propagate_state(turn, end)
+            if self._detects_rest and self._steady_rates is not None:
+                self._judge_bias(self._steady_rates, still, end)
         self._adopt_state()
+
+    def _judge_bias(self, rates: SteadyRates, turn: RateIntegral, end: float) -> None:
+        """Judge the bias by steady rates, with an integral that ends at a time, s."""
+        sigmas = self._sigmas[MEAN_LAGS[0]]
+        if not rates.add(turn, end, self._state.noise, sigmas, self.is_resting) or (
+                self.is_resting and not rates.variance):
+            return
+        change = rates.judge(self._state, sigmas)
+        if change is None or self.is_resting:
+            return
+        self._state = self._state.with_bias_change(*change, end - self._heading_begin_time)
+        if self._keeps_steps:
+            self._revise_steps(*change)
+
+    def _revise_steps(self, change: float, variance: float) -> None:
+        """Compute the steps again with a change of the bias, rad/s: there was no rest."""
+        first = self.recalibrations[-1][0] if self.recalibrations else 0
+        state = self.steps[first].state_before.with_bias_change(
+            change + self._state.wander_rate[0], variance, 0.0)
+        for place in range(first, len(self.steps)):
+            step = self.steps[place]
+            self.steps[place] = TrackStep(state, step.rate_integral, False, step.end_time)
+            state = state.propagate(step.rate_integral)
 
     def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""
@@ -1046,7 +1093,7 @@ class HeadingTracker:
         self._wander_rate = self._state.wander_rate[0]
         self._calibration_errors = self._state.calibration_errors[0]
         self._error_sensitivity = self._bias_sensitivity = None
-        self._bias_margin = _BIAS_MARGIN_SIGMAS * self.bias[1]
+        self._bias_margin = _BIAS_MARGIN_SIGMAS * self._state_bias(self.sensitivity)[1]
         self._open_variance, self._state_version = None, self._state_version + 1
         estimate = (float(self._state.mean[HEADING_INDEX])
                     + (0.0 if self.is_resting
@@ -1091,6 +1138,11 @@ class HeadingTracker:
 
     def bias_for(self, sensitivity: Array) -> tuple[float, float]:
         """Return the same for another sensitivity, (m,), as of samples at another temperature."""
+        bias, deviation = self._state_bias(sensitivity)
+        return bias, math.hypot(deviation, self.bias_doubt)
+
+    def _state_bias(self, sensitivity: Array) -> tuple[float, float]:
+        """Return the same without `bias_doubt`."""
         if sensitivity is not self._bias_sensitivity:
             bias, variance = self._state.rate_error(sensitivity)
             self._bias_sensitivity, self._cached_bias = sensitivity, (bias, math.sqrt(variance))

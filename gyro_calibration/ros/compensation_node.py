@@ -426,7 +426,8 @@ class CompensationReport:
                     pipeline.alternation_fault, pipeline.turn_fault,
                     pipeline.odometry_fault, pipeline.standstill_fault,
                     store.calibration_hint, store.shared_hint, monitor.bias_alarm,
-                    monitor.noise_alarm, estimator.calibration_message, store.table_hint)
+                    monitor.noise_alarm, estimator.calibration_message, estimator.bias_message,
+                    store.table_hint)
 
     def _sample_values(self, rate: float) -> dict[str, object]:
         """Return counts, heading and temperature; `rate` is the sample rate, Hz."""
