@@ -261,7 +261,8 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
 WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
-#: Lags between which the response of a motion to its reference is constant, s.
+#: Linear response of a motion to its reference rate; lags between which it is constant, s.
+RESPONSE = f'{UNNAMED_PREFIX}rate_change'
 _RESPONSE_LAGS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 1.6, 2.4)
 #: Widths of a bump in time as shares of the duration.
 BUMP_WIDTHS = (0.01, 0.05)
@@ -298,7 +299,7 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
                 yield _unnamed_term(f'{name} and heading',
                                     _wave_columns(heading, number, variables[name]))
     if 'rate' in variables and 'reference_rate' in common_channels(replays):
-        yield RESPONSE
+        yield _response_term(max(each.interval for each in replays))
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
@@ -360,18 +361,16 @@ def _spline_columns(variable: Variable) -> ColumnFunction:
     return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
 
 
-def _response_columns(each: Replay) -> Sequence[Array]:
+def _response_term(interval: float) -> Candidate:
     """Return the mean rate between two lags less the rate, for each pair of neighbouring lags."""
-    time, rate = each.channels.time, each.channels.rate
-    # whole samples
-    edges = np.unique(np.rint(np.array(_RESPONSE_LAGS) / each.interval)) * each.interval
-    turned = integrate(time, rate)
-    late = np.interp(time - edges[:, None], time, turned)
-    return [*((late[:-1] - late[1:]) / np.diff(edges)[:, None] - rate)]
+    # whole samples of the slowest log
+    edges = np.unique(np.rint(np.array(_RESPONSE_LAGS) / interval)) * interval
 
-
-#: Linear response of a motion to its reference rate.
-RESPONSE = Candidate(f'{UNNAMED_PREFIX}rate_change', (), _response_columns)
+    def columns(each: Replay) -> Sequence[Array]:
+        time, rate = each.channels.time, each.channels.rate
+        late = np.interp(time - edges[:, None], time, integrate(time, rate))
+        return [*((late[:-1] - late[1:]) / np.diff(edges)[:, None] - rate)]
+    return Candidate(RESPONSE, (), columns)
 
 
 def _part_of_log(first: float, last: float, log_index: int | None,

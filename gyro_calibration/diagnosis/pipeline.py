@@ -350,7 +350,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
     if not follows:
         found = _search_replays(replays, rate, on_progress)
         replays = found.search.problem.replays
-        responds = RESPONSE.cause in {each.cause for each in found.causes}
+        responds = RESPONSE in {each.cause for each in found.causes}
         settled = find_settled(fit_causes(found.search.problem, found.causes), responds)
         if not responds and not settled:
             return found
@@ -360,7 +360,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
         settled = find_settled(moved, True)
     replays = ([drop_samples(followed.replays[0], ~settled[0])] if settled
                else followed.replays)
-    found = _search_replays(replays, rate, on_progress, {RESPONSE.cause, *HIDDEN_CAUSES})
+    found = _search_replays(replays, rate, on_progress, {RESPONSE, *HIDDEN_CAUSES})
     if follows:
         found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
                         followed=followed)
