@@ -182,9 +182,6 @@ class Replay:
     # follows it with any linear response, which is then taken out of the residual and all columns
     command: Array | None = None
     lag_count: int = 0
-    # noise under which the response is fitted, for what is slower than its mean lag, s
-    response_noise: NoiseShape = NoiseShape()
-    response_lag: float = 0.0
 
     @property
     def point_interval(self) -> float:
@@ -260,42 +257,28 @@ class Replay:
         for kernel in kernels:
             yield oaconvolve(padded, kernel, 'valid')[grid] - kernel.sum() * self.command
 
-    def response_variance(self) -> Array:
-        """
-        Return the variance of coefficients by which the response is weighted, shape (points - 1,).
-
-        A wander of the bias would otherwise pass for a response. What is faster than the lag is
-        also error of the response, which is not stationary, and has equal weights.
-
-        """
-        return self.response_noise.variance(np.minimum(
-            coefficient_angles(self.point_count),
-            self.point_interval / max(self.response_lag, self.point_interval)),
-            self.point_interval)
-
     @cached_property
-    def _response_basis(self) -> tuple[Array, Array, Array]:
-        """Return weighted transforms of all responses, their orthonormal ones, and kernels."""
+    def _response_basis(self) -> tuple[Array, Array]:
+        """Return the transforms of all responses, orthonormal, and their kernels."""
         kernels = response_kernels(self.interval)[:self.lag_count]
         columns = np.array([self._transform(each) for each in self.delayed_commands(kernels)])
-        weighted = columns / self.response_variance()
-        values, vectors = np.linalg.eigh(weighted @ columns.T)
+        values, vectors = np.linalg.eigh(columns @ columns.T)
         kept = values > MIN_RESPONSE_POWER * values[-1]
         scaled = vectors[:, kept].T / np.sqrt(values[kept])[:, None]
-        return scaled @ weighted, scaled @ columns, scaled @ kernels
+        return scaled @ columns, scaled @ kernels
 
     def _without_response(self, transform: Array) -> Array:
         if self.command is None:
             return transform
-        weighted, basis, _ = self._response_basis
-        return transform - (weighted @ transform) @ basis
+        basis = self._response_basis[0]
+        return transform - (basis @ transform) @ basis
 
     def response(self, values: Array) -> Array:
         """Return the response to the command that fits samples best, rad/s, shape (n,)."""
         if self.command is None:
             return np.zeros(len(values))
-        weighted, _, kernels = self._response_basis
-        return next(self.delayed_commands((weighted @ self._transform(values) @ kernels)[None]))
+        basis, kernels = self._response_basis
+        return next(self.delayed_commands((basis @ self._transform(values) @ kernels)[None]))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""

@@ -257,6 +257,13 @@ def test_a_step_that_happens_with_a_change_of_temperature_is_a_step_where_the_ot
         logs[0], found)
 
 
+def test_logs_of_different_sample_rates_are_diagnosed_together():
+    logs = [in_fast_walk(1e3, seed)[0] for seed in (1, 2)]
+    slow = {name: getattr(logs[1], name)[::3] for name in ('time', 'output', 'reference_rate')}
+    found = diagnose([logs[0], replace(logs[1], **slow)], np.random.default_rng(0))
+    assert not found.findings and not found.unexplained
+
+
 # against a model
 
 @pytest.mark.parametrize('factor', [0.7, 1.5])
