@@ -370,6 +370,7 @@ def _response_term(interval: float) -> Candidate:
         time, rate = each.channels.time, each.channels.rate
         late = np.interp(time - edges[:, None], time, integrate(time, rate))
         return [*((late[:-1] - late[1:]) / np.diff(edges)[:, None] - rate)]
+
     return Candidate(RESPONSE, (), columns)
 
 

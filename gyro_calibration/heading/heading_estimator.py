@@ -253,11 +253,11 @@ class HeadingEstimator:
     @property
     def bias_message(self) -> str:
         """Return the message on several rates that may be the bias; '' if it is known better."""
-        tracker, doubt = self.tracker, self.tracker.bias_doubt
+        tracker, ambiguity = self.tracker, self.tracker.bias_ambiguity
         return (f'several steady rates may be that of a rest: the bias may be off by '
-                f'{doubt / DEGREE:.3f} deg/s, and the heading by '
+                f'{ambiguity / DEGREE:.3f} deg/s, and the heading by '
                 f'{math.sqrt(tracker.variance) / DEGREE:.1f} deg; let the robot rest again after '
-                'a turn, or calibrate it' if doubt > tracker.bias[1] / math.sqrt(2.0) else '')
+                'a turn, or calibrate it' if ambiguity > tracker.bias[1] / math.sqrt(2.0) else '')
 
     def age(self, now: float) -> float:
         """Return the age of the calibration of the bias, s; a year if it is unknown."""
@@ -558,7 +558,7 @@ class HeadingEstimator:
             bias, temperature = (total / stretch.count
                                  for total in (stretch.rate_sum, stretch.temperature_sum))
             variance = (self.current_model.noise.angle_random_walk ** 2 / REST_DURATION
-                        + self.tracker.bias_doubt ** 2)
+                        + self.tracker.bias_ambiguity ** 2)
             expected, deviation = self._expected_bias(temperature, stretch.sensitivity)
             if abs(bias - expected) > OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
                 continue

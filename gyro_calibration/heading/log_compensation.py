@@ -169,4 +169,4 @@ def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
     followed = turned - np.interp(time, ends, np.interp(ends, time, turned))
     resting = np.array([step.is_resting for step in steps] or [False])[place]
     return (np.interp(time, ends, heading) + share[place] * followed,
-            np.interp(time, ends, variance) + tracker.doubt_variance(time), resting)
+            np.interp(time, ends, variance) + tracker.ambiguity_variance(time), resting)

@@ -405,7 +405,7 @@ class Epoch:
     is_resting: bool
     heading: float
     pending: float
-    bias_doubt: float  # (rad/s)²
+    ambiguity_variance: float  # of the bias, (rad/s)²
     begin_time: float  # of the heading, s
     #: Last samples of its blocks, and integrals of the rates since the state: durations, s, lost
     #: variances, rad², and sensitivities, shape (k, m).
@@ -486,12 +486,12 @@ class EvenSamples:
                               + state.noise.angle_random_walk ** 2
                               / (WINDOW_DURATION if epoch.is_resting else interval[here]))
             found[here, 4] = epoch.is_resting
-            doubt = epoch.bias_doubt * (self.time[here] - epoch.begin_time) ** 2
-            found[here, 3] += epoch.bias_doubt
+            unknown = epoch.ambiguity_variance * (self.time[here] - epoch.begin_time) ** 2
+            found[here, 3] += epoch.ambiguity_variance
             if epoch.is_resting:
                 variance = float(state.covariance[HEADING_INDEX, HEADING_INDEX])
-                found[here, :3] = epoch.heading, variance + epoch.pending ** 2, 0.0
-                found[here, 1] += doubt
+                found[here, 0], found[here, 2] = epoch.heading, 0.0
+                found[here, 1] = variance + epoch.pending ** 2 + unknown
                 continue
             moving.append(epoch)
             found[here, 2] = self.rate[here] + rows @ values - offset
@@ -507,7 +507,7 @@ class EvenSamples:
             np.cumsum(turned, out=turned)
             first = here.start - epoch.start_index
             found[here, 0] = (turned - pending)[first:]
-            found[here, 1] = pending[first:] ** 2 + doubt
+            found[here, 1] = pending[first:] ** 2 + unknown
         if moving:
             self._add_variances(moving)
 

@@ -58,7 +58,7 @@ class _SteadyRate:
 
 
 class SteadyRates:
-    """Steady rates since the bias was unknown, and the doubt about the bias by them."""
+    """Steady rates since the bias was unknown, and the ambiguity of the bias by them."""
 
     def __init__(self, covariance: Array):
         """Begin with the covariance of the calibration, shape (m, m)."""
@@ -107,8 +107,8 @@ class SteadyRates:
             self._ended.append(self._last)
         self._last = None
 
-    def judge(self, state: HeadingState, sigmas: float) -> tuple[float, float] | None:
-        """Update the doubt; return the change to a more probable bias, rad/s, and its variance."""
+    def compare(self, state: HeadingState, sigmas: float) -> tuple[float, float] | None:
+        """Update `variance`; return the change to a likelier bias, rad/s, and its variance."""
         rates = [*self._ended, *([self._last] if self._last and self._last.step_count > 1 else [])]
         noise, count = state.noise, len(rates)
         if count < 2:

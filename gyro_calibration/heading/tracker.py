@@ -262,7 +262,7 @@ class HeadingTracker:
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
         unknown = (self._pending_correction ** 2 + self._erroneous_turn ** 2
-                   + self.doubt_variance(self._last_time))
+                   + self.ambiguity_variance(self._last_time))
         if self.is_resting:
             return float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]) + unknown
         if self._open_variance is None:
@@ -274,13 +274,13 @@ class HeadingTracker:
                 + part.lost_variance + part.extra_noise_variance + unknown)
 
     @property
-    def bias_doubt(self) -> float:
+    def bias_ambiguity(self) -> float:
         """Return the deviation, rad/s, of the bias if another steady rate was that of a rest."""
         return math.sqrt(0.0 if self._steady_rates is None else self._steady_rates.variance)
 
-    def doubt_variance(self, time: Number) -> Number:
-        """Return the variance of the heading at a stamp, s, by `bias_doubt`, rad²."""
-        return (self.bias_doubt * (time - self._heading_begin_time)) ** 2
+    def ambiguity_variance(self, time: Number) -> Number:
+        """Return the variance of the heading at a stamp, s, by `bias_ambiguity`, rad²."""
+        return (self.bias_ambiguity * (time - self._heading_begin_time)) ** 2
 
     # Samples
 
@@ -479,7 +479,7 @@ class HeadingTracker:
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
-                     self._pending_correction, self.bias_doubt ** 2, self._heading_begin_time,
+                     self._pending_correction, self.bias_ambiguity ** 2, self._heading_begin_time,
                      [self._open_row(place)])
 
     def _open_row(self, place: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
@@ -971,16 +971,16 @@ class HeadingTracker:
             else:
                 self._propagate_state(turn, end)
             if self._detects_rest and self._steady_rates is not None:
-                self._judge_bias(self._steady_rates, still, end)
+                self._compare_steady_rates(self._steady_rates, still, end)
         self._adopt_state()
 
-    def _judge_bias(self, rates: SteadyRates, turn: RateIntegral, end: float) -> None:
-        """Judge the bias by steady rates, with an integral that ends at a time, s."""
+    def _compare_steady_rates(self, rates: SteadyRates, turn: RateIntegral, end: float) -> None:
+        """Compare the bias with steady rates, and an integral that ends at a time, s."""
         sigmas = self._sigmas[MEAN_LAGS[0]]
         if not rates.add(turn, end, self._state.noise, sigmas, self.is_resting) or (
                 self.is_resting and not rates.variance):
             return
-        change = rates.judge(self._state, sigmas)
+        change = rates.compare(self._state, sigmas)
         if change is None or self.is_resting:
             return
         self._state = self._state.with_bias_change(*change, end - self._heading_begin_time)
@@ -1139,10 +1139,10 @@ class HeadingTracker:
     def bias_for(self, sensitivity: Array) -> tuple[float, float]:
         """Return the same for another sensitivity, (m,), as of samples at another temperature."""
         bias, deviation = self._state_bias(sensitivity)
-        return bias, math.hypot(deviation, self.bias_doubt)
+        return bias, math.hypot(deviation, self.bias_ambiguity)
 
     def _state_bias(self, sensitivity: Array) -> tuple[float, float]:
-        """Return the same without `bias_doubt`."""
+        """Return the same without `bias_ambiguity`."""
         if sensitivity is not self._bias_sensitivity:
             bias, variance = self._state.rate_error(sensitivity)
             self._bias_sensitivity, self._cached_bias = sensitivity, (bias, math.sqrt(variance))

@@ -74,7 +74,7 @@ def test_a_slow_turn_after_a_rest_is_a_turn(bias):
         assert np.abs(error).max() < 2.0 and deviation[-1] < 2.0
 
 
-def test_rests_alone_leave_no_doubt():
+def test_rests_alone_leave_no_ambiguity():
     error, deviation = followed([(20, 0), (4, 30), (3, 0), (4, 30), (10, 0)])
     assert (np.abs(error) <= 3.0 * deviation).all()
     assert deviation.max() < 1.0
@@ -96,7 +96,7 @@ def test_blocks_have_the_heading_of_single_samples():
     assert np.array(rows)[:, :2] == pytest.approx(np.asarray(found)[:, :2], rel=1e-9, abs=1e-12)
 
 
-def test_a_user_is_told_of_the_doubt():
+def test_a_user_is_warned_of_the_ambiguity():
     one = estimator()
     time, output, _ = simulated(TURN_FIRST)
     messages = []
