@@ -168,13 +168,14 @@ def heading_difference(log: Log) -> HeadingDifference:
     return HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * longest * interval)))
 
 
-def rate_noise_share(log: Log) -> float:
+def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     """
     Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
 
     A command has none, however it jumps. It is estimated where the reference is quietest, by the
     updates of a held one. White noise is detected by third differences of alternating sign, other
-    noise by changes from sample to sample that the gyro does not show.
+    noise by changes from sample to sample that the gyro does not show, unless the rate is known to
+    be commanded: a robot need not follow those.
 
     """
     assert log.output is not None and log.reference_rate is not None
@@ -205,6 +206,8 @@ def rate_noise_share(log: Log) -> float:
     variance = energy_of_fast / len(fast) / 20.0
     if not (variance > 0.0
             and float(fast[1:] @ fast[:-1]) < _WHITE_CORRELATION_RATIO * energy_of_fast):
+        if is_commanded:
+            return 0.0
         product = -fast * left / 20.0
         # third differences of white noise are correlated over three samples
         deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))

@@ -790,7 +790,8 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
                 and (is_slow(log.reference_rate)
-                     or rate_noise_share(log) > _MAX_RATE_NOISE_SHARE))
+                     or rate_noise_share(log, reference.evidence == 'as given')
+                     > _MAX_RATE_NOISE_SHARE))
     if (reference.kind in ('course', 'odometry') or reference.evidence == 'as given'
             or cross_rotation(log).size):  # of which a part is in the output
         return True

@@ -30,7 +30,12 @@ from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
 from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
 from gyro_calibration.diagnosis.noisy_reference import MAX_GYRO_LAG
-from gyro_calibration.diagnosis.regression import likelihood_with, RegressionFit
+from gyro_calibration.diagnosis.regression import (
+    build_problem,
+    fit_causes,
+    likelihood_with,
+    RegressionFit,
+)
 from gyro_calibration.diagnosis.replay import (
     cosine_transform,
     kernel_lags,
@@ -113,7 +118,7 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
     Return a log with the motion that follows as the reference, and its mean delay, s.
 
     The number of lags is the likeliest one by the information criterion of Bayes, with effects
-    of the gyro along the motion.
+    of the gyro along the motion, and with the noise that a first response leaves.
 
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
@@ -124,11 +129,13 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
                         replay.channels.time < replay.channels.time[0] + longest[len(kernels) - 1])
     delayed = [cosine_transform(late.resample(each)) for each in late.delayed_commands(kernels)]
     others: list[Array] = []
+    moved = late
     for _ in range(2):
-        first = 1 + len(others)
+        first, deviation = 1 + len(others), np.sqrt(moved.response_variance())
         columns = np.array([*(cosine_transform(late.resample(each))
-                              for each in (replay.channels.rate, *others)), *delayed])
-        left = cosine_transform(late.resample(replay.channels.output - replay.reference))
+                              for each in (replay.channels.rate, *others)), *delayed]) / deviation
+        left = cosine_transform(late.resample(
+            replay.channels.output - replay.reference)) / deviation
         squares = left @ left - np.cumsum((np.linalg.qr(columns.T)[0].T @ left) ** 2)
         penalties = np.log(len(left)) * np.arange(len(columns))
         criterion = len(left) * np.log(squares) + penalties
@@ -140,12 +147,14 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
         response = values[first:] / (1.0 + values[0]) @ kernels[:lag_count]
         change = next(late.delayed_commands(response[None]))
         # effects along this motion would otherwise pass for a longer response
-        moved = late.with_rate(replay.channels.rate + change)
+        moved = replace(late.with_rate(replay.channels.rate + change), lag_count=lag_count,
+                        reference=replay.reference + change,
+                        response_noise=moved.response_noise)
         others = [column for name in _MOTION_EFFECTS
                   for column in effect_candidate(name).columns(moved)]
+        fit = fit_causes(build_problem([moved]), [])
+        moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
     moments = kernels[:lag_count] @ lags
     covariance = squares[first + lag_count - 1] / (len(left) - len(columns)) * inverse
-    late = replace(late.with_rate(replay.channels.rate + change), lag_count=lag_count,
-                   reference=replay.reference + change)
-    return late, Estimate.from_half_width(float(response @ lags), NORMAL_QUANTILE_975 * float(
+    return moved, Estimate.from_half_width(float(response @ lags), NORMAL_QUANTILE_975 * float(
         np.sqrt(moments @ covariance[first:, first:] @ moments)), 's')

@@ -156,7 +156,7 @@ _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
 
 #: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1;
 #: and least power of an independent response to the command as a share of the strongest.
-_LEAD, LONGEST_LAG, _LAG_RATIO, MIN_RESPONSE_POWER = 0.1, 5.0, 0.05, 1e-12
+_LEAD, LONGEST_LAG, _LAG_RATIO, MIN_RESPONSE_POWER = 0.1, 20.0, 0.05, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +182,7 @@ class Replay:
     # follows it with any linear response, which is then taken out of the residual and all columns
     command: Array | None = None
     lag_count: int = 0
+    response_noise: NoiseShape = NoiseShape()  # noise under which the response is fitted
 
     @property
     def point_interval(self) -> float:
@@ -257,28 +258,34 @@ class Replay:
         for kernel in kernels:
             yield oaconvolve(padded, kernel, 'valid')[grid] - kernel.sum() * self.command
 
+    def response_variance(self) -> Array:
+        """Return the variance of coefficients that weights the response, shape (points - 1,)."""
+        return self.response_noise.variance(coefficient_angles(self.point_count),
+                                            self.point_interval)
+
     @cached_property
-    def _response_basis(self) -> tuple[Array, Array]:
-        """Return the transforms of all responses, orthonormal, and their kernels."""
+    def _response_basis(self) -> tuple[Array, Array, Array]:
+        """Return weighted transforms of all responses, their orthonormal ones, and kernels."""
         kernels = response_kernels(self.interval)[:self.lag_count]
         columns = np.array([self._transform(each) for each in self.delayed_commands(kernels)])
-        values, vectors = np.linalg.eigh(columns @ columns.T)
+        weighted = columns / self.response_variance()
+        values, vectors = np.linalg.eigh(weighted @ columns.T)
         kept = values > MIN_RESPONSE_POWER * values[-1]
         scaled = vectors[:, kept].T / np.sqrt(values[kept])[:, None]
-        return scaled @ columns, scaled @ kernels
+        return scaled @ weighted, scaled @ columns, scaled @ kernels
 
     def _without_response(self, transform: Array) -> Array:
         if self.command is None:
             return transform
-        basis = self._response_basis[0]
-        return transform - (basis @ transform) @ basis
+        weighted, basis, _ = self._response_basis
+        return transform - (weighted @ transform) @ basis
 
     def response(self, values: Array) -> Array:
         """Return the response to the command that fits samples best, rad/s, shape (n,)."""
         if self.command is None:
             return np.zeros(len(values))
-        basis, kernels = self._response_basis
-        return next(self.delayed_commands((basis @ self._transform(values) @ kernels)[None]))
+        weighted, _, kernels = self._response_basis
+        return next(self.delayed_commands((weighted @ self._transform(values) @ kernels)[None]))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
