@@ -23,8 +23,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
-from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
+from gyro_calibration.calibration.heading_regression import HEADING_TREATMENT, MIN_STRETCHES
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
@@ -39,8 +40,8 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import (
     cosine_transform,
     kernel_lags,
+    LEAD,
     LONGEST_LAG,
-    MIN_RESPONSE_POWER,
     Replay,
     response_kernels,
 )
@@ -60,6 +61,9 @@ _MAX_LAG_SHARE = 0.1
 #: Number of lags of a gyro that are compared with longer ones, and probability by which those have
 #: to be likelier.
 _LAGS_OF_GYRO, _LATE_LEVEL = 4, 0.05
+#: Numbers of time constants and sizes of the prior of a response that are tried; and least
+#: variance of a response by its prior, over that by the noise.
+_TIME_CONSTANTS, _PRIOR_SIZES, _MIN_RATIO = 16, 65, 0.01
 
 
 @dataclass(frozen=True)
@@ -117,44 +121,91 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
     """
     Return a log with the motion that follows as the reference, and its mean delay, s.
 
-    The number of lags is the likeliest one by the information criterion of Bayes, with effects
-    of the gyro along the motion, and with the noise that a first response leaves.
+    It is fitted with effects of the gyro along the motion, and with the noise that a first
+    response leaves.
 
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
     longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]
     kernels = kernels[longest < _MAX_LAG_SHARE * replay.duration]
     # at first the motion follows commands from before the log
-    late = drop_samples(replace(replay, command=replay.channels.rate),
-                        replay.channels.time < replay.channels.time[0] + longest[len(kernels) - 1])
+    moved = late = drop_samples(
+        replace(replay, command=replay.channels.rate),
+        replay.channels.time < replay.channels.time[0] + longest[len(kernels) - 1])
     delayed = [cosine_transform(late.resample(each)) for each in late.delayed_commands(kernels)]
     others: list[Array] = []
-    moved = late
     for _ in range(2):
-        first, deviation = 1 + len(others), np.sqrt(moved.response_variance())
-        columns = np.array([*(cosine_transform(late.resample(each))
-                              for each in (replay.channels.rate, *others)), *delayed]) / deviation
-        left = cosine_transform(late.resample(
-            replay.channels.output - replay.reference)) / deviation
-        squares = left @ left - np.cumsum((np.linalg.qr(columns.T)[0].T @ left) ** 2)
-        penalties = np.log(len(left)) * np.arange(len(columns))
-        criterion = len(left) * np.log(squares) + penalties
-        lag_count = 1 + int(np.argmin(criterion[first:]))
-        columns = columns[:first + lag_count]
-        inverse = np.linalg.pinv(columns @ columns.T, MIN_RESPONSE_POWER, hermitian=True)
-        values = inverse @ columns @ left
-        # of a gain of 1 plus the scale factor error
-        response = values[first:] / (1.0 + values[0]) @ kernels[:lag_count]
+        own = [cosine_transform(late.resample(each)) for each in (replay.channels.rate, *others)]
+        left = cosine_transform(late.resample(replay.channels.output - replay.reference))
+        fitted = _fit_response(np.array([*own, *delayed, left])
+                               / np.sqrt(moved.response_variance()), len(own), kernels @ lags)
+        response = fitted.values @ kernels
         change = next(late.delayed_commands(response[None]))
         # effects along this motion would otherwise pass for a longer response
-        moved = replace(late.with_rate(replay.channels.rate + change), lag_count=lag_count,
+        moved = replace(late.with_rate(replay.channels.rate + change),
+                        responses=fitted.independent @ kernels,
                         reference=replay.reference + change,
                         response_noise=moved.response_noise)
         others = [column for name in _MOTION_EFFECTS
                   for column in effect_candidate(name).columns(moved)]
         fit = fit_causes(build_problem([moved]), [])
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
-    moments = kernels[:lag_count] @ lags
-    covariance = squares[first + lag_count - 1] / (len(left) - len(columns)) * inverse
-    return moved, Estimate.from_half_width(float(response @ lags), NORMAL_QUANTILE_975 * float(
-        np.sqrt(moments @ covariance[first:, first:] @ moments)), 's')
+    return moved, Estimate.from_half_width(
+        float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's')
+
+
+class _Response(NamedTuple):
+    """A response to a command, as the sizes of k delayed commands."""
+
+    values: Array  # sizes, shape (k,), of a gain of 1 plus the scale factor error
+    # sizes of independent responses of one deviation of the prior, in units of the noise: (m, k)
+    independent: Array
+    lag_deviation: float  # standard deviation of the mean delay, s
+
+
+def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
+    """
+    Return the likeliest response as the sizes of k delayed commands with their mean lags, s.
+
+    The transforms, all with the same white noise, are those of effects, the first of which is the
+    commanded rate; of the delayed commands; and of the difference of output and command.
+
+    The prior of the response is a random walk from late to early lags, in a variable that falls
+    exponentially with the lag: the response gets smooth and fades (the stable spline of order 1 of
+    Pillonetto, Chiuso and De Nicolao, Automatica 47, 2011). Its time constant and size are the
+    likeliest. The scale factor error has a prior too.
+
+    """
+    reduced = np.asarray(np.linalg.qr(transforms.T, mode='r'))
+    count = transforms.shape[1] - own_count
+    noise = abs(float(reduced[-1, -1])) / math.sqrt(count - len(lags))
+    prior = np.zeros((1, reduced.shape[1]))
+    prior[0, 0] = noise / HEADING_TREATMENT.prior[0]
+    reduced = np.concatenate([reduced, prior])
+    own, delayed, left = np.split(reduced, [own_count, -1], axis=1)
+    basis = np.linalg.qr(own)[0]
+    free, rest = (each - basis @ (basis.T @ each) for each in (delayed, left[:, 0]))
+    total = float(rest @ rest)
+    best = None
+    for constant in np.geomspace(0.1 * LEAD, LONGEST_LAG, _TIME_CONSTANTS):
+        steps = -np.diff(np.exp(-(lags + LEAD) / constant), append=0.0)
+        walk = np.triu(np.ones((len(lags), len(lags)))) * np.sqrt(steps)
+        walk *= np.gradient(lags)[:, None]
+        along, powers, vectors = np.linalg.svd(free @ walk, full_matrices=False)
+        squares = (along.T @ rest) ** 2
+        for size in np.geomspace(1e-2, 1e14, _PRIOR_SIZES) / powers[0] ** 2:
+            ratios = size * powers ** 2
+            within = total - float(squares @ (ratios / (1.0 + ratios)))
+            criterion = count * math.log(within) + float(np.log1p(ratios).sum())
+            if best is None or criterion < best[0]:
+                independent = math.sqrt(size) * (walk @ vectors.T).T
+                sizes = np.sqrt(ratios) / (1.0 + ratios) * (along.T @ rest)
+                best = criterion, independent, sizes, ratios, within / count
+    assert best is not None
+    _, independent, sizes, ratios, variance = best
+    values = sizes @ independent
+    scale = np.linalg.lstsq(own, left[:, 0] - delayed @ values, rcond=None)[0][0]
+    deviation = math.sqrt(variance * float(np.sum((independent @ lags) ** 2 / (1.0 + ratios))))
+    powers, vectors = np.linalg.svd(delayed @ independent.T, full_matrices=False)[1:]
+    return _Response(values / (1.0 + scale), (vectors @ independent)[powers ** 2 > _MIN_RATIO],
+                     deviation)

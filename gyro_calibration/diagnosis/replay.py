@@ -22,7 +22,7 @@ its variance by ``(3 sin / (2 + cos))²``.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 import math
 
@@ -154,9 +154,8 @@ _GAP_MARGIN_SAMPLES = 6
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
 
 
-#: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1;
-#: and least power of an independent response to the command as a share of the strongest.
-_LEAD, LONGEST_LAG, _LAG_RATIO, MIN_RESPONSE_POWER = 0.1, 20.0, 0.05, 1e-12
+#: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1.
+LEAD, LONGEST_LAG, _LAG_RATIO = 0.1, 20.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,10 +177,11 @@ class Replay:
     # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
     rounding_variance: float = 0.0  # variance of a sample by quantization of the output, (rad/s)²
-    # commanded rate, shape (n,), and number of the lags of `response_kernels`, if the motion
-    # follows it with any linear response, which is then taken out of the residual and all columns
+    # commanded rate, shape (n,), and independent responses to it of one standard deviation of
+    # their prior, shape (k, lags), in units of the noise, if the motion follows the command: what
+    # they explain is then taken out of the residual and all columns
     command: Array | None = None
-    lag_count: int = 0
+    responses: Array = field(default_factory=lambda: np.empty((0, 0)))
     response_noise: NoiseShape = NoiseShape()  # noise under which the response is fitted
 
     @property
@@ -264,28 +264,36 @@ class Replay:
                                             self.point_interval)
 
     @cached_property
-    def _response_basis(self) -> tuple[Array, Array, Array]:
-        """Return weighted transforms of all responses, their orthonormal ones, and kernels."""
-        kernels = response_kernels(self.interval)[:self.lag_count]
-        columns = np.array([self._transform(each) for each in self.delayed_commands(kernels)])
+    def _response_basis(self) -> tuple[Array, Array, Array, Array]:
+        """
+        Return the responses to the command with independent transforms.
+
+        Their transforms, weighted by the noise and not, shape (k, points - 1), with products 1;
+        their kernels, shape (k, lags); and their variance by the prior over that by the noise.
+
+        """
+        columns = np.array([self._transform(each) for each in self.delayed_commands(
+            self.responses)])
         weighted = columns / self.response_variance()
-        values, vectors = np.linalg.eigh(weighted @ columns.T)
-        kept = values > MIN_RESPONSE_POWER * values[-1]
-        scaled = vectors[:, kept].T / np.sqrt(values[kept])[:, None]
-        return scaled @ weighted, scaled @ columns, scaled @ kernels
+        ratios, vectors = np.linalg.eigh(weighted @ columns.T)
+        ratios = np.maximum(ratios, np.finfo(float).tiny)
+        scaled = vectors.T / np.sqrt(ratios)[:, None]
+        return scaled @ weighted, scaled @ columns, scaled @ self.responses, ratios
 
     def _without_response(self, transform: Array) -> Array:
-        if self.command is None:
+        """Return a transform that has the same variance whether along responses or not."""
+        if not len(self.responses):
             return transform
-        weighted, basis, _ = self._response_basis
-        return transform - (weighted @ transform) @ basis
+        weighted, basis, _, ratios = self._response_basis
+        return transform - (weighted @ transform) * (1.0 - (1.0 + ratios) ** -0.5) @ basis
 
     def response(self, values: Array) -> Array:
-        """Return the response to the command that fits samples best, rad/s, shape (n,)."""
-        if self.command is None:
+        """Return the likeliest response to the command in samples, rad/s, shape (n,)."""
+        if not len(self.responses):
             return np.zeros(len(values))
-        weighted, _, kernels = self._response_basis
-        return next(self.delayed_commands((weighted @ self._transform(values) @ kernels)[None]))
+        weighted, _, kernels, ratios = self._response_basis
+        sizes = weighted @ self._transform(values) * ratios / (1.0 + ratios)
+        return next(self.delayed_commands((sizes @ kernels)[None]))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
@@ -294,7 +302,7 @@ class Replay:
 
 def _leading_lags(interval: float) -> int:
     """Return the number of lags before 0, where a reference is late by its stamps."""
-    return round(_LEAD / interval)
+    return round(LEAD / interval)
 
 
 @cache

@@ -51,7 +51,8 @@ def followed(command, delay, frequency, damping):
     return np.array(rates)
 
 
-def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0, period=0.0, jitter=0.0):
+def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0, period=0.0, jitter=0.0,
+                  robot=(0.08, 8.0, 0.7)):
     """Return a log of a robot with its command, which may be held, as the reference rate."""
     generator = np.random.default_rng(seed)
     command = commanded(kind, generator)
@@ -60,7 +61,7 @@ def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0, period=0.0, j
         sent = np.arange(0, len(command), every)
         sent[1:] += np.rint(jitter * every * generator.standard_normal(len(sent) - 1)).astype(int)
         command = command[np.repeat(sent, np.diff(sent, append=len(command)))]
-    rate = followed(command, 0.08, 8.0, 0.7)[::SUBSTEPS]
+    rate = followed(command, *robot)[::SUBSTEPS]
     time = np.arange(COUNT) * INTERVAL
     output = ((1.0 + SCALE) * rate + BIAS + added(rate, time)
               + noise / np.sqrt(INTERVAL) * generator.standard_normal(COUNT))
@@ -80,6 +81,25 @@ def test_the_lag_of_a_robot_is_no_effect_of_its_gyro(kind, noise):
     values = {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
     for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
         assert abs(values[name][0] - true) < 4.0 * values[name][1]
+
+
+@pytest.mark.parametrize('robot', [(0.0, 1.6, 0.4), (0.1, 4.0, 1.0)])
+@pytest.mark.parametrize('kind, walk', [('trapezoids', 0.0), ('trapezoids', 0.3), ('swing', 0.0)])
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_slow_or_ringing_robot_leaves_the_scale_as_it_is(kind, walk, robot, seed):
+    """In a walk of the bias, too, which is as large as the white noise after 3 s."""
+    wander = 3e-4 * walk * np.sqrt(3.0 * INTERVAL) * np.cumsum(
+        np.random.default_rng(900 + seed).standard_normal(COUNT))
+    log = commanded_log(kind, 3e-4, 70 + seed, lambda rate, time: wander, robot=robot)
+    found = diagnose([log], np.random.default_rng(0), reference_kind='rate_command')
+    named = {each.effect: each for each in found.findings if each.status == 'established'}
+    assert {*named} == {'reference_lag'}
+    delay, frequency, damping = robot
+    lag = named['reference_lag'].parameters['reference_lag']
+    assert lag.estimate == pytest.approx(delay + 2.0 * damping / frequency, abs=0.03)
+    (scale, deviation), = [(value, deviation) for name, _, value, deviation
+                           in found.model.estimates() if name == 'scale_factor_error']
+    assert abs(scale - SCALE) < 4.0 * deviation < 0.008
 
 
 @pytest.mark.parametrize('kind, effect, added', [
