@@ -35,7 +35,7 @@ from gyro_calibration.logs.quality import (
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.ndimage import binary_erosion, uniform_filter1d
+from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
@@ -181,6 +181,8 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
     rate, output = log.reference_rate[known], log.output[known]
+    time = np.arange(len(known)) if log.time is None else log.time
+    steps = np.diff(time[known])
     begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
     if log.time is not None and len(begins) < 0.5 * len(rate) and is_command(
             log, log.reference_rate):
@@ -189,23 +191,25 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     if slow is not None and slow.is_held:
         counts = np.diff(begins, append=len(rate))
         rate, output = rate[begins], np.add.reduceat(output, begins) / counts
+        steps = np.ones(len(begins) - 1)
     if len(rate) < 100 or not np.ptp(rate) > 0.0:
         return 0.0
     line = np.polyfit(rate, output, 1)
-    every, rest = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
+    # across lost samples the motion has changed more
+    index = np.flatnonzero(maximum_filter1d(steps, 3)[1:-1] < 1.5 * np.median(steps))
+    every, rest = (np.diff(each, 3)[index] for each in (rate, output - np.polyval(line, rate)))
     # a quick swing may have no three blocks in a row without a reversal, but as many half as long
-    fast = left = every[:0]
+    fast = left = place = every[:0]
     for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
         quiet = _select_quietest(every, block)
         part = every[:len(quiet)][quiet]
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
-            fast, left = part, rest[:len(quiet)][quiet]
+            fast, left, place = part, rest[:len(quiet)][quiet], index[:len(quiet)][quiet]
     if not len(fast):
         return 0.0
-    energy_of_fast = float(fast @ fast)
-    variance = energy_of_fast / len(fast) / 20.0
-    if not (variance > 0.0
-            and float(fast[1:] @ fast[:-1]) < _WHITE_CORRELATION_RATIO * energy_of_fast):
+    energy = float(np.mean(fast ** 2))
+    variance, products = energy / 20.0, (fast[1:] * fast[:-1])[np.diff(place) == 1]
+    if not (variance > 0.0 and products.sum() < _WHITE_CORRELATION_RATIO * energy * len(products)):
         if is_commanded:
             return 0.0
         product = -fast * left / 20.0

@@ -223,15 +223,30 @@ class Replay:
         filled = self._is_filled[:self.point_count * self.decimation]
         return np.asarray(filled.reshape(-1, self.decimation).any(axis=1))
 
-    @property
+    @cached_property
     def _least_reach(self) -> int:
         """
         Return the least number of samples on each side of a gap whose mean bridges it.
 
-        It repeats their noise: with a sixteenth of the log, in 16 coefficients only.
+        It is the one that predicts the samples best, less a line along the rate: in white noise a
+        sixteenth of the log, which repeats its noise in 16 coefficients only; in a random walk
+        fewer.
 
         """
-        return len(self.grid_index) // 16
+        longest = len(self.grid_index) // 16
+        rate, left = ((each - each.mean())[self.valid] for each in (
+            self.channels.rate, self.channels.output - self.reference))
+        left = left - rate * (rate @ left) / max(rate @ rate, np.finfo(float).tiny)
+        total = np.concatenate([[0.0], np.cumsum(left)])
+        inside = np.arange(longest, len(left) - longest)
+
+        def error(reach: int) -> float:
+            around = (total[inside] - total[inside - reach]
+                      + total[inside + 1 + reach] - total[inside + 1])
+            return float(np.mean((left[inside] - around / (2.0 * reach)) ** 2))
+
+        reaches = [longest >> halvings for halvings in range(longest.bit_length())]
+        return min(reaches, key=error, default=1)
 
     def transform_residual(self, values: Array) -> Array:
         """Return the cosine transform of a residual; interpolated points get white noise."""

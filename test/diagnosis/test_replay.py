@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 
+from chance import seeds
 from gyro_calibration.calibration.reference_noise import keep_own_instants
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
@@ -121,6 +122,28 @@ def test_noise_stays_white_where_single_samples_are_lost(share):
     low, high = power[16:2000], power[-2000:]
     # five standard deviations of a ratio of two means of the squares of 2000 normal values
     assert low.mean() / high.mean() == pytest.approx(1.0, abs=5.0 * np.sqrt(4.0 / 2000.0))
+
+
+@pytest.mark.parametrize('seed', seeds(2))
+def test_single_lost_samples_neither_cost_nor_bias_a_scale_in_a_random_walk(seed):
+    """The walk is as large as the white noise after a third of a second."""
+    generator = np.random.default_rng(300 + seed)
+    time = np.arange(12_000) / 40.0
+    rate = (0.6 * np.sin(0.3 * time) + 0.3 * np.sin(1.1 * time)
+            + 0.2 * np.sin(0.07 * time ** 1.2))
+    noise = simulate_noise(Noise(angle_random_walk=1.5e-3, rate_random_walk=8e-3),
+                           len(time), 0.025, generator)
+    log = Log(time=time, output=1.003 * rate + noise, reference_rate=rate)
+    kept = generator.random(len(time)) > 0.15
+    values = []
+    for each in (log, Log(time=time[kept], output=log.output[kept], reference_rate=rate[kept])):
+        found = diagnose([each], np.random.default_rng(0))
+        assert {cause.effect for cause in found.findings} <= {'dropped_samples'}
+        assert not found.reference.noise
+        values += [(value, deviation) for name, _, value, deviation in found.model.estimates()
+                   if name == 'scale_factor_error']
+    (_, whole), (scale, deviation) = values
+    assert deviation < 1.15 * whole and abs(scale - 0.003) < 4.0 * deviation
 
 
 def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
