@@ -14,7 +14,6 @@ Read files within limits of size, and write files atomically.
 A pipe, a socket, a device or a folder is neither waited for nor replaced. A symbolic link is
 followed when it is read, and replaced when it is written; its target does not change. A file that
 is replaced keeps its mode, and its owner and group where that is allowed.
-
 """
 
 from __future__ import annotations
@@ -182,7 +181,6 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
 
     Its folder is made where it is missing. After an error the old file is unchanged. Raise
     `OSError` for a path that is not a regular file, or a link to one.
-
     """
     path, old = Path(path), None
     try:

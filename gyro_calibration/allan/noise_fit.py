@@ -13,7 +13,6 @@ The noise figures of a record: the coefficients of the noise terms, and their bo
 
 Every combination of terms is fitted to the Allan variances at octaves (`CombinationFit`). The fits
 are ranked by likelihood (`Ranking`), and the best one gives the figures.
-
 """
 
 from __future__ import annotations
@@ -25,11 +24,7 @@ import itertools
 import math
 
 from gyro_calibration.allan.deviation import (
-    allan_deviation,
-    AllanChart,
-    chi_squared_bounds,
-    covariance_form,
-)
+    allan_deviation, AllanChart, chi_squared_bounds, covariance_form)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.stamps import Integers
 from gyro_calibration.model.noise import GaussMarkov, Noise, NOISE_TERMS, NoiseTerm, QUANTIZATION
@@ -191,7 +186,6 @@ def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: 
     Fit a combination of nonnegative terms, with the covariance of the fitted noise.
 
     For `misfit` see `NoiseFit`. A further term may be fixed at a squared coefficient.
-
     """
     given = np.zeros(_FILTER_BEND + 1)
     if fixed_term >= 0:
@@ -286,7 +280,6 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
     The first octave is the earliest one from which the residuals are within chance; if there is
     none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
     Raise `DataRefused` where no combination fits.
-
     """
     last = max(len(octaves.variance) // 2 - 1, 0)
     for misfit, start in itertools.product(_MISFIT_SHARES, range(last + 1)):
@@ -409,7 +402,6 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Raise
     `DataRefused` for too few samples, or where no sum of terms fits them.
-
     """
     chart = allan_deviation(
         rate, interval,

@@ -13,7 +13,6 @@ Find the noise figures of a gyro in a record at rest, by its Allan deviation.
 
 example: gyro_calibration allan rest.csv --rate 100 --picture allan.png --model model.yaml
 --out model.yaml
-
 """
 
 from __future__ import annotations
@@ -24,11 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.allan.deviation import (
-    allan_deviation,
-    AllanChart,
-    build_rest_record,
-    RestRecord,
-)
+    allan_deviation, AllanChart, build_rest_record, RestRecord)
 from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan

@@ -12,7 +12,6 @@
 Run an emulated gyro, its driver, compensation, self-calibration and a drive here.
 
 example: gyro_calibration demo --out demo
-
 """
 
 from __future__ import annotations
@@ -210,7 +209,6 @@ def run_demo(out: Path, seed: int) -> Answer:
     compensation drives the calibration, then a drive follows.
 
     Raise `OSError` where a node does not answer, or the folder cannot be written to.
-
     """
     out.mkdir(parents=True, exist_ok=True)
     calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',

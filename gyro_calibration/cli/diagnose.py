@@ -12,7 +12,6 @@
 Measure the error of a simulation, name the cause, extend the model, measure the gain.
 
 example: gyro_calibration diagnose drive.csv --model gyro.yaml --out diagnosis
-
 """
 
 from __future__ import annotations

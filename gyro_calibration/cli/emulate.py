@@ -13,7 +13,6 @@ Emulate a gyro on a pseudo-terminal, from a model and a motion or from a log.
 
 example: gyro_calibration emulate --protocol kvh_dsp3000 --model model.yaml --motion robot
 --link /tmp/gyro
-
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@
 Write a model as robot simulators read it.
 
 example: gyro_calibration export --to sdf model.yaml --sample-rate 100
-
 """
 
 from __future__ import annotations

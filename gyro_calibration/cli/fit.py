@@ -12,7 +12,6 @@
 Calibrate from a rate table, a turntable, an encoder, or any log with a reference.
 
 example: gyro_calibration fit table.csv --out model.yaml
-
 """
 
 from __future__ import annotations
@@ -36,11 +35,7 @@ from gyro_calibration.diagnosis.words import as_sentence, display_unit
 from gyro_calibration.files import InputError, suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
-    Effect,
-    polynomial_to_matrix,
-    rate_temperature_polynomial,
-    STATIC_EFFECTS,
-)
+    Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np

@@ -12,7 +12,6 @@
 Record a gyro, from its port or from topics, until Ctrl-C.
 
 example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
-
 """
 
 from __future__ import annotations
@@ -36,11 +35,7 @@ from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.protocol import (
-    ASSUMED_FORCE_NOISE,
-    ASSUMED_NOISE,
-    TRISTATE,
-)
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE, TRISTATE
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
@@ -226,7 +221,6 @@ class CsvRecorder(_Recorder):
 
     The columns are fixed with the first piece. Values that come less often than samples, such as
     the temperature, are repeated until the next one.
-
     """
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
@@ -327,7 +321,6 @@ class _PortSession:
 
     As `_TopicSession`, it has a recorder, counts samples received and lost, and concludes with
     data and remarks of the answer; where nothing came, it has the failure and a remedy.
-
     """
 
     remedy = 'check the port, the power and the wires of the gyro'

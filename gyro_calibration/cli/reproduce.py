@@ -12,7 +12,6 @@
 Compare published numbers of the sources with those reproduced here.
 
 example: gyro_calibration reproduce hong_park
-
 """
 
 from __future__ import annotations

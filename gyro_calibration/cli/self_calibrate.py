@@ -12,7 +12,6 @@
 Find scale factor error and bias from about 20 s of known motion, or from whole turns.
 
 example: gyro_calibration self-calibrate run.csv --profile profile.csv --out model.yaml
-
 """
 
 from __future__ import annotations
@@ -29,17 +28,8 @@ from typing import Any
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import (
-    check_end,
-    check_rest,
-    default_reference_errors,
-    describe_implausible_scale,
-    find_rest_after,
-    METHODS,
-    ReferenceErrors,
-    RestCheck,
-    self_calibrate,
-    to_model_record,
-)
+    check_end, check_rest, default_reference_errors, describe_implausible_scale, find_rest_after,
+    METHODS, ReferenceErrors, RestCheck, self_calibrate, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
@@ -47,10 +37,7 @@ from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import (
-    compensate_log,
-    no_plausible_row_message,
-    plausible_rows,
-)
+    compensate_log, no_plausible_row_message, plausible_rows)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.model.model_file import read_model, write_model

@@ -12,7 +12,6 @@
 Compute the error of a full turn, with a static bias only and with a model.
 
 example: gyro_calibration turn table.csv --picture turn.png
-
 """
 
 from __future__ import annotations
@@ -24,11 +23,7 @@ from typing import Any
 
 from gyro_calibration.calibration.dwells import Dwells, extract_dwells, format_list, select_dwells
 from gyro_calibration.calibration.rate_table import (
-    compute_turn_errors,
-    equal_bins,
-    MIN_TURN_RATE,
-    TurnErrors,
-)
+    compute_turn_errors, equal_bins, MIN_TURN_RATE, TurnErrors)
 from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers, rms
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb

@@ -31,16 +31,8 @@ from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
 from gyro_calibration.logs.columns import AXES, suggest_attitude
 from gyro_calibration.logs.log import (
-    Array,
-    BLOCK_ROWS,
-    DataRefused,
-    DEGREE,
-    Log,
-    read_log,
-    read_log_blocks,
-    select_rows,
-    unwrap_heading,
-)
+    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, read_log, read_log_blocks, select_rows,
+    unwrap_heading)
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel

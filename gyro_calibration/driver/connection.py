@@ -13,7 +13,6 @@ A gyro on a serial port: opens, recognizes and reads it, and opens it again afte
 
 This module has no ROS and starts no thread: `Connection.chunks` gives the samples in the thread of
 the caller.
-
 """
 
 from __future__ import annotations
@@ -33,16 +32,8 @@ import threading
 from typing import NamedTuple
 
 from gyro_calibration.driver.protocols import (
-    AUTO,
-    BAUDS,
-    Decoder,
-    find_protocol,
-    Protocol,
-    Recognition,
-    recognize_protocol,
-    Sample,
-    Settings,
-)
+    AUTO, BAUDS, Decoder, find_protocol, Protocol, Recognition, recognize_protocol, Sample,
+    Settings)
 from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
 import serial
 
@@ -69,7 +60,6 @@ class SerialPort:
 
     Each method raises `PortError` where the device cannot do it or was disconnected; the port is
     then closed.
-
     """
 
     def __init__(self, path: str, baud: int):
@@ -205,7 +195,6 @@ class Connection:
     of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` where the
     protocol is unknown, or settings that it needs are missing. Tests have a clock of their own, s,
     and ports in place of a `SerialPort`.
-
     """
 
     def __init__(self, port: str, protocol: str = AUTO, baud: int = 0,

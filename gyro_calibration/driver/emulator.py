@@ -13,7 +13,6 @@ A gyro on a pseudo-terminal: samples of a simulation or a recording, sent at the
 
 A program opens the path of the emulator like the port of a real gyro. Bytes from the program are
 read and ignored.
-
 """
 
 from __future__ import annotations
@@ -49,7 +48,6 @@ class Emulator:
     read are lost, as on a real line; above 1 the emulator waits for the reader. A symbolic link to
     the pseudo-terminal, whose name differs from run to run, is removed at the end. Raise
     `ValueError` where settings that the protocol needs are missing.
-
     """
 
     def __init__(self, protocol: Protocol, samples: Iterable[Sample],

@@ -23,7 +23,6 @@ date and is set by months when it finds a time server. `NodeTimeConverter` conve
 to stamps of such a clock, `HostTimeConverter` converts its stamps to a continuous time.
 
 No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
-
 """
 
 from __future__ import annotations
@@ -226,7 +225,6 @@ class SampleClock:
     show that samples were lost. The nominal rate of the gyro, Hz, is used for the first samples
     only: its clock is 2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0
     without one, and `min_stamp` the last stamp of another clock.
-
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
@@ -454,7 +452,6 @@ class HostTimeConverter:
         The previous time is -inf for the first sample, which shows no step, and the usual interval
         inf while it is not known. Over a gap the jump of the stamps equals the time between their
         arrivals, but not over a step of the clock.
-
         """
         if previous_time == -math.inf:
             self._unshown_steps.clear()

@@ -16,7 +16,6 @@ the calibration and the diagnosis. A single log does not distinguish slow effect
 warm-up, the temperature) from the wander of the bias. Each is fitted alone with scale factor error
 and bias, to the increments of the heading over spans, with the noise of `noise_grid`. An effect
 repeats over many logs, wander does not.
-
 """
 
 from __future__ import annotations
@@ -40,30 +39,17 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
-    bias_wander_columns,
-    fit_noise_grid,
-    heading_noise,
-)
+    bias_wander_columns, fit_noise_grid, heading_noise)
 from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.gates import (
-    is_at_rest,
-    is_implausible_factor,
-    refuse_mismatch,
-    refuse_unusable,
-)
+    is_at_rest, is_implausible_factor, refuse_mismatch, refuse_unusable)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.files import (
-    describe_error,
-    InputError,
-    open_regular_file,
-    read_bytes,
-    sha256_digest,
-    to_printable,
-    write_atomically,
-)
+    describe_error, InputError, open_regular_file, read_bytes, sha256_digest, to_printable,
+    write_atomically)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import find_delimiter
 from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES, read_log
@@ -146,7 +132,6 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     A log that is named several times is one entry. A table inside a folder is used as well; the
     results of an earlier fleet, and of this one in `excluded_folder`, are not. Raise `InputError`
     where there is none, or a table is wrong or contradicts another one.
-
     """
     found: dict[str, FleetLog] = {}
     visited = {os.path.realpath(excluded_folder)} if excluded_folder else set()
@@ -398,7 +383,6 @@ def process_log(task: LogTask) -> dict[str, Any]:
     ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
     ``slow`` the same of effects that a single log does not distinguish from the wander of the
     bias, each fitted alone; ``diagnosis`` is a summary.
-
     """
     try:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
@@ -480,7 +464,6 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
 
     The offset, s, comes with its standard deviation. A log at rest gives the bias only, and any
     other one is calibrated by `calibrate`. Raise `DataRefused` with the reason and the remedy.
-
     """
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')

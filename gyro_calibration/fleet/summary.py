@@ -12,7 +12,6 @@
 From the records of logs to the errors of the type, the unit and the reference.
 
 They are sentences, data, models, one page that needs nothing else, and tables in CSV and Parquet.
-
 """
 
 from __future__ import annotations
@@ -28,37 +27,13 @@ from typing import Any
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
 from gyro_calibration.diagnosis.report import (
-    Chart,
-    draw_chart,
-    element,
-    join_markup,
-    Line,
-    Markup,
-    render_page,
-)
+    Chart, draw_chart, element, join_markup, Line, Markup, render_page)
 from gyro_calibration.diagnosis.words import (
-    as_sentence,
-    display_unit,
-    format_amount,
-    format_quantity,
-    join_list,
-    readable_name,
-)
+    as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
-    Alarm,
-    DRIVES,
-    find_changes,
-    find_outliers,
-    IntegerArray,
-    Interval,
-    Observations,
-    OWN_SHARE,
-    PooledValue,
-    POWER_ONS,
-    SLOPES,
-    UNITS,
-)
+    Alarm, DRIVES, find_changes, find_outliers, IntegerArray, Interval, Observations, OWN_SHARE,
+    PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -288,7 +263,6 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
     A diagnosis names a false effect at a stated rate. An effect is assigned to the type where more
     logs show it than that rate explains, even without the unit, and without the drive, that show
     it most; else to the unit or the drive whose own logs show it more often.
-
     """
     logs = [each for each in summary.records if each['diagnosis']]
     shown = [{one['effect'] for one in each['diagnosis']['findings']
@@ -368,7 +342,6 @@ def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     They hold the mean values, and as tolerance the deviation of a power-on from them, so that
     their interval of 95 % is that of the fleet. The compensation adds the tolerance until there is
     a self-calibration, which uses it as its prior (`GyroModel.prior_deviations`).
-
     """
     for unit in ('', *summary.units):
         terms, variances, tolerances = [], [], {'bias': 0.0, 'scale_factor_error': 0.0}

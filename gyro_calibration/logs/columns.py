@@ -13,7 +13,6 @@ Names and units of the columns of a log.
 
 A name of the log format states quantity and unit. The user assigns other names, with a unit, as
 `gyro=wz:deg/s`; without a unit, SI is assumed.
-
 """
 
 from __future__ import annotations
@@ -104,7 +103,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
     `user_columns` has the name of a quantity in options -> name of its column, or name:unit. The
     axis is that of names that contain one. Raise `InputError` for an unknown quantity, column or
     unit, a quantity in two columns, or no output.
-
     """
     found, by_user = dict[str, Column](), set[str]()
     for name, text in user_columns.items():

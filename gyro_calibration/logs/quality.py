@@ -54,7 +54,6 @@ def cross_rotation(log: Log) -> Array:
 
     It is planar if by a usual misalignment it turns the heading by less than the white noise of
     the gyro does.
-
     """
     given = [getattr(log, name) for name in ROTATIONS[1:]]
     if log.time is None or log.output is None or any(
@@ -72,7 +71,6 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
 
     Those with nan are left out. Their order is 3 in motion, and 1 at rest, which shows filtered
     noise best.
-
     """
     off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]
@@ -182,7 +180,6 @@ def noise_before_rounding(variance: Array) -> Array:
     Return the variance of the noise of samples by that after they are rounded, steps².
 
     Over all places in a step, rounding adds 1/12 less the variance of the error of the mean.
-
     """
     noise = np.linspace(0.0, 1.0, 1001)
     return np.interp(variance, noise + 1.0 / 12.0 - rounding_product(noise, np.zeros(1)), noise)
@@ -222,7 +219,6 @@ def mask_outliers(values: Array, limit: float) -> Mask:
     Mark single samples beyond a limit from their neighbours and from the median.
 
     The limit is in robust standard deviations. Drift and vibration are not marked.
-
     """
     if len(values) < 4:
         return np.zeros(len(values), dtype=bool)

@@ -15,7 +15,6 @@ The gyro is an Imu; temperature and reference are interpolated at its stamps. Ot
 with a rate, an orientation or a temperature are used where their topic is named. Times are the
 stamps of the headers; times of receipt are used only where headers have no stamps. Notes list this
 and all other corrections.
-
 """
 
 from __future__ import annotations
@@ -163,7 +162,6 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     A sample rate, Hz, replaces the stamps. `on_progress` takes the number of bytes read, `on_note`
     each note on selections and corrections. Raise `LogError` for a recording that cannot be read,
     or has no gyro or several; it names the topics.
-
     """
     contents, series = Contents(), dict[str, _TopicBuffer]()
     for message in read_messages(path, contents, on_progress):

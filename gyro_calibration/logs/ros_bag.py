@@ -16,7 +16,6 @@ are read from the beginning up to the end, or to the point of truncation. No rec
 memory than `MAX_RECORD_BYTES`, and no file may expand to more than an `ExpansionBudget` of its
 size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
-
 """
 
 from __future__ import annotations
@@ -133,7 +132,6 @@ def read_messages(path: str | Path, contents: Contents,
 
     It is a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd; `LogError` for others. The
     progress is the number of bytes read.
-
     """
     done = 0
 

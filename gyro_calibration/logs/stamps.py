@@ -14,7 +14,6 @@ Stamps of samples on an even grid.
 A gyro samples by its own clock, and the stamps of a host jitter. So the samples are numbered, and
 a line fitted to the stamps gives the interval. Samples are lost where the stamps stay late after a
 long step. Where the stamps catch up again, samples were only delayed.
-
 """
 
 from __future__ import annotations

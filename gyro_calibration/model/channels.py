@@ -14,7 +14,6 @@ Channels that need a history: time since power-on, lagged channels, the sign of 
 A `ChannelHistory` takes a stream sample by sample, or a log as a whole or in blocks, with the same
 results but for rounding (1e-14 rad/s). Each lag that is requested starts at the value of its
 channel at that time and is updated from then on.
-
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ class ChannelHistory:
 
         Stamps are in s, quantities in degC, m/s², V and rad, or None where they are not known.
         Rate and output of the channels are 0.
-
         """
         if self._block is None:
             self._start_time = float(_edge_value(time, 0))
@@ -133,7 +131,6 @@ def channels_from_log(log: Log) -> Channels:
     Return the channels of a whole log, with rate and output 0.
 
     Without stamps all rows have time 0. The heading is that of the reference, or 0 without one.
-
     """
     time = np.zeros(len(log)) if log.time is None else log.time
     heading = np.zeros(len(log)) if log.reference_heading is None else log.reference_heading

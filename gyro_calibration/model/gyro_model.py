@@ -305,7 +305,6 @@ class GyroModel:
 
         The rate of the channels is not used. The second value tells whether no rate of the
         `rate_domain` has this output; the correction at the end of the domain is held there.
-
         """
         output, (independent, dependent) = channels.output, self._split_by_rate
         given = output - _sum_errors(independent, channels)
@@ -383,7 +382,6 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
 
     Return the rate, and whether there is none in the domain; the correction at the nearer end of
     the domain is used then. A start and an output have shape (n,), or are numbers.
-
     """
     low, high = domain
     many = isinstance(output, np.ndarray)

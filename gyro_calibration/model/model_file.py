@@ -18,30 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.files import (
-    describe_error,
-    InputError,
-    MAX_MAGNITUDE,
-    suggest_nearest,
-    write_atomically,
-)
+    describe_error, InputError, MAX_MAGNITUDE, suggest_nearest, write_atomically)
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
-    CATALOGUE,
-    Effect,
-    polynomial_from_matrix,
-    rate_temperature_polynomial,
-)
+    CATALOGUE, Effect, polynomial_from_matrix, rate_temperature_polynomial)
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.settings_file import (
-    format_settings,
-    InvalidValue,
-    parse_number,
-    parse_text,
-    read_settings,
-    refuse_unknown_names,
-    validate,
-)
+    format_settings, InvalidValue, parse_number, parse_text, read_settings, refuse_unknown_names,
+    validate)
 import numpy as np
 
 FORMAT = 'gyro_calibration/model'

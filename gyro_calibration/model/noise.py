@@ -89,7 +89,6 @@ def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
 
     The process is a Gauss-Markov process of unit variance; the covariance is that of the mean and
     the value at the end of the interval.
-
     """
     ratio = BIAS_AVERAGING_TIME / time_constant
     decayed = 1.0 - np.exp(-ratio)
@@ -103,7 +102,6 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     Flicker and random walk have no finite variance, but their increments do
     (`NoiseTerm.angle_covariance`). The result holds for sums whose weights add up to zero, such as
     the difference of two biases.
-
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
     angle = (noise.bias_instability ** 2 * FLICKER.angle_covariance(apart)

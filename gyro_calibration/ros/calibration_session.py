@@ -18,7 +18,6 @@ then fits it.
 
 A foreign command is one of another node: own commands come back on `cmd_vel` in the order of
 sending, and every other command is foreign, also an additional zero.
-
 """
 
 from __future__ import annotations
@@ -34,37 +33,18 @@ from types import SimpleNamespace
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
-    calibrate_bias,
-    check_rest,
-    describe_implausible_scale,
-    find_rest_after,
-    ReferenceErrors,
-    RunLimits,
-    self_calibrate,
-    SETTLING_TIME,
-    to_model_record,
-)
+    calibrate_bias, check_rest, describe_implausible_scale, find_rest_after, ReferenceErrors,
+    RunLimits, self_calibrate, SETTLING_TIME, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    Motion,
-    motion_from_headings,
-    motion_from_rates,
-    MotionError,
-    read_motion,
-)
+    CALIBRATION_MOTION, Motion, motion_from_headings, motion_from_rates, MotionError, read_motion)
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
 from gyro_calibration.ros.inputs import (
-    Clock,
-    MAX_ANGULAR_ACCELERATION,
-    node_time,
-    StampDelay,
-    Velocity,
-)
+    Clock, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
 from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
@@ -345,7 +325,6 @@ class CalibrationSession:
         To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
         `receivers` is the number of other nodes that receive the commands, and `conflict` why the
         samples cannot be used, or ''.
-
         """
         run, drive, now = self.run, self._drive, self._clock.steady()
         if now < self._stop_repeat_end and not drive:

@@ -13,7 +13,6 @@ The compensation node: connects `pipeline` to topics, services and timers, and r
 
 It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``, and publishes
 ``imu/data``, ``heading``, ``yaw_rate``, ``~/calibration_status`` and diagnostics.
-
 """
 
 from __future__ import annotations
@@ -28,40 +27,18 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
-    PoseWithCovarianceStamped,
-    Quaternion,
-    Twist,
-    TwistStamped,
-    TwistWithCovarianceStamped,
-)
+    PoseWithCovarianceStamped, Quaternion, Twist, TwistStamped, TwistWithCovarianceStamped)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.logs.cdr import (
-    NOT_REPORTED,
-    NOT_REPORTED_COVARIANCE,
-    NSEC_PER_SEC,
-    UNMEASURED_COVARIANCE,
-    UNMEASURED_VARIANCE,
-    z_axis_covariance,
-)
+    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, UNMEASURED_COVARIANCE,
+    UNMEASURED_VARIANCE, z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
 from gyro_calibration.ros.inputs import Clock, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
-    allow_future_response,
-    call_every,
-    declare_parameters,
-    Diagnostics,
-    ERROR,
-    LATCHED_QOS,
-    OK,
-    publish_on,
-    Report,
-    run_node,
-    status_array,
-    subscribe_to,
-    WARN,
-)
+    allow_future_response, call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK,
+    publish_on, Report, run_node, status_array, subscribe_to, WARN)
 from nav_msgs.msg import Odometry
 from rclpy.clock import ROSClock
 from rclpy.duration import Duration

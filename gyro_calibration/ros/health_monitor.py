@@ -15,7 +15,6 @@ Samples are collected in stretches of `REST_DURATION` s with a steady rate, as a
 stretch the mean square of differences of neighbouring blocks is tested against the noise of the
 model, and the mean rate against zero. The levels of both tests follow from a stated rate of false
 alarms.
-
 """
 
 from __future__ import annotations
@@ -75,7 +74,6 @@ class RepeatedOutputDetector:
 
     A value that was held for less time, but longer than usual and not by chance, leaves a possible
     error of the integrated rate, `unseen_turn`, rad, with the sample that ends it.
-
     """
 
     def __init__(self, noise: Noise):
@@ -159,7 +157,6 @@ class RepeatedOutputDetector:
 
         The noise of a sample, rad/s, may be lower than that of the model. The probability must be
         below e^-level: e^-100, since it is e^-25 for a gyro that sends each sample four times.
-
         """
         stays = math.erf(_MAX_NOISE_REDUCTION * width / (2.0 * math.sqrt(2.0) * sample))
         return -count * math.log(max(stays, 1e-9)) > level
@@ -171,7 +168,6 @@ class PulseDetector:
 
     A pulse begins with a step of more than 20 rad/s² and ten times the median one of the last 2 s,
     and ends with such a step back, at most 0.25 s later: a fast turntable swings in 0.5 s.
-
     """
 
     def __init__(self) -> None:
@@ -216,7 +212,6 @@ class HealthMonitor:
 
     The alarms are a sentence each, or ''; `examined_count` is the number of stretches at rest, and
     `has_noise_at_rest` tells whether one had the noise and the bias of the model.
-
     """
 
     def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0):
@@ -225,7 +220,6 @@ class HealthMonitor:
 
         The largest rate of false alarms at rest is in 1/h. Means below the standstill rate, rad/s,
         are rest; one above may be a steady turn, and counts only if it stays in several stretches.
-
         """
         self._noise, self.standstill_rate = noise, standstill_rate
         # Four tests: noise and bias, upwards and downwards.
@@ -312,7 +306,6 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     rad/s, inf where the output never changed. The variance of the bias, (rad/s)², is that of its
     calibration of an age in s, nan where it is not known. Return None where the rate is not
     steady, samples are too few, or values are too large.
-
     """
     if max(np.abs(output).max(), np.abs(rate).max()) > MAX_MAGNITUDE:
         return None  # the squares may overflow
@@ -362,7 +355,6 @@ def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: 
 
     The noise is that of the model, for the drift of the bias; the level is the probability of a
     false report. An infinite variance is that of an unknown value.
-
     """
     if previous.covariance is None or current.covariance is None:
         return ''

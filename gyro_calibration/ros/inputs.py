@@ -13,7 +13,6 @@ What a node takes from outside, without rclpy: parameters, clocks, and the motio
 
 Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
 ROS time, which may be paused. The motion is that of odometry and commands of the last second.
-
 """
 
 from __future__ import annotations
@@ -117,7 +116,6 @@ class StampDelay:
 
         The test compares with the delays of a window, s. A tolerance is a duration, s, the
         shortest one first, in which some samples are not late, and a change of their delay, s.
-
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
         # Time of arrival and delay, s, of samples with less delay than any after them.
@@ -229,7 +227,6 @@ class TurnComparison:
     wheels; a robot may be turned by others than the commands, or scale them. So beside commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
     distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
-
     """
 
     def __init__(self) -> None:
@@ -252,7 +249,6 @@ class TurnComparison:
         Return duration, s, and turn by the gyro, rad, while odometry shows standstill.
 
         The least rate in a second of it, rad/s, follows: a push is over, a bias is not.
-
         """
         # two seconds pass before a robot stands, and one until a late odometry shows its turn
         if len(self._at_rest) < 4:
@@ -266,7 +262,6 @@ class TurnComparison:
         Add time, s, and rate, rad/s, of a source, and the heading by the gyro, rad.
 
         The heading must not be changed by resets. Tell whether odometry shows standstill.
-
         """
         (then, before), self._last = self._last, (time, heading)
         is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
@@ -307,7 +302,6 @@ class AlternateTurns:
     without a function, have the same topic and frame. A vibration near half the sample rate has
     the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
     biases of the two may differ.
-
     """
 
     def __init__(self) -> None:

@@ -18,7 +18,6 @@ the steady clock.
 Two publishers are detected by their stamps: a sample of a second one divides an interval so that
 one part is at most half of it. Two such intervals while the graph lists several publishers are the
 proof. The graph alone is not, since it lists a killed driver for up to 20 s.
-
 """
 
 from __future__ import annotations
@@ -36,42 +35,19 @@ from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pai
 from gyro_calibration.files import to_printable
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
-    Assumptions,
-    HeadingEstimator,
-    MAX_SPECIFIC_FORCE,
-    TEMPERATURE_TIMEOUT,
-)
+    Assumptions, HeadingEstimator, MAX_SPECIFIC_FORCE, TEMPERATURE_TIMEOUT)
 from gyro_calibration.heading.integration import MAX_GAP, Threshold
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession,
-    DRIVE_SAMPLE_TIMEOUT,
-    MIN_TURN_ANGLE,
-    REST,
-    ROS_TIME_PAUSED,
-)
+    CalibrationSession, DRIVE_SAMPLE_TIMEOUT, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
-    HealthMonitor,
-    PulseDetector,
-    RepeatedOutputDetector,
-)
+    HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
-    AlternateTurns,
-    Clock,
-    COMMAND,
-    MAX_ANGULAR_ACCELERATION,
-    MAX_VELOCITY_AGE,
-    ODOMETRY,
-    Parameter,
-    RosTime,
-    StampDelay,
-    TurnComparison,
-    Velocity,
-    Wheels,
-)
+    AlternateTurns, Clock, COMMAND, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE, ODOMETRY,
+    Parameter, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
 from gyro_calibration.ros.state_store import StateStore
 
 PARAMETERS = (
@@ -347,7 +323,6 @@ class Pipeline:
         The stamp is in ns, the output in rad/s, and the specific force along the input axis in
         m/s², which counts as missing where it is not plausible; `receivers` is the number of other
         nodes that receive cmd_vel.
-
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1

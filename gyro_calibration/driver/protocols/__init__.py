@@ -18,7 +18,6 @@ records. No port, no ROS and no clock is used here.
 >>> decoder = find_protocol('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
 [Sample(output=-0.00027459265121626786, ...)]
-
 """
 
 from __future__ import annotations
@@ -74,7 +73,6 @@ def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recogni
 
     The settings may be incomplete for the recognized format. `csv` is recognized by the number of
     their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
-
     """
     settings, data = settings or Settings(), data[-_MAX_BYTES:]
     scores = [(*_explain(protocol, settings, data), protocol) for protocol in PROTOCOLS.values()]

@@ -24,7 +24,6 @@ the device.
 
 An XV-3500CB gives 0.67 mV per deg/s. A converter of 12 bits and 3.3 V has 1.2 deg/s a count:
 amplify or oversample.
-
 """
 
 from __future__ import annotations
@@ -33,16 +32,8 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    GYRO_COLUMNS,
-    LineSplitter,
-    NUMBER,
-    OPTIONAL_COLUMNS,
-    Protocol,
-    Reading,
-    Sample,
-    Settings,
-    stateless,
-)
+    GYRO_COLUMNS, LineSplitter, NUMBER, OPTIONAL_COLUMNS, Protocol, Reading, Sample, Settings,
+    stateless)
 
 _NUMBER = re.compile(NUMBER)
 _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)

@@ -14,7 +14,6 @@ Common parts of wire formats: records, decoder from bytes to samples, and splitt
 A format is a `Protocol`: a splitter that finds frames in a stream of bytes, a parser from a frame
 to a `Reading`, and a writer. A reading is in the unit of the device; sign, sensitivity and full
 scale are applied here for all formats, as are the counts of discarded, refused and lost data.
-
 """
 
 from __future__ import annotations
@@ -251,7 +250,6 @@ class Decoder:
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
     The counts are those of `ConnectionCounts`.
-
     """
 
     def __init__(self, protocol: Protocol, settings: Settings):
@@ -322,7 +320,6 @@ class LineSplitter(Splitter):
 
     A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
     first line is discarded, unless it begins with bytes with which only complete lines begin.
-
     """
 
     def __init__(self, line_starts: tuple[bytes, ...] = ()):
@@ -362,7 +359,6 @@ class FrameSplitter(Splitter):
     In the pattern, a regular expression, ``.`` is any byte; the length is in bytes. If other bytes
     often pass the check, which is then weak, a frame after other bytes counts only if another one
     follows directly.
-
     """
 
     def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool],
