@@ -12,7 +12,6 @@
 The wire formats: their bytes, bad bytes, settings, recognition, and what single ones have.
 
 Any bytes, in any pieces, are decoded in test_fuzz.py: alike, and right again after two frames.
-
 """
 
 from dataclasses import replace
@@ -26,13 +25,7 @@ import time
 from fake_port import SETTINGS
 from gyro_calibration.driver import protocols
 from gyro_calibration.driver.protocols import (
-    BAUDS,
-    find_protocol,
-    PROTOCOLS,
-    recognize_protocol,
-    Sample,
-    Settings,
-)
+    BAUDS, find_protocol, PROTOCOLS, recognize_protocol, Sample, Settings)
 import pytest
 
 ALL = sorted(PROTOCOLS)
@@ -284,7 +277,6 @@ def received(data, ratio, idle=0):
     Each byte is 10 bits: low, the data from the lowest bit on, high. The receiver waits for a
     falling edge and samples the middle of each of its bits; it ignores a missing stop bit, as in a
     break, as terminals do in raw mode.
-
     """
     line = [1]
     for byte in data:

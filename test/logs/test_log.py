@@ -16,17 +16,8 @@ import math
 
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.logs.log import (
-    DEGREE,
-    Log,
-    log_from_table,
-    LogError,
-    read_log,
-    read_log_blocks,
-    select_rows,
-    unwrap_heading,
-    write_log,
-    write_log_blocks,
-)
+    DEGREE, Log, log_from_table, LogError, read_log, read_log_blocks, select_rows, unwrap_heading,
+    write_log, write_log_blocks)
 from gyro_calibration.logs.stamps import fit_stamp_grid
 import numpy as np
 import pytest

@@ -18,14 +18,7 @@ import sqlite3
 import sys
 
 from gyro_calibration.logs.cdr import (
-    IMU,
-    LAYOUTS,
-    MessageError,
-    parse,
-    parse_layout,
-    serialize,
-    TEMPERATURE,
-)
+    IMU, LAYOUTS, MessageError, parse, parse_layout, serialize, TEMPERATURE)
 from gyro_calibration.logs.log import LogError, read_log, select_rows, write_log
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording

@@ -18,15 +18,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
-    CalibrationRun,
-    Drive,
-    FINISH_TIMEOUT,
-    fit_run,
-    ODOMETRY,
-    REST,
-    SAMPLE_TIMEOUT,
-    TURNS,
-)
+    CalibrationRun, Drive, FINISH_TIMEOUT, fit_run, ODOMETRY, REST, SAMPLE_TIMEOUT, TURNS)
 from gyro_calibration.ros.inputs import Velocity
 import numpy as np
 import pytest

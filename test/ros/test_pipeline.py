@@ -20,14 +20,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.inputs import (
-    AlternateTurns,
-    COASTING_DURATION,
-    COMMAND,
-    MAX_VELOCITY_AGE,
-    ODOMETRY,
-    Velocity,
-    Wheels,
-)
+    AlternateTurns, COASTING_DURATION, COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels)
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
