@@ -218,7 +218,6 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def format_rows(rows: Iterable[Iterable[Any]]) -> str:
-    """Return rows of values as CSV."""
     text = io.StringIO()
     csv.writer(text, lineterminator='\n').writerows(rows)
     return text.getvalue()

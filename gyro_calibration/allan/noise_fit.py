@@ -348,7 +348,6 @@ class NoiseFigure:
     upper: float
 
     def allan_variance(self, time: Array) -> Array:
-        """Return the Allan variance of the term, (rad/s)²."""
         return self.value ** 2 * self.term.allan_variance(time)
 
 

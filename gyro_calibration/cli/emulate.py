@@ -70,7 +70,7 @@ def run(given: argparse.Namespace) -> None:
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')
-    samples = _iterate_samples(time, output, log.temperature, given.repeat)
+    samples = _make_samples(time, output, log.temperature, given.repeat)
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
 
@@ -90,8 +90,8 @@ def _handle_signals(handler: Any) -> None:
         signal.signal(number, handler)
 
 
-def _iterate_samples(time: Array, output: Array, temperature: Array | None,
-                     repeats: bool) -> Iterator[Sample]:
+def _make_samples(time: Array, output: Array, temperature: Array | None,
+                  repeats: bool) -> Iterator[Sample]:
     """Give the samples of a log that have an output, once or, on request, again and again."""
     known = np.isfinite(output)
     times, outputs = time[known] - time[known][0], output[known].tolist()

@@ -131,7 +131,6 @@ def _check_limit(place: str, value: Any) -> float:
 
 
 def write_motion(path: str, motion: Motion) -> None:
-    """Write a motion of rates as a profile."""
     rows = zip(motion.time, motion.rate_at(motion.time) / DEGREE)
     lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
              *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]

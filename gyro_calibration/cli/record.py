@@ -130,6 +130,8 @@ class DiskFull(OSError):
 class _Recorder:
     """A new file that grows by complete pieces, and is removed at the end if it has none."""
 
+    closing_part = b''
+
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
         # size of the complete pieces, bytes, and whether one could not be written
@@ -158,16 +160,15 @@ class _Recorder:
         """Write what was added as a piece; a silence or the end makes it due."""
         raise NotImplementedError
 
-    def finish(self) -> None:
-        """Write the last piece."""
-        self.flush(is_due=True)
-
     def close(self) -> None:
-        """Finish and close the file; nothing is written after a piece that failed."""
+        """Write the last piece, unless one has failed, and close the file."""
         try:
             if not self.is_full:
-                self.finish()
+                self.flush(is_due=True)
         finally:
+            if self.size and self.closing_part:
+                with suppress(DiskFull):  # a reader then takes the file for truncated
+                    self.append(self.closing_part)
             self._file.close()
             if not self.size:
                 os.unlink(self.path)
@@ -175,6 +176,8 @@ class _Recorder:
 
 class McapRecorder(_Recorder):
     """Messages in an MCAP file; `variance` is that of the rate of a sample, (rad/s)²."""
+
+    closing_part = MCAP_END
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
@@ -195,24 +198,10 @@ class McapRecorder(_Recorder):
             self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
 
     def flush(self, is_due: bool = False) -> None:
-        """Write the messages so far as a chunk."""
-        if self.writer.pending_bytes:
+        if chunk := self.writer.take_chunk():
             head = b'' if self.size else self.writer.pack_header(
                 f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
-            self.append(head + self.writer.pack_chunk())
-
-    def finish(self) -> None:
-        """Write the last chunk and the index."""
-        self.flush()
-        if self.size:
-            self.append(self.writer.pack_summary())
-
-    def close(self) -> None:
-        """Close the file, on a full disk with an end that readers understand."""
-        if self.is_full and self.size:
-            with suppress(DiskFull):  # a reader then takes the file for truncated
-                self.append(MCAP_END)
-        super().close()
+            self.append(head + chunk)
 
 
 class CsvRecorder(_Recorder):

@@ -217,9 +217,9 @@ def _fit_data(fit: ScaleBiasFit, check: RestCheck | None) -> dict[str, Any]:
             'time_offset_standard_deviation_s': fit.time_offset_deviation,
             'start_heading_rad': fit.start_heading,
             'start_heading_standard_deviation_rad': fit.start_heading_deviation,
-            **{key: getattr(fit.goodness, name, math.nan) for key, name in (
-                ('chi_square', 'chi_square'), ('degrees_of_freedom', 'dof'),
-                ('probability', 'probability'), ('noise_ratio', 'noise_ratio'))},
+            'degrees_of_freedom': getattr(fit.goodness, 'dof', math.nan),
+            **{name: getattr(fit.goodness, name, math.nan)
+               for name in ('chi_square', 'probability', 'noise_ratio')},
             'rest_rate_rad_s': check.rate if check else math.nan,
             'rest_limit_rad_s': check.limit if check else math.nan}
 

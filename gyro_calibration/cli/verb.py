@@ -248,7 +248,6 @@ def _cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Lo
 
 
 def print_message(text: object) -> None:
-    """Print a message on standard error."""
     print(f'gyro_calibration: {to_printable(text)}', file=sys.stderr, flush=True)
 
 

@@ -86,7 +86,6 @@ class SerialPort:
             return data
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the device."""
         with self._open_port() as port:
             port.write(data)
 
@@ -97,7 +96,6 @@ class SerialPort:
             port.reset_input_buffer()
 
     def close(self) -> None:
-        """Close the port, if it is open."""
         port, self._port = self._port, None
         if port is not None:
             port.close()

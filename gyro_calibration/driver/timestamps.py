@@ -70,7 +70,6 @@ class LowerLine:
         self._begin, self._block_begin = 0.0, -math.inf
 
     def value_at(self, x: float) -> float:
-        """Return the height of the line."""
         return self._anchor[1] + self.slope * (x - self._anchor[0])
 
     def time_span(self) -> float:

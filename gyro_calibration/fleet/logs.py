@@ -94,7 +94,6 @@ class FleetLog:
     temperature: float | None = None  # degC
 
     def fill_missing(self, stated: Mapping[str, str]) -> FleetLog:
-        """Return the entry with its empty fields filled."""
         new: dict[str, Any] = {name: to_printable(text.strip())
                                for name, text in stated.items() if name in ENTRY_KEYS
                                and text.strip() and getattr(self, name) in ('', None)}
@@ -409,7 +408,6 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
 
 def make_refused_record(entry: FleetLog, reason_text: str) -> dict[str, Any]:
-    """Return the record of an excluded log."""
     return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated_fields(entry),
             'status': NO_EVIDENCE, 'reason': reason_text}
 
@@ -490,7 +488,6 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
 
 
 def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:
-    """Return a summary of the diagnosis, and write its page."""
     assert task.generator is not None
     try:
         found = (diagnose_table(log, None) if log.time is None

@@ -490,7 +490,6 @@ class Alarm:
     since: str = ''  # first date after a change
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
         size = {'since': self.since, 'size': self.size} if self.since else {'excess': self.size}
         return {'name': self.name, **size, 'chance': self.p_value}
 

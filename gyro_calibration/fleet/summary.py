@@ -297,7 +297,6 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
 
 
 def data(summary: TypeSummary) -> dict[str, Any]:
-    """Return the results of a type as JSON data."""
     return {'type': summary.name, 'units': list(summary.units), 'drives': list(summary.drives),
             'logs': len(summary.records), 'level': summary.significance,
             'values': {name: _value_data(each) for name, each in summary.values.items()},
@@ -430,7 +429,6 @@ def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, A
 
 
 def _type_sections(summary: TypeSummary, key: str) -> Iterator[Markup]:
-    """Give the sections of a type: its values, units, drives and dates."""
     name = summary.name or 'Type not stated'
     items = [element('li', as_sentence(text)) for text in describe_type(summary)]
     yield element('section', element('h2', name), element('ul', *items), _variance_table(summary))
@@ -509,7 +507,6 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
 
 
 def _cell(text: str, key: float | None = None) -> Markup:
-    """Return a cell with its sort key."""
     return element('td', text, data_key=text if key is None else f'{key:.9g}')
 
 
@@ -520,7 +517,6 @@ def _interval_cell(value: ValueSummary, interval: Interval | None) -> Markup:
 
 def _interval_chart(value: ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
                     style: str) -> Chart:
-    """Return the intervals of units or drives."""
     unit, factor = display_unit(value.unit, value.name)
     low, high = (np.array([getattr(each, end) for each in intervals.values()])
                  for end in ('low', 'high'))

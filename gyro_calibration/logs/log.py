@@ -471,7 +471,6 @@ def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> No
 
 
 def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
-    """Return some rows of a log."""
     which = np.arange(len(log))[rows]
     arrays: dict[str, Any] = {name: getattr(log, name)[which] for name in QUANTITIES
                               if getattr(log, name) is not None}

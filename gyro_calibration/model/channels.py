@@ -87,7 +87,6 @@ class _Block:
         self._interval = _differences(time, begin)
 
     def signal(self, channel: str) -> Number:
-        """Return a channel."""
         if channel == 'vibration' and channel not in self._signals:
             # a second high-pass filter of 1 s, since after one a tilt within seconds still counts
             self._signals['fast_force'] = self.lag_difference('specific_force', 1.0)

@@ -45,12 +45,10 @@ class Term:
     values: tuple[float, ...]
 
     def columns(self, channels: Channels) -> Sequence[Number]:
-        """Return one column for each coefficient."""
         return self.effect.columns(channels, *self.values[:len(self.effect.nonlinear_parameters)])
 
     @cached_property
     def error(self) -> Callable[[Channels], Number]:
-        """Return the function of the channels that the effect adds to the output, rad/s."""
         return self.effect.error_function(self.values)
 
     @cached_property
@@ -175,7 +173,6 @@ class GyroModel:
             yield term.effect.name, term.effect.parameters[place], term.values[place], deviation
 
     def error(self, channels: Channels) -> Number:
-        """Return the sum of all effects, rad/s."""
         return _sum_errors(self.terms, channels)
 
     def output_slope(self, channels: Channels) -> Number:
@@ -266,7 +263,6 @@ class GyroModel:
         return float(distances[-1] if good.all() else distances[np.argmin(good)])
 
     def uses_channel(self, channel: str) -> bool:
-        """Tell whether an effect uses the channel."""
         return any(channel in term.effect.inputs for term in self.terms)
 
     @cached_property
@@ -407,7 +403,6 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
 
 
 def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None) -> GyroModel:
-    """Return the model with another self-calibration."""
     return replace(model, self_calibration=calibration)
 
 

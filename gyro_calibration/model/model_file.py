@@ -224,7 +224,6 @@ def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
 
 
 def format_model(model: GyroModel) -> str:
-    """Return the text of a model file."""
     effects: dict[str, Any] = {}
     for term in model.terms:
         named: dict[str, Any] = {parameter.name: value

@@ -128,7 +128,6 @@ class CalibrationRun:
 
     @property
     def status(self) -> str:
-        """Return the progress in words."""
         return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
                 if math.isinf(self.duration)
                 else f'{self.elapsed:.0f} of {self.max_duration:.0f} s')
@@ -140,7 +139,6 @@ class Drive:
     INTERVAL = 0.02  # time between commands, s
 
     def __init__(self, run: CalibrationRun, motion: Motion, clock: Clock):
-        """Start to wait for a receiver of the commands."""
         self._run, self._motion, self._clock = run, motion, clock
         self._start_time = self._last_poll = clock.steady()
         self._has_receiver = self._had_callers = self._lost_callers = False
@@ -227,7 +225,6 @@ class CalibrationSession:
 
     @property
     def is_driving(self) -> bool:
-        """Tell whether a run drives the robot."""
         return self._drive is not None
 
     # Start
@@ -406,7 +403,6 @@ class CalibrationSession:
         return True, run.finish()
 
     def cancel(self) -> tuple[bool, str]:
-        """Cancel the run without a change of the calibration."""
         if self.run is None:
             return False, 'no calibration is in progress'
         if self.run.end_reason is not None:

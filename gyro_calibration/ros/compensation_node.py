@@ -57,7 +57,6 @@ class NodeClock:
     steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
 
     def __init__(self, node: Node):
-        """Read ROS time from a node."""
         self._clock = node.get_clock()
 
     def simulated(self) -> float | None:
@@ -205,7 +204,6 @@ class CompensationNode(Node):
             self._yaw_rate.publish(rate)
 
     def _publish_status(self) -> None:
-        """Publish the latched state of the calibration."""
         self._status.publish(status_array(self, 'calibration', calibration_status(self._pipeline)))
 
     def _poll_graph(self) -> None:
@@ -328,12 +326,10 @@ class CompensationReport:
     """Makes reports of a pipeline; counts are compared with those of the last report."""
 
     def __init__(self, pipeline: Pipeline, clock: Clock):
-        """Start without a report."""
         self._pipeline, self._clock = pipeline, clock
         self._previous_counts, self._last_report_time = dict.fromkeys(COUNT_NAMES, 0), math.nan
 
     def level(self) -> bytes:
-        """Return the level of a report made now."""
         return self._evaluate()[0]
 
     def make(self) -> Report:
@@ -508,7 +504,6 @@ def _to_velocity(twist: Twist) -> Velocity:
 
 
 def main() -> int:
-    """Run the node until SIGINT or SIGTERM."""
     return run_node(CompensationNode)
 
 

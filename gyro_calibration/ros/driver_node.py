@@ -198,7 +198,6 @@ class DriverReport:
         self._temperature, self._health = None, {}
 
     def make(self) -> Report:
-        """Return level, message and values."""
         counts, now, connection = self._connection.counts(), self._clock(), self._connection
         elapsed = now - self._last_time
         if elapsed >= 0.5:
@@ -288,7 +287,6 @@ def settings_from_parameters(values: SimpleNamespace) -> Settings:
 
 
 def main() -> int:
-    """Run the node; returns the exit code."""
     return run_node(DriverNode)
 
 

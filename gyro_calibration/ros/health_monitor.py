@@ -77,7 +77,6 @@ class RepeatedOutputDetector:
     """
 
     def __init__(self, noise: Noise):
-        """Start without samples; `noise` is that of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
         self._value, self._since, self._count = math.nan, 0.0, 0
         self._last_step = self._acceleration = 0.0  # to this value, rad/s, and rad/s² less noise
@@ -171,7 +170,6 @@ class PulseDetector:
     """
 
     def __init__(self) -> None:
-        """Start without samples."""
         self._last = math.nan, math.nan
         self._steps = deque[tuple[float, float]]()  # stamps, s, and sizes, rad/s
         self._median_step, self._median_time = math.nan, -math.inf  # rad/s, and of when, s
@@ -233,7 +231,6 @@ class HealthMonitor:
 
     @property
     def is_enabled(self) -> bool:
-        """Return whether the monitor is on."""
         return self._noise.angle_random_walk > 0.0 and self._level > 0.0
 
     def restart(self) -> None:

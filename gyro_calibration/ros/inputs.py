@@ -50,7 +50,6 @@ class Parameter:
 
     @property
     def choices_text(self) -> str:
-        """Return the choices as text; '' if any value is allowed."""
         return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
 
     def check(self, value: object) -> object:
@@ -170,7 +169,6 @@ class RosTime:
     """Whether ROS time advances."""
 
     def __init__(self) -> None:
-        """Start without readings."""
         # time since its last advance, s of the steady clock; 0 where it is not simulated, inf
         # before a simulation starts
         self.paused_duration = 0.0
@@ -230,7 +228,6 @@ class TurnComparison:
     """
 
     def __init__(self) -> None:
-        """Start without turns."""
         self.ratio, self.source = math.nan, ''  # of the last turns
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
@@ -240,7 +237,6 @@ class TurnComparison:
 
     @property
     def is_contradictory(self) -> bool:
-        """Tell whether the last turns contradict each other."""
         return self._contradictions > 1
 
     @property
@@ -305,7 +301,6 @@ class AlternateTurns:
     """
 
     def __init__(self) -> None:
-        """Start without samples."""
         self._samples: list[tuple[float, float]] = []  # the last ones, up to 2; s and rad/s
         self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
         # difference over sum in turns of a row, their last sense, and how often it changed
@@ -313,7 +308,6 @@ class AlternateTurns:
 
     @property
     def is_contradictory(self) -> bool:
-        """Tell whether the last turns contradict each other."""
         return self._changes > 1
 
     def add(self, time: float, rate: float) -> None:
@@ -348,7 +342,6 @@ class Wheels:
     """The last velocity from each source, by the steady clock."""
 
     def __init__(self) -> None:
-        """Start without velocities."""
         self._last: dict[str, tuple[float, Velocity]] = {}
         # begin of uninterrupted standstill by each source, s
         self._standing_since: dict[str, float] = {}

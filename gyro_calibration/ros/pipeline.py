@@ -553,7 +553,6 @@ class Pipeline:
     # Periodic calls
 
     def use_parameters(self, values: SimpleNamespace) -> None:  # noqa: A003
-        """Continue with other values of the parameters."""
         self.values = values
         tracking = _tracker_settings(values, self.store.model.noise)
         if tracking != self._tracking_settings:

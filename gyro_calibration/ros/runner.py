@@ -130,7 +130,6 @@ def declare_parameters(
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return the descriptor that ``ros2 param describe`` shows."""
     unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.description + unit, read_only=not parameter.dynamic,

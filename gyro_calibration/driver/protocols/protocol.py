@@ -328,7 +328,6 @@ class LineSplitter(Splitter):
         self._has_line_start = self._is_too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the lines that these bytes complete."""
         first, *rest = _LINE_END.split(data)  # the tail was searched for line ends when it came
         *lines, tail = self._tail + first, *rest
         whole = []
@@ -347,7 +346,6 @@ class LineSplitter(Splitter):
         return whole
 
     def reset(self) -> None:
-        """Discard an incomplete line."""
         super().reset()
         self._has_line_start = self._is_too_long = False
 
@@ -368,7 +366,6 @@ class FrameSplitter(Splitter):
         self._length, self._is_intact, self._is_weak = length, is_intact, is_weak
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that these bytes complete."""
         data, position, end, frames = self._tail + data, 0, 0, []
         while match := self._pattern.search(data, position):
             position = match.start() + 1
