@@ -16,8 +16,6 @@ followed when it is read, and replaced when it is written; its target does not c
 is replaced keeps its mode, and its owner and group where that is allowed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 import csv

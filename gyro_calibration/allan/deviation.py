@@ -18,8 +18,6 @@ of the angle, and mean squares of Gaussian values have the covariance 2 c² summ
 (Greenhall and Riley, Uncertainty of stability variances based on finite differences, PTTI 2003).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math

@@ -14,8 +14,6 @@ Measure the error of a simulation, name the cause, extend the model, measure the
 example: gyro_calibration diagnose drive.csv --model gyro.yaml --out diagnosis
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace

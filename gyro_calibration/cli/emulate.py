@@ -15,8 +15,6 @@ example: gyro_calibration emulate --protocol kvh_dsp3000 --model model.yaml --mo
 --link /tmp/gyro
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from itertools import count, repeat

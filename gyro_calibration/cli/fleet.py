@@ -14,8 +14,6 @@ Calibrate and diagnose many logs, and attribute errors to unit, type and referen
 example: gyro_calibration fleet drives/ --out fleet
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -10,8 +10,6 @@
 
 """The program ``gyro_calibration``: it runs one verb, prints its answer and sets its exit code."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 from collections.abc import Sequence

@@ -14,8 +14,6 @@ Compute the motion that calibrates best within the limits of a robot.
 example: gyro_calibration plan --limits limits.yaml --seconds 20 --out profile.csv
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 from typing import Any

@@ -14,8 +14,6 @@ Find scale factor error and bias from about 20 s of known motion, or from whole 
 example: gyro_calibration self-calibrate run.csv --profile profile.csv --out model.yaml
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass

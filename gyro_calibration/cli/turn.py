@@ -14,8 +14,6 @@ Compute the error of a full turn, with a static bias only and with a model.
 example: gyro_calibration turn table.csv --picture turn.png
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 import math

@@ -10,8 +10,6 @@
 
 """Common parts of the verbs: answers, options for logs, errors of usage, progress bars."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager

@@ -15,8 +15,6 @@ This module has no ROS and starts no thread: `Connection.chunks` gives the sampl
 the caller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

@@ -25,8 +25,6 @@ to stamps of such a clock, `HostTimeConverter` converts its stamps to a continuo
 No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise

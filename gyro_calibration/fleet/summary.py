@@ -14,8 +14,6 @@ From the records of logs to the errors of the type, the unit and the reference.
 They are sentences, data, models, one page that needs nothing else, and tables in CSV and Parquet.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

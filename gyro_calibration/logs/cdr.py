@@ -16,8 +16,6 @@ the fields, each aligned to its own size. The message definition, which recordin
 the fields. It is parsed here into a table of formats; nothing in it is run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -15,8 +15,6 @@ A name of the log format states quantity and unit. The user assigns other names,
 `gyro=wz:deg/s`; without a unit, SI is assumed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 import difflib
 import math

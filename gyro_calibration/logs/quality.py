@@ -10,8 +10,6 @@
 
 """The quality of samples: white noise, quantization, outliers, repeated and saturated samples."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math

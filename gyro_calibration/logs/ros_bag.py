@@ -18,8 +18,6 @@ size. Existing libraries have no such limits and refuse truncated files: rosbags
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field

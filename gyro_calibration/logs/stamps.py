@@ -16,8 +16,6 @@ a line fitted to the stamps gives the interval. Samples are lost where the stamp
 long step. Where the stamps catch up again, samples were only delayed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from gyro_calibration.logs.log import Array, DataRefused

@@ -17,8 +17,6 @@ needs one pass, and a model of the output alone none. No separate inverse formul
 differ from the simulation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 import sys

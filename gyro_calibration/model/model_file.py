@@ -10,8 +10,6 @@
 
 """A gyro's model as a YAML file that a person can read and write."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import math
 from pathlib import Path

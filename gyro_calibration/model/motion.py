@@ -10,8 +10,6 @@
 
 """Motion profiles about one axis, and the simulated output of a gyro in them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import csv
 from dataclasses import dataclass, replace

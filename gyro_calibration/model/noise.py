@@ -10,8 +10,6 @@
 
 """Noise of a gyro by IEEE Std 952: terms, Allan variances, processes and simulated samples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 import math

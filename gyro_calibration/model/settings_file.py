@@ -15,8 +15,6 @@ They are data only: nothing in them is run, and they cannot name other files. A 
 each name may hold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path

@@ -15,8 +15,6 @@ Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configura
 a `<gyro>` sensor. Each supports some of the parameters; the export lists those that are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 import math

@@ -26,8 +26,6 @@ An XV-3500CB gives 0.67 mV per deg/s. A converter of 12 bits and 3.3 V has 1.2 d
 amplify or oversample.
 """
 
-from __future__ import annotations
-
 import math
 import re
 

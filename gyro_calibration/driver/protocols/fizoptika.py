@@ -29,8 +29,6 @@ until samples come, so set ``sample_rate``. The sense of rotation is not verifie
 glossary calls a clockwise turn positive, without the direction of view.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 from gyro_calibration.driver.protocols.protocol import (

@@ -36,8 +36,6 @@ models other than the 1775, and the 1000 Hz of a new unit, which public drivers 
 supported: formats B and C (headers ``FE 81 FF 56`` and ``57``), and temperatures in other units.
 """
 
-from __future__ import annotations
-
 from functools import partial
 import math
 import struct

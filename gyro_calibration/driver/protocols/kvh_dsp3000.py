@@ -27,8 +27,6 @@ the value, 60 micro-deg/s a count for rates. Section 3.1.4 defines the two bits 
 without which the first byte of a message cannot be identified; no public copy of it was found.
 """
 
-from __future__ import annotations
-
 from functools import partial
 import math
 import re

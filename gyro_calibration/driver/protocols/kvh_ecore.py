@@ -22,8 +22,6 @@ rotation were inferred, not read in a manual: check sign and scale on your unit.
 ``8A 40 00 00 00 00 07 68`` is a count of 1000, which is 1.83 deg/s.
 """
 
-from __future__ import annotations
-
 from functools import partial
 import math
 

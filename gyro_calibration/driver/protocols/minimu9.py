@@ -20,8 +20,6 @@ firmware. The parameter ``axis`` selects x, y or z. One count is 0.07 deg/s in t
 ``!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9`` is -7 deg/s about z.
 """
 
-from __future__ import annotations
-
 from functools import partial
 import math
 import re

@@ -27,8 +27,6 @@ Razor_AHRS.ino, on axes and serial commands; node imu_node.py). For older firmwa
 counts set ``sensitivity``.
 """
 
-from __future__ import annotations
-
 from functools import partial
 import math
 import re

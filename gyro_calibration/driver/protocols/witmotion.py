@@ -25,8 +25,6 @@ the temperature of older modules is wrong. Not verified: whether a module that l
 +1 g.
 """
 
-from __future__ import annotations
-
 from functools import partial
 import math
 import struct
