@@ -227,6 +227,11 @@ class Rig:
             self.step()
         return until()
 
+    def turn(self, rate, seconds):
+        """Command the robot to turn, rad/s, and step for a time."""
+        self.robot.command(rate)
+        self.go(seconds)
+
     def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None):
         """
         Play outputs of a gyro, rad/s, without the robot; return what came out for each.

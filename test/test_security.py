@@ -204,8 +204,7 @@ def test_only_a_session_that_may_drive_sends_commands(tmp_path):
     """Not even where the profile has long begun to turn."""
     rig = rested(tmp_path)
     assert not rig.begin()
-    rig.robot.command(0.7)
-    rig.go(10.0)
+    rig.turn(0.7, 10.0)
     assert not rig.commands and not rig.session.is_driving
 
 

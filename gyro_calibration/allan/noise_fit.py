@@ -178,11 +178,7 @@ class CombinationFit:
 
 def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
                     fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
-    """
-    Fit a combination of nonnegative terms, with the covariance of the fitted noise.
-
-    For `misfit` see `NoiseFit`. A further term may be fixed at a squared coefficient.
-    """
+    """Fit nonnegative terms, with the covariance of the fitted noise; one more may be fixed."""
     given = np.zeros(_FILTER_BEND + 1)
     if fixed_term >= 0:
         given[fixed_term] = fixed_square
@@ -258,15 +254,6 @@ class Ranking:
         both = [{*best.active_terms, *other.active_terms} for other in self.alternatives]
         return [best, *(each for each in self.fits if each.deviance
                         < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
-
-    def lower_bound_beside_process(self, index: int) -> float:
-        """Return that of a coefficient of the best fit if a process is in the record too."""
-        # as for other combinations with more terms; a process has two figures
-        best = self.best
-        found = _fit_with_process(best, tuple(best.active_terms), self.misfit)
-        return (found.coefficient_bounds(index)[0]
-                if found is not None and index in found.active_terms
-                and found.deviance < best.deviance - 2.0 * _WIDENING_LIMIT else math.inf)
 
 
 def rank_combinations(octaves: OctaveVariances) -> Ranking:
@@ -438,7 +425,12 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
             each.coefficient_bounds(index) for each in possible if index in each.active_terms)]
         lower, upper = min(low for low, _ in ends), max(high for _, high in ends)
         if index == _B:
-            lower = min(lower, ranking.lower_bound_beside_process(index))
+            # a process may be in the record too, as other combinations with more terms; it has
+            # two figures
+            joint = _fit_with_process(best, tuple(best.active_terms), ranking.misfit)
+            if (joint is not None and index in joint.active_terms
+                    and joint.deviance < best.deviance - 2.0 * _WIDENING_LIMIT):
+                lower = min(lower, joint.coefficient_bounds(index)[0])
     if not value or index in (_B, _K) and ranking.is_replaceable(index):
         lower = 0.0
     unit = interval ** -part.slope

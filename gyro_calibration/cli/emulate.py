@@ -19,6 +19,7 @@ import argparse
 from collections.abc import Iterator
 from itertools import count, repeat
 import json
+import math
 import signal
 from typing import Any
 
@@ -52,7 +53,8 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help='start when a program has opened the port')
     parser.add_argument('--repeat', action='store_true', help='start again at the end')
     verb.add_topic_options(parser)
-    parser.set_defaults(**verb.DEFAULT_LOG_OPTIONS)
+    # of the other options that `verb.read` uses
+    parser.set_defaults(invert=False, names={}, axis='z', unwrap=False, begin=0.0, end=math.inf)
 
 
 def run(given: argparse.Namespace) -> None:

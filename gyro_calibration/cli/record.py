@@ -302,12 +302,7 @@ def _record(session: _PortSession | _TopicSession, out: str) -> Answer:
 
 
 class _PortSession:
-    """
-    Records samples from a port.
-
-    As `_TopicSession`, it has a recorder, counts samples received and lost, and concludes with
-    data and remarks of the answer; where nothing came, it has the failure and a remedy.
-    """
+    """Records samples from a port; `_TopicSession` has the same attributes and methods."""
 
     remedy = 'check the port, the power and the wires of the gyro'
 

@@ -138,11 +138,6 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     add_topic_options(parser)
 
 
-#: Values of the options that `read` uses, for a verb without them.
-DEFAULT_LOG_OPTIONS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap': False,
-                                       'begin': 0.0, 'end': math.inf}
-
-
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
                         'sensor_msgs/Imu or another type with a rate; default: the only Imu')

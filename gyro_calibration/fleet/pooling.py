@@ -496,11 +496,7 @@ class Alarm:
 
 def find_outliers(pooled: PooledValue, kind: str, names: Sequence[str],
                   significance: float) -> list[Alarm]:
-    """
-    Return the outlying units or drives with these names; `kind` is `UNITS` or `DRIVES`.
-
-    The significance is the probability of an outlier where there is none.
-    """
+    """Return the outlying units or drives; the significance is the probability of a false one."""
     number = pooled.observed.unit if kind == UNITS else pooled.observed.drive
     groups = np.unique(number[number >= 0]).tolist()
     if len(groups) < 4 or len(number) < 5 or kind not in pooled.variance_names:

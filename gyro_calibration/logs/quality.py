@@ -47,18 +47,14 @@ def bridge_gaps(values: Array) -> Array:
 
 
 def cross_rotation(log: Log) -> Array:
-    """
-    Return the rotation about the cross axes, rad, gaps bridged, (n, 2); (n, 0) if it is planar.
-
-    It is planar if by a usual misalignment it turns the heading by less than the white noise of
-    the gyro does.
-    """
+    """Return the rotation about the cross axes, rad, gaps bridged, (n, 2); (n, 0) if planar."""
     given = [getattr(log, name) for name in ROTATIONS[1:]]
     if log.time is None or log.output is None or any(
             each is None or np.isfinite(each).sum() < 2 for each in given):
         return np.empty((len(log), 0))
     turned, interval = np.column_stack([bridge_gaps(each) for each in given]), np.diff(log.time)
     noise = white_noise_deviation(log.output) * math.sqrt(np.median(interval) * interval.sum())
+    # by a usual misalignment it turns the heading by less than the noise does
     is_planar = MISALIGNMENT_DEVIATION * np.ptp(turned, axis=0).max() <= noise
     return turned[:, :0] if is_planar else turned
 
@@ -209,11 +205,7 @@ def mark_rows(ends: Iterable[Sequence[int]], count: int) -> Mask:
 
 
 def mask_outliers(values: Array, limit: float) -> Mask:
-    """
-    Mark single samples beyond a limit from their neighbours and from the median.
-
-    The limit is in robust standard deviations. Drift and vibration are not marked.
-    """
+    """Mark single samples beyond a limit, robust deviations, from neighbours and median."""
     if len(values) < 4:
         return np.zeros(len(values), dtype=bool)
     # The median of six neighbours resists two outliers among them.

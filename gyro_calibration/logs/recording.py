@@ -194,7 +194,12 @@ class _LogBuilder:
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.topic} declares that it reports no angular velocity; name '
                            'another by --topic')
-        reference, temperature = self._find_reference(), self._find_temperature(gyro.topic)
+        reference, temperature = None, self._find_temperature(gyro.topic)
+        if self._topics.reference is not None:
+            reference = self._topic_series(self._find_topic(self._topics.reference, 'reference'))
+        elif possible := self._topics_of_type(set(REFERENCE_TYPES) - {cdr.IMU}):
+            self._notes.append('no reference was asked for; --reference-topic may be '
+                               f'{_join_names(possible)}')
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were '
@@ -233,15 +238,6 @@ class _LogBuilder:
         remedy = (f'select {_join_names(others, "or")} with --topic' if others
                   else 'record the topic of the gyro')
         raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; {remedy}')
-
-    def _find_reference(self) -> _TopicSeries | None:
-        if self._topics.reference is not None:
-            return self._topic_series(self._find_topic(self._topics.reference, 'reference'))
-        found = self._topics_of_type(set(REFERENCE_TYPES) - {cdr.IMU})
-        if found:
-            self._notes.append('no reference was asked for; --reference-topic may be '
-                               f'{_join_names(found)}')
-        return None
 
     def _find_temperature(self, gyro: str) -> _TopicSeries | None:
         if self._topics.temperature is not None:

@@ -46,7 +46,6 @@ MAX_RECORD_BYTES = 1 << 28
 _READ_BYTES = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
-_ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
 #: Name of the metadata record of this program.
 METADATA_NAME = 'gyro_calibration'
 
@@ -208,8 +207,8 @@ def _decompress_up_to(size: int, compression: str, data: bytes, budget: Expansio
 
 
 def _decompress_message(data: bytes, budget: ExpansionBudget) -> bytes:
-    return (_decompress_up_to(1 << 16, 'zstd', data, budget)
-            if data.startswith(_ZSTANDARD_MAGIC) else data)
+    is_packed = data.startswith(b'\x28\xb5\x2f\xfd')  # as Zstandard begins
+    return _decompress_up_to(1 << 16, 'zstd', data, budget) if is_packed else data
 
 
 _RecordCode = IntEnum('_RecordCode', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX '
@@ -395,7 +394,6 @@ class McapWriter:
                             struct.pack('<Q', len(records)), records)
 
 
-_TABLES = ('topics', 'messages', 'message_definitions')
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
 _MESSAGES_QUERY = """
     SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
@@ -471,7 +469,8 @@ def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
         database.execute('PRAGMA trusted_schema = OFF')
         tables = {name for name, text in database.execute(
             "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-            if name in _TABLES and str(text).upper().startswith('CREATE TABLE')
+            if name in ('topics', 'messages', 'message_definitions')
+            and str(text).upper().startswith('CREATE TABLE')
             and not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
         return database, tables
     except BaseException:

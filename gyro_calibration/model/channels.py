@@ -126,11 +126,7 @@ class _Block:
 
 
 def channels_from_log(log: Log) -> Channels:
-    """
-    Return the channels of a whole log, with rate and output 0.
-
-    Without stamps all rows have time 0. The heading is that of the reference, or 0 without one.
-    """
+    """Return the channels of a whole log, with rate and output 0, and time 0 without stamps."""
     time = np.zeros(len(log)) if log.time is None else log.time
     heading = np.zeros(len(log)) if log.reference_heading is None else log.reference_heading
     return ChannelHistory().update(time, log.temperature, log.specific_force, log.supply, heading)

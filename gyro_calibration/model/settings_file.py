@@ -28,7 +28,6 @@ import yaml
 
 #: Largest file, bytes: twice the size of a model with the covariance of 150 values.
 MAX_SETTINGS_BYTES = 1_000_000
-_INTEGER = re.compile('[-+]?[0-9]{1,400}')
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
@@ -120,7 +119,7 @@ def _parse_plain(text: str) -> Any:
         return None
     if text.lower() in ('true', 'false'):
         return text.lower() == 'true'
-    if _INTEGER.fullmatch(text):
+    if re.fullmatch('[-+]?[0-9]{1,400}', text):
         return int(text)
     if text.lower().lstrip('+-') in ('.inf', '.nan'):
         return float(text.lower().replace('.', ''))

@@ -153,11 +153,7 @@ SIMULATORS = tuple(_FORMATTERS)
 
 def export_model(parameters: SimulatorParameters, model: GyroModel,
                  simulator: str) -> tuple[str, list[str]]:
-    """
-    Return the `simulator_parameters` of a gyro as text for one of `SIMULATORS`.
-
-    A comment lists the parameters that are left out; they are returned too, one text each.
-    """
+    """Return a text for one of `SIMULATORS`, and what it does not hold, which a comment lists."""
     text, names = _FORMATTERS[simulator](parameters)
     run, noise = model.self_calibration, model.noise
     found = {term.effect.name: ', '.join(

@@ -373,23 +373,17 @@ class CalibrationSession:
         self._pending_commands.append(rate)
         self._send(rate)
 
-    def stop_robot(self) -> bool:
-        """Command zero if the robot is driven; return whether it was."""
-        if not self._drive:
-            return False
-        self._command(0.0)
-        self._stop_time = self._clock.steady()
-        return True
-
     # End
 
     def end(self, reason: str) -> None:
         """End the run and stop the robot; the reason is '' if its samples are complete."""
         if self.run and self.run.end_reason is None:
             self.run.end_reason = reason
-            if self.stop_robot() and reason:
-                # zero is repeated for 1 s, since the link to the base may lose some
-                self._stop_repeat_end = self._stop_time + 1.0
+            if self._drive:
+                self._command(0.0)
+                self._stop_time = self._clock.steady()
+                if reason:  # zero is repeated for 1 s, since the link to the base may lose some
+                    self._stop_repeat_end = self._stop_time + 1.0
 
     def finish(self) -> tuple[bool, str]:
         """End the motion of a run by turns or by odometry."""

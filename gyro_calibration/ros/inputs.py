@@ -220,7 +220,7 @@ class TurnComparison:
 
     Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
-    wheels; a robot may be turned by others than the commands, or scale them. So beside commands
+    wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
     distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
     """
@@ -252,11 +252,7 @@ class TurnComparison:
 
     def add(self, source: str, time: float, rate: float, heading: float, *,
             stands: bool = False) -> None:
-        """
-        Add time, s, and rate, rad/s, of a source, and the heading by the gyro, rad.
-
-        The heading must not be changed by resets. Tell whether odometry shows standstill.
-        """
+        """Add time, s, and rate, rad/s, of a source, and the heading by the gyro without resets."""
         (then, before), self._last = self._last, (time, heading)
         is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
         self.source = source

@@ -86,12 +86,7 @@ class StateStore:
         return with_self_calibration(model, stored.self_calibration)
 
     def store_calibration(self, calibration: SelfCalibration) -> str:
-        """
-        Use and store a calibration; return the fault of the storage, '' without one.
-
-        A file in its place that was not used, such as that of another gyro, is kept under another
-        name, in a sentence that is returned.
-        """
+        """Use and store a calibration; return a fault, or where an unused file is kept, or ''."""
         self.model, self.calibration_hint = with_self_calibration(self.model, calibration), ''
         kept = ''
         try:

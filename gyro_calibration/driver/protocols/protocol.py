@@ -309,7 +309,6 @@ class Decoder:
 #: A finite number in text: `float` also takes nan, inf and 1_0.
 NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
 
-_LINE_END = re.compile(rb'[\r\n]')
 _MAX_LINE = 1024  # bytes; a longer line is discarded, so that an endless one fills no memory
 
 
@@ -327,7 +326,7 @@ class LineSplitter(Splitter):
         self._has_line_start = self._is_too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        first, *rest = _LINE_END.split(data)  # the tail was searched for line ends when it came
+        first, *rest = re.split(rb'[\r\n]', data)  # the tail has no line end
         *lines, tail = self._tail + first, *rest
         whole = []
         for line in lines:
