@@ -40,8 +40,7 @@ _WIDENING_LIMIT = 1.0
 #: Relative differences between the Allan deviations and the sum of the terms that are tried; the
 #: smallest sufficient one is used.
 _MISFIT_SHARES = (0.0, *np.geomspace(0.01, 0.32, 11).tolist())
-#: Least number of octaves that show a slope and its end.
-_MIN_OCTAVES = 4
+_MIN_OCTAVES = 4  # least number of octaves that show a slope and its end
 #: Indices of the terms, of a Gauss-Markov process, and of the reduction of the variance by a
 #: filter: at times beyond its memory it has the slope of quantization, with a negative sign.
 _N, _B, _K, _Q, _R, _PROCESS, _FILTER_BEND = range(len(NOISE_TERMS) + 2)

@@ -37,8 +37,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
-#: Limits of each bin, and which errors lie in it.
-Bins = list[tuple[float, float, Mask]]
+Bins = list[tuple[float, float, Mask]]  # limits of each bin, and which errors lie in it
 
 
 def add(parser: argparse.ArgumentParser) -> None:

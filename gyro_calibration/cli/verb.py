@@ -37,8 +37,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from tqdm import tqdm
 
-#: Time before progress is shown, s.
-PROGRESS_DELAY = 2.0
+PROGRESS_DELAY = 2.0  # time before progress is shown, s
 
 
 @contextmanager

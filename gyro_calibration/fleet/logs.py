@@ -66,8 +66,7 @@ import numpy as np
 ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
-#: Largest number of bytes that are read of the notes of a log.
-_MAX_NOTE_BYTES = 4096
+_MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)

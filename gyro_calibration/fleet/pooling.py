@@ -63,8 +63,7 @@ IntegerArray = NDArray[np.intp]
 UNITS, DRIVES, POWER_ONS, OWN_SHARE = 'units', 'drives', 'power_ons', 'own_share'
 #: Standard deviations of the slopes of units over the first column and the second.
 SLOPES = ('slopes_0', 'slopes_1')
-#: Points of the sequence over the variances.
-_SAMPLE_POINTS = 512
+_SAMPLE_POINTS = 512  # points of the sequence over the variances
 
 
 @dataclass(frozen=True)

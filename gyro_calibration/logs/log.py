@@ -53,10 +53,8 @@ NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
 CACHE_BLOCK_SAMPLES = 1 << 14
-#: Rows in a block of a log.
-BLOCK_ROWS = 1 << 16
-#: Least interval between samples, s.
-MIN_SAMPLE_INTERVAL = 1e-9
+BLOCK_ROWS = 1 << 16  # rows in a block of a log
+MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
 #: Largest number of characters of a line; and of notes and header, of a block of lines, or of a
 #: row that spans several lines.
 _MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24

@@ -46,11 +46,9 @@ MAX_RECORD_BYTES = 1 << 28
 _READ_BYTES = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
-#: Name of the metadata record of this program.
-METADATA_NAME = 'gyro_calibration'
+METADATA_NAME = 'gyro_calibration'  # name of the metadata record of this program
 
-#: Is called with the number of bytes read of all files.
-OnProgress = Callable[[int], object]
+OnProgress = Callable[[int], object]  # is called with the number of bytes read of all files
 
 
 @dataclass(frozen=True)
@@ -75,8 +73,7 @@ class Contents:
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    #: Number of parts that are damaged or too large.
-    skipped_parts: int = 0
+    skipped_parts: int = 0  # number of parts that are damaged or too large
 
     def add_topic(self, topic: str, kind: str, encoding: str,
                   definition: str) -> tuple[str, str] | None:

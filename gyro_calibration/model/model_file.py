@@ -31,8 +31,7 @@ FORMAT = 'gyro_calibration/model'
 VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
 _NOISE_NAMES = tuple(Noise.__dataclass_fields__)
-#: Highest order of a polynomial.
-_MAX_POLYNOMIAL_ORDER = 20
+_MAX_POLYNOMIAL_ORDER = 20  # highest order of a polynomial
 
 
 class ModelError(InputError):

@@ -147,8 +147,7 @@ def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
 
 _FORMATTERS: dict[str, Callable[[SimulatorParameters], tuple[str, set[str]]]] = {
     'sdf': _format_sdf, 'isaac': _format_isaac, 'mujoco': _format_mujoco}
-#: Names of the simulators.
-SIMULATORS = tuple(_FORMATTERS)
+SIMULATORS = tuple(_FORMATTERS)  # names of the simulators
 
 
 def export_model(parameters: SimulatorParameters, model: GyroModel,

@@ -187,8 +187,7 @@ class RosTime:
         self._last_poll = now
 
 
-#: Largest age of a velocity that is used, s; slower odometry shows nothing.
-MAX_VELOCITY_AGE = 1.0
+MAX_VELOCITY_AGE = 1.0  # largest age of a velocity that is used, s; slower odometry shows nothing
 #: Longest motion after the last command to move, s: the default time-out of ros2_control's
 #: diff_drive_controller.
 COASTING_DURATION = 0.5
@@ -252,7 +251,7 @@ class TurnComparison:
 
     def add(self, source: str, time: float, rate: float, heading: float, *,
             stands: bool = False) -> None:
-        """Add time, s, and rate, rad/s, of a source, and the heading by the gyro without resets."""
+        """Add time, s, and rate, rad/s, by a source, and the heading by the gyro, not reset."""
         (then, before), self._last = self._last, (time, heading)
         is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
         self.source = source

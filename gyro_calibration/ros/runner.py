@@ -62,8 +62,7 @@ SHUTDOWN_TIMEOUT = 10.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-#: Level, sentence and values by name.
-Report = tuple[bytes, str, Mapping[str, object]]
+Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values by name
 
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:

@@ -37,8 +37,7 @@ PROTOCOLS = {
     value.name: value for each in pkgutil.iter_modules(__path__)
     for value in vars(importlib.import_module(f'{__name__}.{each.name}')).values()
     if isinstance(value, Protocol)}
-#: Name that stands for recognition by listening.
-AUTO = 'auto'
+AUTO = 'auto'  # name that stands for recognition by listening
 #: Bits per second, in order of the attempts: first the defaults of gyros, then others.
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 
