@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass
 from datetime import date
 import io
 import math
+from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
@@ -371,44 +372,6 @@ def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
 
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
-#: Sorts a table by the clicked column, and shows the rows that contain a text.
-_SCRIPT = Markup("""<script>
-'use strict';
-for (const table of document.querySelectorAll('table.sortable')) {
-  const body = table.tBodies[0], rows = [...body.rows], search = document.createElement('input');
-  search.type = 'search';
-  search.placeholder = 'Search';
-  search.setAttribute('aria-label', 'Search in the table below');
-  if (table.parentNode.classList.contains('tall')) table.parentNode.before(search);
-  search.addEventListener('input', () => {
-    const text = search.value.toLowerCase();
-    for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(text);
-  });
-  [...table.tHead.rows[0].cells].forEach((head, column) => {
-    const button = document.createElement('button');
-    for (const row of rows) row.cells[column].dataset.head = head.textContent;
-    button.textContent = head.textContent;
-    head.replaceChildren(button);
-    let sign = -1;
-    button.addEventListener('click', () => {
-      sign = -sign;
-      const key = row => row.cells[column].dataset.key;
-      rows.sort((a, b) => sign * (key(a) - key(b) || key(a).localeCompare(key(b))));
-      body.append(...rows);
-    });
-  });
-}
-</script>""")
-_STYLE = Markup("""<style>
-th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid; }
-input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-width: 20rem; }
-.scroll.fold { max-width: none; max-height: none; } .scroll.tall { max-height: 40rem; }
-.sortable th, .sortable td { overflow-wrap: normal; word-break: normal; }
-.sortable td:nth-child(n + 2):not(:empty) { min-width: 4.5rem; }
-@container (max-width: 29.99rem) {
-  .fold .sortable td:first-child { font-weight: 600; } .fold .sortable td:empty { display: none; }
-}
-</style>""")
 
 
 def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
@@ -422,7 +385,7 @@ def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, A
                 element('p', about, class_='gained') if about else None),
         element('main', *(part for place, found in enumerate(types)
                           for part in _type_sections(found, f't{place}')), _log_section(records)),
-        _STYLE, _SCRIPT)
+        Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
     return render_page(f'Fleet: {title}', body)
 
 
