@@ -145,9 +145,19 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
 
 
 def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
-    """Give the logs of a path; a folder that was visited before has none."""
+    """Give the logs of a path; a folder that was visited before, or holds results, has none."""
     if os.path.isdir(path):
-        yield from _search_folder(Path(path), visited)
+        folder = Path(path)
+        if os.path.realpath(folder) in visited or (folder / 'fleet.json').is_file():
+            return
+        visited.add(os.path.realpath(folder))
+        if (folder / 'metadata.yaml').is_file():
+            yield FleetLog(path)  # a recording
+            return
+        for inner in sorted(folder.iterdir()):
+            if (inner.is_dir() or inner.name.lower().endswith(LOG_SUFFIXES)
+                    and not inner.name.startswith('.')):
+                yield from _expand_path(str(inner), visited)
     elif not os.path.exists(path) and glob(path, recursive=True):
         for each in sorted(glob(path, recursive=True)):
             yield from _expand_path(each, visited)
@@ -159,20 +169,6 @@ def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
         yield from _read_rows(path, columns)
     else:
         yield FleetLog(path)
-
-
-def _search_folder(folder: Path, visited: set[str]) -> Iterator[FleetLog]:
-    """Give the logs in a folder and in those inside it; one with metadata.yaml is a recording."""
-    if os.path.realpath(folder) in visited or (folder / 'fleet.json').is_file():
-        return
-    visited.add(os.path.realpath(folder))
-    if (folder / 'metadata.yaml').is_file():
-        yield FleetLog(str(folder))
-        return
-    for path in sorted(folder.iterdir()):
-        if (path.is_dir() or path.name.lower().endswith(LOG_SUFFIXES)
-                and not path.name.startswith('.')):
-            yield from _expand_path(str(path), visited)
 
 
 def _read_text(path: str) -> str:
@@ -355,7 +351,7 @@ class LogTask:
     entry: FleetLog
     folder: str  # of the results
     technology: str = 'mems'  # of the gyros, one of `heading_regression.TECHNOLOGY_PRIORS`
-    file_pattern: re.Pattern[str] | None = None  # by `table.compile_file_pattern`
+    file_pattern: re.Pattern[str] | None = None  # by `compile_file_pattern`
     #: For the diagnosis, the same for each log; None without a diagnosis.
     generator: np.random.Generator | None = None
     default_type: str = ''  # of logs whose type is not stated

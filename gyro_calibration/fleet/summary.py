@@ -97,7 +97,7 @@ class TypeSummary:
 
 
 def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
-    """Return the results of each type by records of `work.process_log` that are not excluded."""
+    """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
     values = {}  # the names in more than one log, and whether each is a slow effect

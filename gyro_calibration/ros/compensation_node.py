@@ -52,7 +52,7 @@ from std_srvs.srv import Trigger
 
 
 class NodeClock:
-    """The clocks of a node; see `clock.Clock`."""
+    """The clocks of a node; see `inputs.Clock`."""
 
     steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
 
