@@ -51,8 +51,7 @@ def rms_bounds(freedom):
 def mean_bound(values):
     """Return what the mean of normal values about zero is off at most, by their own scatter."""
     count = len(values)
-    return (student.isf(0.5 * RARE, count - 1)
-            * np.std(values, axis=0, ddof=1) / math.sqrt(count))
+    return (student.isf(0.5 * RARE, count - 1) * np.std(values, axis=0, ddof=1) / math.sqrt(count))
 
 
 def evidence(*case):

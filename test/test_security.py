@@ -128,8 +128,7 @@ SETTINGS = {
     'compensation_node': [{}, {'wheels': 'both', 'cmd_vel_stamped': True, 'use_sim_time': True}],
     'compensation_node_that_drives': [{'calibration.drive': True, 'use_sim_time': True}],
 }
-#: What a node has only where it is asked for.
-ONLY_THEN = {('subscriber', '/clock')}
+ONLY_THEN = {('subscriber', '/clock')}  # what a node has only where it is asked for
 
 
 def node_of(enclave):

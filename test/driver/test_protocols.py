@@ -156,8 +156,7 @@ def test_a_flipped_bit_gives_no_wrong_rate(name):
 @pytest.mark.parametrize('name', ALL)
 def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
     encode, decoder = find_protocol(name).encoder(SETTINGS[name]), opened(name)
-    frames = [encode(Sample(0.1 * number, 20.0, 0.01 * number))
-              for number in range(1, 9)]
+    frames = [encode(Sample(0.1 * number, 20.0, 0.01 * number)) for number in range(1, 9)]
     frames[3] = frames[3][:2] + b'\x55' + frames[3][4:]
     frames[4] = frames[4][:3] + b'\x55' + frames[4][3:]
     assert [sample.missing for sample in decoder.feed(b''.join(frames))] == [0, 0, 0, 2, 0, 0]
@@ -559,8 +558,7 @@ def witmotion(kind, *numbers):
     return data + bytes([sum(data) % 256])
 
 
-@pytest.mark.parametrize('axis, rate, force',
-                         [('x', 100, 4), ('y', -200, -5), ('z', 300, 2048)])
+@pytest.mark.parametrize('axis, rate, force', [('x', 100, 4), ('y', -200, -5), ('z', 300, 2048)])
 def test_the_axis_chooses_rate_and_acceleration_of_a_witmotion(axis, rate, force):
     sample, = decoded(WITMOTION, witmotion(0x51, 4, -5, 2048, 2500),
                       witmotion(0x52, 100, -200, 300, 2534), axis=axis)
