@@ -126,8 +126,6 @@ class DiskFull(OSError):
 class _Recorder:
     """A new file that grows by complete pieces, and is removed at the end if it has none."""
 
-    closing_part = b''
-
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
         # size of the complete pieces, bytes, and whether one could not be written
@@ -156,15 +154,16 @@ class _Recorder:
         """Write what was added as a piece; a silence or the end makes it due."""
         raise NotImplementedError
 
+    def finish(self) -> None:
+        """Write the last piece."""
+        self.flush(is_due=True)
+
     def close(self) -> None:
-        """Write the last piece, unless one has failed, and close the file."""
+        """Finish and close the file; nothing is written after a piece that failed."""
         try:
             if not self.is_full:
-                self.flush(is_due=True)
+                self.finish()
         finally:
-            if self.size and self.closing_part:
-                with suppress(DiskFull):  # a reader then takes the file for truncated
-                    self.append(self.closing_part)
             self._file.close()
             if not self.size:
                 os.unlink(self.path)
@@ -172,8 +171,6 @@ class _Recorder:
 
 class McapRecorder(_Recorder):
     """Messages in an MCAP file; `variance` is that of the rate of a sample, (rad/s)²."""
-
-    closing_part = MCAP_END
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
@@ -194,10 +191,24 @@ class McapRecorder(_Recorder):
             self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
 
     def flush(self, is_due: bool = False) -> None:
-        if chunk := self.writer.take_chunk():
+        """Write the messages so far as a chunk."""
+        if self.writer.pending_bytes:
             head = b'' if self.size else self.writer.pack_header(
                 f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
-            self.append(head + chunk)
+            self.append(head + self.writer.pack_chunk())
+
+    def finish(self) -> None:
+        """Write the last chunk and the index."""
+        self.flush()
+        if self.size:
+            self.append(self.writer.pack_summary())
+
+    def close(self) -> None:
+        """Close the file, on a full disk with an end that readers understand."""
+        if self.is_full and self.size:
+            with suppress(DiskFull):  # a reader then takes the file for truncated
+                self.append(MCAP_END)
+        super().close()
 
 
 class CsvRecorder(_Recorder):

@@ -18,6 +18,7 @@ size. Existing libraries have no such limits and refuse truncated files: rosbags
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
 """
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -213,7 +214,7 @@ _RecordCode = IntEnum('_RecordCode', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK
                       'METADATA_INDEX SUMMARY_OFFSET DATA_END')
 _USED_RECORDS = (_RecordCode.SCHEMA, _RecordCode.CHANNEL, _RecordCode.MESSAGE, _RecordCode.CHUNK,
                  _RecordCode.METADATA)
-#: Closing part of an MCAP file: end of data, and a footer that refers to no index.
+#: Closing part of an MCAP file without index and checksum: end of data, and a footer of zeros.
 MCAP_END = (struct.pack('<BQ4x', _RecordCode.DATA_END, 4)
             + struct.pack('<BQ20x', _RecordCode.FOOTER, 20) + _MAGIC)
 
@@ -350,45 +351,98 @@ def _pack_sized(data: bytes | str) -> bytes:
 
 
 class McapWriter:
-    """Makes the bytes of an uncompressed MCAP file of ROS 2 messages; `MCAP_END` follows them."""
+    """Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk."""
 
     def __init__(self) -> None:
-        self._numbers: dict[str, int] = {}  # of message types and topics in the file
-        self._records, self._times = bytearray(), list[int]()
+        self._offset = 0
+        self._records = bytearray()
+        self._schemas: dict[str, tuple[int, bytes]] = {}
+        self._channels: dict[str, tuple[int, bytes]] = {}
+        self._indexes: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+        self._counts: Counter[int] = Counter()
+        self._spans: list[tuple[int, int]] = []
+        self._chunk_indexes: list[bytes] = []
+        self._metadata_index = b''
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes of the messages that are not yet in a chunk."""
+        return len(self._records)
 
     def pack_header(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
         """Return the beginning of a file: header with the program, and a metadata record."""
+        head = _MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'), _pack_sized(library))
         pairs = b''.join(_pack_sized(key) + _pack_sized(value) for key, value in notes.items())
-        head = _pack_record(_RecordCode.HEADER, _pack_sized('ros2'), _pack_sized(library))
-        return _MAGIC + head + _pack_record(_RecordCode.METADATA, _pack_sized(name),
-                                            _pack_sized(pairs))
+        metadata = _pack_record(_RecordCode.METADATA, _pack_sized(name), _pack_sized(pairs))
+        self._metadata_index = _pack_record(_RecordCode.METADATA_INDEX,
+                                            struct.pack('<QQ', len(head), len(metadata)),
+                                            _pack_sized(name))
+        self._offset = len(head + metadata)
+        return head + metadata
 
     def add(self, message: Message) -> None:
         """Add a message of a type of `DEFINITIONS` to the next chunk."""
-        kind, topic, numbers = message.kind, message.topic, self._numbers
-        if kind not in numbers:
-            numbers[kind] = len(numbers) + 1
-            self._records += _pack_record(
-                _RecordCode.SCHEMA, struct.pack('<H', numbers[kind]), _pack_sized(kind),
-                _pack_sized('ros2msg'), _pack_sized(DEFINITIONS[kind]))
-        if topic not in numbers:
-            numbers[topic] = len(numbers) + 1
-            self._records += _pack_record(
-                _RecordCode.CHANNEL, struct.pack('<HH', numbers[topic], numbers[kind]),
-                _pack_sized(topic), _pack_sized('cdr'), _pack_sized(b''))
-        head = struct.pack('<HIQQ', numbers[topic], 0, message.received, message.received)
+        kind, topic, received = message.kind, message.topic, message.received
+        if kind not in self._schemas:
+            schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H', len(self._schemas) + 1),
+                                  _pack_sized(kind), _pack_sized('ros2msg'),
+                                  _pack_sized(DEFINITIONS[kind]))
+            self._schemas[kind] = len(self._schemas) + 1, schema
+            self._records += schema
+        if topic not in self._channels:
+            ends = len(self._channels) + 1, self._schemas[kind][0]
+            channel = _pack_record(_RecordCode.CHANNEL, struct.pack('<HH', *ends),
+                                   _pack_sized(topic), _pack_sized('cdr'), _pack_sized(b''))
+            self._channels[topic] = ends[0], channel
+            self._records += channel
+        number = self._channels[topic][0]
+        self._indexes[number].append((received, len(self._records)))
+        head = struct.pack('<HIQQ', number, 0, received, received)
         self._records += _pack_record(_RecordCode.MESSAGE, head, message.data)
-        self._times.append(message.received)
 
-    def take_chunk(self) -> bytes:
-        """Return the messages since the last chunk as a chunk; b'' without any."""
-        if not self._times:
+    def pack_chunk(self) -> bytes:
+        """Return the messages since the last chunk as a chunk with index; b'' without any."""
+        if not self._indexes:
             return b''
-        times, records = self._times, bytes(self._records)
-        self._records, self._times = bytearray(), []
-        head = struct.pack('<QQQI', min(times), max(times), len(records), zlib.crc32(records))
-        return _pack_record(_RecordCode.CHUNK, head, _pack_sized(''),
-                            struct.pack('<Q', len(records)), records)
+        times = [time for index in self._indexes.values() for time, _ in index]
+        self._spans.append((min(times), max(times)))
+        records = bytes(self._records)
+        head = struct.pack('<QQQI', *self._spans[-1], len(records), zlib.crc32(records))
+        chunk = _pack_record(_RecordCode.CHUNK, head, _pack_sized(''),
+                             struct.pack('<Q', len(records)), records)
+        indexes, offsets = b'', b''
+        for number, index in self._indexes.items():
+            offsets += struct.pack('<HQ', number, self._offset + len(chunk) + len(indexes))
+            pairs = b''.join(struct.pack('<QQ', *pair) for pair in sorted(index))
+            indexes += _pack_record(_RecordCode.MESSAGE_INDEX, struct.pack('<H', number),
+                                    _pack_sized(pairs))
+            self._counts[number] += len(index)
+        self._chunk_indexes.append(
+            _pack_record(_RecordCode.CHUNK_INDEX,
+                         struct.pack('<QQQQ', *self._spans[-1], self._offset, len(chunk)),
+                         _pack_sized(offsets), struct.pack('<Q', len(indexes)), _pack_sized(''),
+                         struct.pack('<QQ', len(records), len(records))))
+        self._records.clear()
+        self._indexes.clear()
+        self._offset += len(chunk + indexes)
+        return chunk + indexes
+
+    def pack_summary(self) -> bytes:
+        """Return the end of a file: the summary with the index of all chunks."""
+        data_end = _pack_record(_RecordCode.DATA_END, struct.pack('<I', 0))
+        sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
+        span = (min((span[0] for span in self._spans), default=0),
+                max((span[1] for span in self._spans), default=0))
+        counts = b''.join(struct.pack('<HQ', *pair) for pair in self._counts.items())
+        statistics = _pack_record(
+            _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
+            struct.pack('<QQ', *span), _pack_sized(counts))
+        summary = b''.join([*(record for _, record in self._schemas.values()),
+                            *(record for _, record in self._channels.values()),
+                            statistics, *self._chunk_indexes, self._metadata_index])
+        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, self._offset + len(data_end), 0)
+        checked = struct.pack('<I', zlib.crc32(summary + footer))
+        return data_end + summary + footer + checked + _MAGIC
 
 
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
