@@ -27,7 +27,6 @@ Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, 
 ports, processes and ROS 2, `driver`, `ros`, `cli`; then `api`, which holds the public names. Each
 folder imports only what stands before it, and so does each module of a folder, by the reading
 order that its docstring gives. `files` opens and writes files for all.
-
 """
 
 from importlib import import_module
@@ -35,20 +34,8 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gyro_calibration.api import (
-        allan,
-        compensate,
-        diagnose,
-        fit,
-        GyroModel,
-        Log,
-        read_log,
-        read_model,
-        self_calibrate,
-        simulate,
-        track,
-        write_log,
-        write_model,
-    )
+        allan, compensate, diagnose, fit, GyroModel, Log, read_log, read_model, self_calibrate,
+        simulate, track, write_log, write_model)
 
 __version__ = '0.2.0'
 __all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_log', 'read_model',

@@ -15,7 +15,6 @@ All quantities are in SI: s, rad, rad/s; temperatures are in degC. Each function
 returns a record that prints its answer, as the verb of the same name does. Data that allow no
 answer raise `DataRefused`, files that cannot be read `LogError` or `ModelError`, arguments that
 are not possible `InputError`; all of them are a `ValueError` whose text says what to do.
-
 """
 
 from __future__ import annotations
@@ -35,11 +34,7 @@ from gyro_calibration.calibration.self_calibration import default_reference_erro
 from gyro_calibration.cli import plots
 from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures
 from gyro_calibration.cli.compensate import (
-    check_finite,
-    CompensatedBlock,
-    integrate_log,
-    track_log,
-)
+    check_finite, CompensatedBlock, integrate_log, track_log)
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import Fitted
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
@@ -58,11 +53,7 @@ from gyro_calibration.model import model_file
 from gyro_calibration.model.effects import STATIC_EFFECTS
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import parse_model, write_model
-from gyro_calibration.model.motion import (
-    Motion,
-    motion_by_name,
-    motion_from_log,
-)
+from gyro_calibration.model.motion import Motion, motion_by_name, motion_from_log
 from gyro_calibration.model.motion import simulate as simulate_motion
 import numpy as np
 
@@ -114,7 +105,6 @@ def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
 
     ``read_model({'effects': {'bias': {'bias': 0.002}}, 'noise': {'angle_random_walk': 7e-4}})``
     is a gyro with a bias and white noise.
-
     """
     return (parse_model(dict(source)) if isinstance(source, Mapping)
             else model_file.read_model(source))
@@ -182,7 +172,6 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     Correct the rates of a log by a model, and integrate them to a heading.
 
     `ValueError` says that no row of the log is plausible.
-
     """
     _require_logs(log)
     _require_model(model)
@@ -292,7 +281,6 @@ def allan(log: Log) -> NoiseFigures:
     Find the noise figures of a gyro in a log at rest, by its Allan deviation.
 
     `ValueError` says that the gyro moved, is dead, or has uneven stamps.
-
     """
     _require_time(log)
     return find_noise_figures(log)

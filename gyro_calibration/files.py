@@ -14,10 +14,7 @@ Read files within limits of size, and write files atomically.
 A pipe, a socket, a device or a folder is neither waited for nor replaced. A symbolic link is
 followed when it is read, and replaced when it is written; its target does not change. A file that
 is replaced keeps its mode, and its owner and group where that is allowed.
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -43,8 +40,6 @@ MAX_MAGNITUDE = 1e20
 MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
 #: Largest depth of nested lists, names and messages, which the stack of Python holds.
 MAX_DEPTH = 10
-#: Longest wait for a program to write to a pipe, ms.
-_PIPE_TIMEOUT_MS = 900
 
 #: File type, other than a regular file -> its name.
 _FILE_TYPE_NAMES = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
@@ -140,10 +135,10 @@ def _require_regular_file(path: str | Path, mode: int, allow_pipes: bool = False
 
 
 def _has_writer(handle: int) -> bool:
-    """Tell whether a pipe has a writer, or gets one within the timeout."""
+    """Tell whether a pipe has a writer, or gets one within 0.9 s."""
     waiting = select.poll()
     waiting.register(handle, select.POLLIN)
-    if waiting.poll(_PIPE_TIMEOUT_MS):
+    if waiting.poll(900):
         return True
     try:
         os.read(handle, 1)
@@ -182,7 +177,6 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
 
     Its folder is made where it is missing. After an error the old file is unchanged. Raise
     `OSError` for a path that is not a regular file, or a link to one.
-
     """
     path, old = Path(path), None
     try:
@@ -220,7 +214,6 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def format_rows(rows: Iterable[Iterable[Any]]) -> str:
-    """Return rows of values as CSV."""
     text = io.StringIO()
     csv.writer(text, lineterminator='\n').writerows(rows)
     return text.getvalue()

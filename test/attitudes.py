@@ -24,7 +24,6 @@ def tumbling(seed, misalignment=(0.0, 0.0), sizes=(70.0, 40.0, 40.0), noise=0.03
     The angles of yaw, pitch and roll are sums of sines of so many deg; the misalignment in rad is
     the part of the rates about x and y in the output of the gyro, which is along z. The attitude
     has so many deg of noise, and is lost twice.
-
     """
     generator = np.random.default_rng(seed)
     time = 0.01 * np.arange(12000)

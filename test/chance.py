@@ -14,7 +14,6 @@ Chance in tests: seeds that stay the same, and bounds of counts.
 A test draws from the same seed in each run, by its name, and from another one as evidence. Where
 it counts what happens at a stated rate, or measures a mean or a scatter, its bound is one that
 chance alone breaks at most once in a million runs.
-
 """
 
 import math
@@ -45,7 +44,6 @@ def rms_bounds(freedom):
     Return the least and the largest root mean square of normal values of deviation 1.
 
     Of a scatter about the own mean, `freedom` is one less than there are values.
-
     """
     return tuple(math.sqrt(chi2.ppf(rare, freedom) / freedom) for rare in (RARE, 1.0 - RARE))
 
@@ -53,8 +51,7 @@ def rms_bounds(freedom):
 def mean_bound(values):
     """Return what the mean of normal values about zero is off at most, by their own scatter."""
     count = len(values)
-    return (student.isf(0.5 * RARE, count - 1)
-            * np.std(values, axis=0, ddof=1) / math.sqrt(count))
+    return (student.isf(0.5 * RARE, count - 1) * np.std(values, axis=0, ddof=1) / math.sqrt(count))
 
 
 def evidence(*case):

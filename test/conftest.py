@@ -112,7 +112,6 @@ def pytest_collection_modifyitems(config, items):
     Mark the tests with ROS nodes and all that have to keep time; leave out what takes minutes.
 
     Long evidence runs where it is asked for, ``-m evidence``.
-
     """
     for item in items:
         # the item of a launch test has no fixtures
@@ -160,7 +159,6 @@ def operations(work):
 
     They are counted and not timed, so that a busy machine changes nothing. Loops over samples are
     seen however they are written; what a function of C does is one.
-
     """
     count, before = 0, (sys.gettrace(), sys.getprofile())
 
@@ -213,7 +211,6 @@ def compensate(run, tmp_path):
 
     It gives ``code``, ``text`` and ``error`` of the program, and of the log that it wrote ``log``
     and the columns that are new in it as numbers, ``columns``.
-
     """
     from gyro_calibration.logs.log import read_log, write_log
     from gyro_calibration.model.model_file import write_model
@@ -263,7 +260,6 @@ def _is_empty(domain):
 
     Fast DDS would use such a port of the domain again as it is, with less room than `_PATIENT`
     says. Who listens holds a lock.
-
     """
     ports = {int(re.findall(r'[0-9]+', path.name)[0])
              for path in _SHARED_MEMORY.glob('fastrtps_port*')}
@@ -305,7 +301,6 @@ def by_udp(monkeypatch):
     one that comes in its place hears nothing (issues 5053 and 5469 of Fast DDS). A process that
     is stopped while it holds a lock of its shared memory (5 of 226 were) stops the sender too,
     and all samples sent to it are lost.
-
     """
     for name, value in _profile('udp.xml', _BY_UDP).items():
         monkeypatch.setenv(name, value)
@@ -368,7 +363,6 @@ def start_node(ros_domain, request):
     remappings, gives a `NodeProcess` with ``output``, ``wait()``, ``stop()`` and ``process``. A
     node that a test did not itself wait for must still run at the end, end on SIGINT with code 0,
     and never print a traceback.
-
     """
     nodes = []
 
@@ -396,7 +390,6 @@ class HeldNode:
 
     Messages go in and out without DDS, in milliseconds; each topic seems to have two subscribers.
     ``sent`` has a list of messages for each topic.
-
     """
 
     def __init__(self, node_class, monkeypatch, parameters, remappings):
@@ -450,7 +443,6 @@ def hold_node(ros_domain, monkeypatch):
 
     ``hold_node(DriverNode, {'port': '/dev/x'}, {'__ns': '/robot'})``, by class, parameters and
     remappings.
-
     """
     with contextlib.ExitStack() as stack:
         def hold(node_class, parameters=None, remappings=None):
@@ -530,7 +522,6 @@ def ros(ros_domain):
 
     It has ``node``, ``collect(type, topic)``, ``publisher(type, topic)`` and
     ``call(service_type, name)``.
-
     """
     client = Ros()
     yield client

@@ -76,7 +76,6 @@ def won(hidden: HiddenLog, found: Diagnosis) -> dict[str, tuple[float, float]]:
 
     Both on the parts held out, in units of what the truth leaves; nothing where the diagnosis
     measured no gain, or where what is hidden has no gain to measure.
-
     """
     if found.gain is None or set(hidden.truth.names) <= WITHOUT_COLUMN:
         return {}
@@ -92,7 +91,6 @@ def _knowing(hidden: HiddenLog) -> dict[str, tuple[float, float]]:
     Return the mean squares left on the parts held out, by bias and scale alone and by the truth.
 
     The truth takes the bias, as the others do, from the other parts: it wanders.
-
     """
     truth, output, stamps, good = (hidden.truth, hidden.columns['gyro_rad_s'],
                                    hidden.columns['time_s'], hidden.truth.is_good)

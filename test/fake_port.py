@@ -31,7 +31,6 @@ class World:
     Devices that send bytes at their times, for as long as the world lasts.
 
     It is the clock of a `Connection`, the event that stops it, and what makes its ports.
-
     """
 
     def __init__(self, seconds, baud=None):

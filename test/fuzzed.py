@@ -14,7 +14,6 @@ Targets for fuzzing: each takes any bytes, and raises where a claim about its re
 The documented errors (LogError, ModelError, MotionError, ValueError of a parameter) are the right
 answer to wrong bytes; any other exception is a fault, and so is a message of several lines.
 `benchmarks/fuzz.py` runs them, guided by coverage.
-
 """
 
 
@@ -44,13 +43,7 @@ from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.bias_table import BiasTable, read_bias_table, write_bias_table
 from gyro_calibration.logs.cdr import IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.logs.log import (
-    Log,
-    LogError,
-    QUANTITIES,
-    read_log,
-    read_log_blocks,
-    write_log,
-)
+    Log, LogError, QUANTITIES, read_log, read_log_blocks, write_log)
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial

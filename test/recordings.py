@@ -16,8 +16,7 @@ import struct
 import numpy as np
 
 BEGIN = 1_700_000_000_000_000_000  # ns
-#: How long after its stamp a message was received, in ns.
-DELAY = 2_000_000
+DELAY = 2_000_000  # how long after its stamp a message was received, in ns
 #: Kind of storage -> arguments of `write`.
 KINDS = {'sqlite3': {}, 'sqlite3-file': {'mode': 'FILE'}, 'sqlite3-message': {'mode': 'MESSAGE'},
          'mcap': {'storage': 'MCAP'}, 'mcap-chunks': {'storage': 'MCAP', 'mode': 'STORAGE'},

@@ -15,7 +15,6 @@ A small robot, and a pipeline joined to it as the node joins them, with a clock 
 without rclpy and without waiting: a run of 24 s takes a fraction of a second, and a call of
 `Rig.step` does what the compensation node does in the interval of one sample. All units are SI;
 angles are counter-clockwise positive.
-
 """
 
 from collections import deque
@@ -49,7 +48,6 @@ class Robot:
     when it has heard none for the timeout, s. A test sets that the gyro is `unplugged`, that
     `stamps_stand`, or that the base is `deaf`: it goes on with what it did last. `distort` makes
     of the output what the gyro reports.
-
     """
 
     def __init__(self, *, scale_factor_error=0.0373, bias=0.01, noise=1e-3, latency=0.15, lag=0.2,
@@ -118,7 +116,6 @@ class Rig:
 
     The model is the text of its file, '' for none; stamps follow a simulation that begins at
     `ros`, s. Of the parameters of the node ``calibration_drive=True`` is ``calibration.drive``.
-
     """
 
     def __init__(self, folder, model=MODEL, robot=None, ros=None, calibration_file=None,
@@ -230,13 +227,17 @@ class Rig:
             self.step()
         return until()
 
+    def turn(self, rate, seconds):
+        """Command the robot to turn, rad/s, and step for a time."""
+        self.robot.command(rate)
+        self.go(seconds)
+
     def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None):
         """
         Play outputs of a gyro, rad/s, without the robot; return what came out for each.
 
         The temperature, degC, may be one or one a sample; `moving` is the rate that odometry
         shows, rad/s.
-
         """
         found = []
         for number, output in enumerate(outputs):

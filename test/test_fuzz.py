@@ -14,7 +14,6 @@ Any bytes or arguments: only documented errors are raised, nothing hangs, memory
 The claims are in `fuzzed`: hypothesis tries them on what the project writes, damaged at random,
 and atheris for 10 s, or 10 minutes as evidence, guided by coverage. What they once found is tried
 again.
-
 """
 
 import json

@@ -109,6 +109,5 @@ def test_no_random_number_comes_from_a_hidden_source():
     hidden = re.compile(r'np\.random\.(?!Generator)|default_rng')
     found = [path.name for module in CORE
              for path in files(module) if hidden.search(path.read_text())]
-    found += [path.name for path in REPRODUCTION.glob('*.py')
-              if 'default_rng' in path.read_text()]
+    found += [path.name for path in REPRODUCTION.glob('*.py') if 'default_rng' in path.read_text()]
     assert not found

@@ -128,8 +128,7 @@ SETTINGS = {
     'compensation_node': [{}, {'wheels': 'both', 'cmd_vel_stamped': True, 'use_sim_time': True}],
     'compensation_node_that_drives': [{'calibration.drive': True, 'use_sim_time': True}],
 }
-#: What a node has only where it is asked for.
-ONLY_THEN = {('subscriber', '/clock')}
+ONLY_THEN = {('subscriber', '/clock')}  # what a node has only where it is asked for
 
 
 def node_of(enclave):
@@ -204,8 +203,7 @@ def test_only_a_session_that_may_drive_sends_commands(tmp_path):
     """Not even where the profile has long begun to turn."""
     rig = rested(tmp_path)
     assert not rig.begin()
-    rig.robot.command(0.7)
-    rig.go(10.0)
+    rig.turn(0.7, 10.0)
     assert not rig.commands and not rig.session.is_driving
 
 

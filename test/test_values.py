@@ -13,7 +13,6 @@ No value poisons the state: no catalogue model, finite sample, temperature or st
 
 Hypothesis looks for values that break a claim. `make test` tries a fixed choice;
 GYRO_CALIBRATION_EXAMPLES multiplies their number and chooses them at random.
-
 """
 
 import math

@@ -18,7 +18,6 @@ differences of the angle, which are Gaussian.
 
 Reading order: `deviation` (samples at rest on an even grid, the chart, and the covariance of Allan
 variances), `noise_fit` (coefficients of the noise terms).
-
 """
 
 from importlib import import_module

@@ -16,10 +16,7 @@ A record has samples on an even grid, without outliers and motion.
 Times are in samples, except in the chart. An Allan variance is a mean square of second differences
 of the angle, and mean squares of Gaussian values have the covariance 2 c² summed over all pairs
 (Greenhall and Riley, Uncertainty of stability variances based on finite differences, PTTI 2003).
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,15 +29,8 @@ from gyro_calibration.logs.log import Array, DataRefused, Mask
 from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
-    ANGLE_RANDOM_WALK,
-    FLICKER,
-    GaussMarkov,
-    NOISE_TERMS,
-    NoiseTerm,
-    QUANTIZATION,
-    RATE_RAMP,
-    RATE_RANDOM_WALK,
-)
+    ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, NoiseTerm, QUANTIZATION, RATE_RAMP,
+    RATE_RANDOM_WALK)
 import numpy as np
 from scipy.special import chdtri
 from scipy.stats import pearsonr
@@ -71,7 +61,6 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     An output that is nan counts as lost, as does one with `moving` 1; without `moving` the heading
     by a reference, rad, is tested for motion. Raise `DataRefused` for too few samples, a dead
     gyro, stamps without an even interval, or motion.
-
     """
     _refuse_few(len(output))
     known = np.isfinite(output) if moving is None else np.isfinite(output) & (moving == 0.0)
@@ -187,7 +176,6 @@ def integrate_angle(rate: Array) -> Array:
 
     Gaps get the mean over 5 gap lengths on each side. A line between the samples at both ends
     would integrate their noise over the whole gap, which passes for a random walk.
-
     """
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
@@ -268,7 +256,6 @@ def allan_deviation(rate: Array, interval: float,
     times, s, from an interval to half the record, are taken to the nearest whole number of
     intervals; by default they are ten a decade, up to a third of the record. Raise `DataRefused`
     for too few samples.
-
     """
     _refuse_few(int(np.isfinite(rate).sum()))
     samples = len(rate)
@@ -369,7 +356,6 @@ def covariance_form(samples: int, first: int, second: int,
     is no noise, but adds a mean m to values with the covariance c, and 4 m² c to the covariance of
     their squares. With a process, its times in samples, the shape is (6, 6), with a coefficient of
     1.
-
     """
     counts = (samples + 1 - 2 * first, samples + 1 - 2 * second)
     area = float(first) ** 2 * float(second) ** 2

@@ -14,5 +14,4 @@ The command line: one file for each verb.
 A file with a function ``run`` is a verb of its name. Its docstring is the help: a summary and an
 example. ``add`` describes the arguments to argparse, and ``run`` makes an `Answer` of them. Units
 of the command line are converted to SI here.
-
 """

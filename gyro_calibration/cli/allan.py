@@ -13,7 +13,6 @@ Find the noise figures of a gyro in a record at rest, by its Allan deviation.
 
 example: gyro_calibration allan rest.csv --rate 100 --picture allan.png --model model.yaml
 --out model.yaml
-
 """
 
 from __future__ import annotations
@@ -24,11 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.allan.deviation import (
-    allan_deviation,
-    AllanChart,
-    build_rest_record,
-    RestRecord,
-)
+    allan_deviation, AllanChart, build_rest_record, RestRecord)
 from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
@@ -69,7 +64,7 @@ def run(given: argparse.Namespace) -> Answer:
         found.plot(given.picture)
     if given.out:
         write_model(given.out, found.put_into(verb.add_origin(given, model)))
-    return Answer([str(found)], _data(given, found.record, found.chart, found.fit),
+    return Answer([str(found)], {**_data(found), 'picture': given.picture, 'out': given.out},
                   (given.picture, given.out))
 
 
@@ -82,7 +77,19 @@ class NoiseFigures(PrintedResult):
     fit: NoiseFit  # the noise figures
 
     def __str__(self) -> str:
-        return '\n'.join(_answer_lines(self.record, self.chart, self.fit))
+        record, fit, (unit, factor) = self.record, self.fit, DISPLAY_UNITS['B']
+        lost, (time, *sizes) = np.isnan(record.rate).sum(), self.chart.floor.values()
+        deviation, lower, upper = (f'{size * factor:.4g}' for size in sizes)
+        floor_line = (f'Lowest Allan deviation: {deviation} {unit} at {time:.4g} s, '
+                      f'95 %: {lower} to {upper}.')
+        if not fit.is_floor_reached:
+            floor_line += (' The deviation still falls at the end of the chart; record longer to '
+                           'reach its minimum.')
+        return '\n'.join([
+            f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
+            f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks, floor_line,
+            *(_figure_line(symbol, figure) for symbol, figure in fit.figures.items()),
+            _fit_line(fit)])
 
     def put_into(self, model: GyroModel) -> GyroModel:
         """Return a model with these figures as its noise."""
@@ -97,27 +104,10 @@ class NoiseFigures(PrintedResult):
 
 
 def find_noise_figures(log: Log) -> NoiseFigures:
-    """Return the noise figures of a log in time, at rest."""
     record = build_rest_record(np.asarray(log.time), np.asarray(log.output), log.moving,
                                log.reference_heading)
     return NoiseFigures(record, allan_deviation(record.rate, record.interval),
                         fit_noise(record.rate, record.interval))
-
-
-def _answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[str]:
-    lost, (unit, factor) = np.isnan(record.rate).sum(), DISPLAY_UNITS['B']
-    time, *sizes = chart.floor.values()
-    deviation, lower, upper = (f'{size * factor:.4g}' for size in sizes)
-    floor_line = (f'Lowest Allan deviation: {deviation} {unit} at {time:.4g} s, '
-                  f'95 %: {lower} to {upper}.')
-    if not fit.is_floor_reached:
-        floor_line += (' The deviation still falls at the end of the chart; record longer to '
-                       'reach its minimum.')
-    return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
-            f'{len(record.rate) * record.interval:.5g} s at rest.',
-            *record.remarks, floor_line,
-            *(_figure_line(symbol, figure) for symbol, figure in fit.figures.items()),
-            _fit_line(fit)]
 
 
 def _figure_line(symbol: str, figure: NoiseFigure) -> str:
@@ -149,8 +139,8 @@ def _fit_line(fit: NoiseFit) -> str:
     return f'{text}.'
 
 
-def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
-          fit: NoiseFit) -> dict[str, Any]:
+def _data(found: NoiseFigures) -> dict[str, Any]:
+    record, chart, fit = found.record, found.chart, found.fit
     figures = {figure.term.name: {'symbol': symbol, 'unit': figure.term.unit,
                                   'value': figure.value, 'lower': figure.lower,
                                   'upper': figure.upper, 'seen': bool(figure.value),
@@ -166,5 +156,4 @@ def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
             'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
             else {'standard_deviation': fit.process.standard_deviation,
                   'correlation_time_s': fit.process.correlation_time},
-            'chart': {name: values.tolist() for name, values in columns.items()},
-            'picture': given.picture, 'out': given.out}
+            'chart': {name: values.tolist() for name, values in columns.items()}}

@@ -12,7 +12,6 @@
 Add compensated rates, and for samples in time the heading, to a log.
 
 example: gyro_calibration compensate drive.csv --model model.yaml --out compensated.csv
-
 """
 
 from __future__ import annotations
@@ -32,12 +31,7 @@ from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX_GAP, Threshold
 from gyro_calibration.heading.log_compensation import (
-    LogCompensation,
-    no_plausible_row_message,
-    plausible_rows,
-    rows_of,
-    smooth_track,
-)
+    LogCompensation, no_plausible_row_message, plausible_rows, rows_of, smooth_track)
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance

@@ -12,7 +12,6 @@
 Run an emulated gyro, its driver, compensation, self-calibration and a drive here.
 
 example: gyro_calibration demo --out demo
-
 """
 
 from __future__ import annotations
@@ -133,6 +132,10 @@ class DemoClient:
         def add_command(message: Twist) -> None:
             robot.commands.append((time.monotonic(), message.angular.z))
 
+        def spin() -> None:
+            while not self._stop.is_set():
+                self._executor.spin_once(timeout_sec=0.1)
+
         self._node.create_subscription(Imu, 'imu/data_raw', add_raw, SENSOR_QOS)
         self._node.create_subscription(Imu, 'imu/data', add_heading, SENSOR_QOS)
         self._node.create_subscription(Twist, 'cmd_vel', add_command, 10)
@@ -140,12 +143,8 @@ class DemoClient:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._spin)
+        self._thread = threading.Thread(target=spin)
         self._thread.start()
-
-    def _spin(self) -> None:
-        while not self._stop.is_set():
-            self._executor.spin_once(timeout_sec=0.1)
 
     def call_service(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
         """Call a service, wait again and again until it answers, and return its message."""
@@ -162,18 +161,15 @@ class DemoClient:
         return answer.result().message
 
     def is_ready(self) -> bool:
-        """Return whether gyro and heading are received and another node commands the robot."""
         return (bool(self.raw_rates and self.headings)
                 and self._node.count_publishers('cmd_vel') > 1)
 
     def command_rate(self, rate: float) -> None:
-        """Command a rate, rad/s."""
         command = Twist()
         command.angular.z = rate
         self._velocity.publish(command)
 
     def close(self) -> None:
-        """Leave the graph."""
         self._stop.set()
         self._thread.join()
         self._executor.shutdown()
@@ -210,7 +206,6 @@ def run_demo(out: Path, seed: int) -> Answer:
     compensation drives the calibration, then a drive follows.
 
     Raise `OSError` where a node does not answer, or the folder cannot be written to.
-
     """
     out.mkdir(parents=True, exist_ok=True)
     calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',

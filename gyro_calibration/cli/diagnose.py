@@ -12,10 +12,7 @@
 Measure the error of a simulation, name the cause, extend the model, measure the gain.
 
 example: gyro_calibration diagnose drive.csv --model gyro.yaml --out diagnosis
-
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence

@@ -13,15 +13,13 @@ Emulate a gyro on a pseudo-terminal, from a model and a motion or from a log.
 
 example: gyro_calibration emulate --protocol kvh_dsp3000 --model model.yaml --motion robot
 --link /tmp/gyro
-
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
 from itertools import count, repeat
 import json
+import math
 import signal
 from typing import Any
 
@@ -55,7 +53,8 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help='start when a program has opened the port')
     parser.add_argument('--repeat', action='store_true', help='start again at the end')
     verb.add_topic_options(parser)
-    parser.set_defaults(**verb.DEFAULT_LOG_OPTIONS)
+    # of the other options that `verb.read` uses
+    parser.set_defaults(invert=False, names={}, axis='z', unwrap=False, begin=0.0, end=math.inf)
 
 
 def run(given: argparse.Namespace) -> None:
@@ -71,7 +70,7 @@ def run(given: argparse.Namespace) -> None:
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')
-    samples = _iterate_samples(time, output, log.temperature, given.repeat)
+    samples = _make_samples(time, output, log.temperature, given.repeat)
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
 
@@ -91,8 +90,8 @@ def _handle_signals(handler: Any) -> None:
         signal.signal(number, handler)
 
 
-def _iterate_samples(time: Array, output: Array, temperature: Array | None,
-                     repeats: bool) -> Iterator[Sample]:
+def _make_samples(time: Array, output: Array, temperature: Array | None,
+                  repeats: bool) -> Iterator[Sample]:
     """Give the samples of a log that have an output, once or, on request, again and again."""
     known = np.isfinite(output)
     times, outputs = time[known] - time[known][0], output[known].tolist()

@@ -12,10 +12,7 @@
 Write a model as robot simulators read it.
 
 example: gyro_calibration export --to sdf model.yaml --sample-rate 100
-
 """
-
-from __future__ import annotations
 
 import argparse
 from dataclasses import asdict

@@ -12,7 +12,6 @@
 Calibrate from a rate table, a turntable, an encoder, or any log with a reference.
 
 example: gyro_calibration fit table.csv --out model.yaml
-
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from typing import Any
 
 from gyro_calibration.calibration.dwells import format_list
 from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration, HEADING_ALONE
-from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration
+from gyro_calibration.calibration.rate_table import bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
@@ -36,11 +35,7 @@ from gyro_calibration.diagnosis.words import as_sentence, display_unit
 from gyro_calibration.files import InputError, suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
-    Effect,
-    polynomial_to_matrix,
-    rate_temperature_polynomial,
-    STATIC_EFFECTS,
-)
+    Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np
@@ -211,24 +206,30 @@ def _dwell_data(selection: Selection) -> dict[str, Any]:
                          'parted': pair.is_distinguishable,
                          'parting_rate_rad_s': pair.distinguishing_rate,
                          'reason': pair.reason} for pair in selection.confounders],
-        'by_rate': [_bin_data(part, 'rad_s') for part in bin_errors(fit, table.rate)],
-        'by_temperature': [] if table.temperature is None else
-        [_bin_data(part, 'degc') for part in bin_errors(fit, table.temperature)]}
-
-
-def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
-    return {f'from_{unit}': part.low, f'to_{unit}': part.high, 'dwells': part.count,
-            'mean_before_rad_s': part.uncorrected, 'mean_residual_rad_s': part.residual,
-            'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
+        **{f'by_{name}': [
+            {f'from_{unit}': part.low, f'to_{unit}': part.high, 'dwells': part.count,
+             'mean_before_rad_s': part.uncorrected, 'mean_residual_rad_s': part.residual,
+             'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
+            for part in ([] if values is None else bin_errors(fit, values))]
+            for name, unit, values in (('rate', 'rad_s', table.rate),
+                                       ('temperature', 'degc', table.temperature))}}
 
 
 def _dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
-    """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
     fit = selection.calibration
-    yield from _dwell_count_lines(fit)
+    table, sweeps = fit.dwells, len(np.unique(fit.dwells.sweep))
+    slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
+    temperatures = ('' if table.temperature is None
+                    else f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
+    yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
+           f'{slowest:.1f} to {fastest:.1f} deg/s{temperatures}.')
+    if outlying := [f'{table.location[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
+                    for row in np.flatnonzero(~fit.scatter.inliers)]:
+        yield wrap_line(f'{len(outlying)} outlying, not fitted: {format_list(outlying)}.')
+    yield from (wrap_line(as_sentence(remark)) for remark in table.remarks)
     yield from ('', *_value_lines(model), '', *_quality_lines(fit), '')
-    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, fit.dwells.rate),
-                                       ('temperature', 'degC', 1.0, fit.dwells.temperature)):
+    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, table.rate),
+                                       ('temperature', 'degC', 1.0, table.temperature)):
         if values is None or np.ptp(values) == 0.0:
             continue
         yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
@@ -243,7 +244,6 @@ def _dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
 
 
 def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
-    """Give the result of a fit to a heading, and the errors before and after."""
     yield from (*_value_lines(model), '')
     if math.isfinite(found.fit.time_offset):
         yield (f'Delay of the gyro behind the reference: {1000.0 * found.fit.time_offset:.1f} ms; '
@@ -273,22 +273,6 @@ def _value_lines(model: GyroModel) -> Iterator[str]:
     for temperature in {term.values[0] for term in model.terms
                         if term.effect.parameters[0].name == 'reference_temperature'}:
         yield f'Temperatures are counted from {temperature:g} degC.'
-
-
-def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
-    table = fit.dwells
-    slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
-    temperatures = ('' if table.temperature is None
-                    else f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
-    sweeps = len(np.unique(table.sweep))
-    yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
-           f'{slowest:.1f} to {fastest:.1f} deg/s{temperatures}.')
-    outlying = np.flatnonzero(~fit.scatter.inliers)
-    if len(outlying):
-        named = format_list([f'{table.location[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
-                             for row in outlying])
-        yield wrap_line(f'{len(outlying)} outlying, not fitted: {named}.')
-    yield from (wrap_line(as_sentence(remark)) for remark in table.remarks)
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:

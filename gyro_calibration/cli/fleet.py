@@ -12,10 +12,7 @@
 Calibrate and diagnose many logs, and attribute errors to unit, type and reference.
 
 example: gyro_calibration fleet drives/ --out fleet
-
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -34,24 +31,11 @@ from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
 from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.fleet.logs import (
-    compile_file_pattern,
-    DONE,
-    find_logs,
-    LogTask,
-    make_refused_record,
-    NO_EVIDENCE,
-    process_log,
-)
+    compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models,
-    COMPONENT_LABELS,
-    describe_type,
-    render_report,
-    summarize_types,
-    table_files,
-    TypeSummary,
-)
+    build_models, COMPONENT_LABELS, describe_type, render_report, summarize_types, table_files,
+    TypeSummary)
 from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model

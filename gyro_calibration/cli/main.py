@@ -10,8 +10,6 @@
 
 """The program ``gyro_calibration``: it runs one verb, prints its answer and sets its exit code."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 from collections.abc import Sequence
@@ -34,12 +32,7 @@ from gyro_calibration import __version__
 from gyro_calibration.cli.verb import print_message
 from gyro_calibration.diagnosis.causes import add_causes
 from gyro_calibration.files import (
-    describe_error,
-    describe_os_error,
-    InputError,
-    suggest_nearest,
-    to_printable,
-)
+    describe_error, describe_os_error, InputError, suggest_nearest, to_printable)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np

@@ -12,24 +12,14 @@
 Compute the motion that calibrates best within the limits of a robot.
 
 example: gyro_calibration plan --limits limits.yaml --seconds 20 --out profile.csv
-
 """
-
-from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
 from typing import Any
 
 from gyro_calibration.calibration.motion_design import (
-    CalibrationForecast,
-    can_follow,
-    find_best_motion,
-    plain_motion,
-    Plan,
-    Prediction,
-    RobotLimits,
-)
+    CalibrationForecast, can_follow, find_best_motion, plain_motion, Plan, Prediction, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_motion
@@ -40,11 +30,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_by_name, NAMED_MOTIONS
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration.model.settings_file import (
-    InvalidValue,
-    parse_number,
-    read_settings,
-    validate,
-)
+    InvalidValue, parse_number, read_settings, validate)
 import numpy as np
 
 #: Name of a limit in a file -> its name in `RobotLimits`, its unit, and the range of its numbers.
@@ -143,7 +129,6 @@ def _check_limit(place: str, value: Any) -> float:
 
 
 def write_motion(path: str, motion: Motion) -> None:
-    """Write a motion of rates as a profile."""
     rows = zip(motion.time, motion.rate_at(motion.time) / DEGREE)
     lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
              *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]

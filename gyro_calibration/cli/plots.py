@@ -14,7 +14,6 @@ Pictures for people: PNG or SVG, units on the axes, readable in black and white.
 Each function returns its figure, and writes it where a path is given; the ending of the path,
 .png or .svg, sets the format. The caption below a picture explains it. Arrays are in SI, with one
 value for each sample or dwell, shape (n,).
-
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@
 Record a gyro, from its port or from topics, until Ctrl-C.
 
 example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
-
 """
 
 from __future__ import annotations
@@ -36,11 +35,7 @@ from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.protocol import (
-    ASSUMED_FORCE_NOISE,
-    ASSUMED_NOISE,
-    TRISTATE,
-)
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE, TRISTATE
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
@@ -54,11 +49,7 @@ from tqdm import tqdm
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
-#: Time, s, for which the header of a log waits for values that come seldom: with and without a
-#: temperature so far.
-_HEADER_WAITS = 1.0, 3.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -226,7 +217,6 @@ class CsvRecorder(_Recorder):
 
     The columns are fixed with the first piece. Values that come less often than samples, such as
     the temperature, are repeated until the next one.
-
     """
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
@@ -248,7 +238,8 @@ class CsvRecorder(_Recorder):
 
     def flush(self, is_due: bool = False) -> None:
         """Write the rows so far; the first ones after some seconds, when the columns are known."""
-        wait = _HEADER_WAITS['temperature_degc' not in self._held_values]
+        # s; for values that come seldom
+        wait = 1.0 if 'temperature_degc' in self._held_values else 3.0
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
                                   - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
@@ -322,13 +313,7 @@ def _record(session: _PortSession | _TopicSession, out: str) -> Answer:
 
 
 class _PortSession:
-    """
-    Records samples from a port.
-
-    As `_TopicSession`, it has a recorder, counts samples received and lost, and concludes with
-    data and remarks of the answer; where nothing came, it has the failure and a remedy.
-
-    """
+    """Records samples from a port; `_TopicSession` has the same attributes and methods."""
 
     remedy = 'check the port, the power and the wires of the gyro'
 
@@ -456,7 +441,7 @@ class _TopicSession:
     def record(self, on_chunk: Callable[[], None]) -> None:
         def tick(node: Any) -> None:
             on_chunk()
-            if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
+            if self._is_waiting and time.monotonic() - self._start_time > 5.0:  # s
                 self._is_waiting = False
                 if missing := node.missing_topics:
                     known = sorted(name for name, _ in node.get_topic_names_and_types())

@@ -12,10 +12,7 @@
 Compare published numbers of the sources with those reproduced here.
 
 example: gyro_calibration reproduce hong_park
-
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator

@@ -12,10 +12,7 @@
 Find scale factor error and bias from about 20 s of known motion, or from whole turns.
 
 example: gyro_calibration self-calibrate run.csv --profile profile.csv --out model.yaml
-
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
@@ -29,17 +26,8 @@ from typing import Any
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import (
-    check_end,
-    check_rest,
-    default_reference_errors,
-    describe_implausible_scale,
-    find_rest_after,
-    METHODS,
-    ReferenceErrors,
-    RestCheck,
-    self_calibrate,
-    to_model_record,
-)
+    check_end, check_rest, default_reference_errors, describe_implausible_scale, find_rest_after,
+    METHODS, ReferenceErrors, RestCheck, self_calibrate, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
@@ -47,10 +35,7 @@ from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import (
-    compensate_log,
-    no_plausible_row_message,
-    plausible_rows,
-)
+    compensate_log, no_plausible_row_message, plausible_rows)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.model.model_file import read_model, write_model
@@ -105,20 +90,40 @@ def run(given: argparse.Namespace) -> Answer:
                          'omit it, or give --turns')
     model = read_model(given.model) if given.model else GyroModel()
     log = verb.read(given)
-    return (_calibrate_by_turns(given, model, log) if given.turns is not None
-            else _calibrate_by_motion(given, model, log))
+    verb.require_time(given, log)
+    plausible, output = plausible_rows(model, log), np.asarray(log.output)
+    if not plausible.any() and np.isfinite(output).any():
+        raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
+    by_turns = given.turns is not None
+    fit, is_used, data, lines = (
+        _calibrate_by_turns(given, model, log, plausible) if by_turns
+        else _calibrate_by_motion(given, model, log))
+    calibration = make_self_calibration(fit, 'turns' if by_turns else given.method, log, is_used)
+    if given.out:
+        write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
+    refused_count = int(np.count_nonzero(np.isfinite(output) & ~plausible))
+    if refused_count:
+        lines.append(f'{refused_count} rows have an implausible rate or temperature and are not '
+                     'used.')
+    first = as_sentence(f'{calibration}, from {is_used.sum()} samples')
+    return Answer([first, *lines],
+                  {**calibration.to_dict(), 'samples': int(is_used.sum()),
+                   'refused_samples': refused_count, **data, 'out': given.out},
+                  (given.picture, given.out))
 
 
-def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time = verb.require_time(given, log)
+#: A fit, the rows of the log that were used, further data and lines of the answer.
+_Result = tuple[ScaleBiasFit, Mask, dict[str, Any], list[str]]
+
+
+def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> _Result:
     try:
-        motion, begin = ((read_motion(given.profile), time[0]) if given.profile
+        motion, begin = ((read_motion(given.profile), np.asarray(log.time)[0]) if given.profile
                          else motion_from_log(log))
     except InputError as error:
         if given.profile:
             raise
         raise type(error)(f'{given.log}: {error} with --profile') from None
-    _refuse_implausible(given, model, log)
     scale = given.reference_scale_deviation
     usual = default_reference_errors(motion) if given.profile else ReferenceErrors()
     reference = ReferenceErrors(usual.scale_deviation if scale is None else scale / 100.0,
@@ -133,8 +138,17 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
     if remark := describe_implausible_scale(
             run.fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
         lines.append(as_sentence(remark))
-    return _store_and_answer(given, model, log, run.fit, run.is_used, given.method,
-                             _fit_data(run.fit, run.rest_check), lines)
+    fit, check = run.fit, run.rest_check
+    return fit, run.is_used, {
+        'time_offset_s': fit.time_offset,
+        'time_offset_standard_deviation_s': fit.time_offset_deviation,
+        'start_heading_rad': fit.start_heading,
+        'start_heading_standard_deviation_rad': fit.start_heading_deviation,
+        'degrees_of_freedom': getattr(fit.goodness, 'dof', math.nan),
+        **{name: getattr(fit.goodness, name, math.nan)
+           for name in ('chi_square', 'probability', 'noise_ratio')},
+        'rest_rate_rad_s': check.rate if check else math.nan,
+        'rest_limit_rad_s': check.limit if check else math.nan}, lines
 
 
 @dataclass(frozen=True)
@@ -173,48 +187,22 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
     return CalibratedRun(fit, check, run, time[run], rate[run], motion)
 
 
-def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, output = verb.require_time(given, log), np.asarray(log.output)
-    known = _refuse_implausible(given, model, log)
-    rates = compensate_log(with_self_calibration(model, None), log)
+def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log,
+                        plausible: Mask) -> _Result:
+    time, output, rates = (each[plausible] for each in (
+        np.asarray(log.time), np.asarray(log.output),
+        compensate_log(with_self_calibration(model, None), log)))
     marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE
-    found = calibrate_turns(time[known], rates[known],
-                            None if given.turns == _NEAREST else given.turns, noise=model.noise,
-                            mark_deviation=marking, output=output[known])
+    found = calibrate_turns(time, rates, None if given.turns == _NEAREST else given.turns,
+                            noise=model.noise, mark_deviation=marking, output=output)
     direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
     before, after = found.rest_durations
-    return _store_and_answer(
-        given, model, log, found.fit, known, 'turns',
-        {'turns': found.turns, 'turning_s': found.duration,
-         'rests_s': list(found.rest_durations), 'marking_rad': marking},
-        [f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
-         f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
-         f'{marking / DEGREE:g} deg.'])
-
-
-def _refuse_implausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
-    """Return which rows are used."""
-    found = plausible_rows(model, log)
-    if not found.any() and np.isfinite(np.asarray(log.output)).any():
-        raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
-    return found
-
-
-def _store_and_answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: ScaleBiasFit,
-                      is_used: Mask, method: str, data: dict[str, Any],
-                      lines: list[str]) -> Answer:
-    calibration = make_self_calibration(fit, method, log, is_used)
-    if given.out:
-        write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
-    implausible_count = int(
-        np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible_rows(model, log)))
-    remarks = [f'{implausible_count} rows have an implausible rate or temperature and are not '
-               'used.'] if implausible_count else []
-    first = as_sentence(f'{calibration}, from {is_used.sum()} samples')
-    return Answer([first, *lines, *remarks],
-                  {**calibration.to_dict(), 'samples': int(is_used.sum()),
-                   'refused_samples': implausible_count, **data, 'out': given.out},
-                  (given.picture, given.out))
+    return found.fit, plausible, {
+        'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rest_durations),
+        'marking_rad': marking}, [
+        f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
+        f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
+        f'{marking / DEGREE:g} deg.']
 
 
 def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,
@@ -223,18 +211,6 @@ def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,
     temperature = None if log.temperature is None else float(log.temperature[is_used].mean())
     return to_model_record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
                            temperature)
-
-
-def _fit_data(fit: ScaleBiasFit, check: RestCheck | None) -> dict[str, Any]:
-    return {'time_offset_s': fit.time_offset,
-            'time_offset_standard_deviation_s': fit.time_offset_deviation,
-            'start_heading_rad': fit.start_heading,
-            'start_heading_standard_deviation_rad': fit.start_heading_deviation,
-            **{key: getattr(fit.goodness, name, math.nan) for key, name in (
-                ('chi_square', 'chi_square'), ('degrees_of_freedom', 'dof'),
-                ('probability', 'probability'), ('noise_ratio', 'noise_ratio'))},
-            'rest_rate_rad_s': check.rate if check else math.nan,
-            'rest_limit_rad_s': check.limit if check else math.nan}
 
 
 def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,

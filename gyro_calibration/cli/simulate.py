@@ -12,10 +12,7 @@
 Write the log of a simulated gyro.
 
 example: gyro_calibration simulate --model model.yaml --motion robot --out log.csv --seed 1
-
 """
-
-from __future__ import annotations
 
 import argparse
 from dataclasses import replace

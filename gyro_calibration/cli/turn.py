@@ -12,10 +12,7 @@
 Compute the error of a full turn, with a static bias only and with a model.
 
 example: gyro_calibration turn table.csv --picture turn.png
-
 """
-
-from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
@@ -24,11 +21,7 @@ from typing import Any
 
 from gyro_calibration.calibration.dwells import Dwells, extract_dwells, format_list, select_dwells
 from gyro_calibration.calibration.rate_table import (
-    compute_turn_errors,
-    equal_bins,
-    MIN_TURN_RATE,
-    TurnErrors,
-)
+    compute_turn_errors, equal_bins, MIN_TURN_RATE, TurnErrors)
 from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers, rms
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb
@@ -44,8 +37,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
-#: Limits of each bin, and which errors lie in it.
-Bins = list[tuple[float, float, Mask]]
+Bins = list[tuple[float, float, Mask]]  # limits of each bin, and which errors lie in it
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +69,13 @@ def run(given: argparse.Namespace) -> Answer:
         errors = compute_turn_errors(select_dwells(found, is_inlier), rate[is_inlier],
                                      given.slowest * DEGREE)
     if given.out:
-        _write_table(given.out, errors)
+        turns, columns = errors.turns, ('sweep', 'reference_rate_rad_s', 'temperature_degc',
+                                        'static_rad_per_turn', 'modelled_rad_per_turn')
+        temperature = (np.full(len(turns), np.nan) if turns.temperature is None
+                       else turns.temperature)
+        rows = zip(turns.location, *(values.tolist() for values in (
+            turns.sweep, turns.rate, temperature, errors.static, errors.modelled)))
+        write_atomically(given.out, format_rows([('place', *columns), *rows]).encode())
     if given.picture:
         draw_turn_errors(given.picture, errors, given.slowest * DEGREE)
     remarks = [*found.remarks, *errors.remarks, *remarks]
@@ -113,8 +111,14 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
     clipped, beyond = (int(np.count_nonzero(each))
                        for each in (result.temperature_clipped, result.beyond_range))
     used = [*names, *(['self-calibration'] if model.self_calibration else [])]
-    remarks = [f'the model is {given.model}: {", ".join(used) or "no effects"}'
-               f'{_describe_fit_data(model, given.log)}']
+    remark = f'the model is {given.model}: {", ".join(used) or "no effects"}'
+    of_fit = 'these are errors of a fit, not of a prediction'
+    if any(file.is_file() and sha256_digest(file) in str(model.origin)
+           for file in list_recording_files(given.log)):
+        remark += f'; it was fitted to this log, so {of_fit}'
+    elif 'sha256' not in str(model.origin):
+        remark += f'; if it was fitted to this log, {of_fit}'
+    remarks = [remark]
     if found.temperature is None and model.uses_channel('temperature'):
         remarks.append('the log has no temperature: '
                        'the model was used at its reference temperature')
@@ -130,14 +134,6 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
     return rate, find_inliers(found), remarks, {
         'effects': names, 'left_out': False, 'temperature_clipped': clipped,
         'beyond_range': beyond}
-
-
-def _describe_fit_data(model: GyroModel, log: str) -> str:
-    if any(file.is_file() and sha256_digest(file) in str(model.origin)
-           for file in list_recording_files(log)):
-        return '; it was fitted to this log, so these are errors of a fit, not of a prediction'
-    return '' if 'sha256' in str(model.origin) else (
-        '; if it was fitted to this log, these are errors of a fit, not of a prediction')
 
 
 def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
@@ -216,13 +212,3 @@ def _error_data(errors: TurnErrors, mask: Mask) -> dict[str, dict[str, float]]:
 def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]:
     return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
              **_error_data(errors, mask)} for low, high, mask in bins]
-
-
-def _write_table(path: str, errors: TurnErrors) -> None:
-    turns = errors.turns
-    temperature = np.full(len(turns), np.nan) if turns.temperature is None else turns.temperature
-    write_atomically(path, format_rows([
-        ('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc', 'static_rad_per_turn',
-         'modelled_rad_per_turn'),
-        *zip(turns.location, *(values.tolist() for values in (
-            turns.sweep, turns.rate, temperature, errors.static, errors.modelled)))]).encode())

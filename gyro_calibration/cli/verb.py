@@ -10,8 +10,6 @@
 
 """Common parts of the verbs: answers, options for logs, errors of usage, progress bars."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -31,24 +29,15 @@ from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
 from gyro_calibration.logs.columns import AXES, suggest_attitude
 from gyro_calibration.logs.log import (
-    Array,
-    BLOCK_ROWS,
-    DataRefused,
-    DEGREE,
-    Log,
-    read_log,
-    read_log_blocks,
-    select_rows,
-    unwrap_heading,
-)
+    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, read_log, read_log_blocks, select_rows,
+    unwrap_heading)
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from tqdm import tqdm
 
-#: Time before progress is shown, s.
-PROGRESS_DELAY = 2.0
+PROGRESS_DELAY = 2.0  # time before progress is shown, s
 
 
 @contextmanager
@@ -146,11 +135,6 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S',
                         help='omit samples after this time, s since the first sample')
     add_topic_options(parser)
-
-
-#: Values of the options that `read` uses, for a verb without them.
-DEFAULT_LOG_OPTIONS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap': False,
-                                       'begin': 0.0, 'end': math.inf}
 
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
@@ -256,7 +240,6 @@ def _cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Lo
 
 
 def print_message(text: object) -> None:
-    """Print a message on standard error."""
     print(f'gyro_calibration: {to_printable(text)}', file=sys.stderr, flush=True)
 
 

@@ -12,5 +12,4 @@
 From bytes on a serial port to stamped samples, with recovery from faults of the port.
 
 Reading order: `protocols` (wire formats), `timestamps`, `connection`, `emulator`.
-
 """

@@ -13,10 +13,7 @@ A gyro on a serial port: opens, recognizes and reads it, and opens it again afte
 
 This module has no ROS and starts no thread: `Connection.chunks` gives the samples in the thread of
 the caller.
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -33,16 +30,8 @@ import threading
 from typing import NamedTuple
 
 from gyro_calibration.driver.protocols import (
-    AUTO,
-    BAUDS,
-    Decoder,
-    find_protocol,
-    Protocol,
-    Recognition,
-    recognize_protocol,
-    Sample,
-    Settings,
-)
+    AUTO, BAUDS, Decoder, find_protocol, Protocol, Recognition, recognize_protocol, Sample,
+    Settings)
 from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
 import serial
 
@@ -69,7 +58,6 @@ class SerialPort:
 
     Each method raises `PortError` where the device cannot do it or was disconnected; the port is
     then closed.
-
     """
 
     def __init__(self, path: str, baud: int):
@@ -96,7 +84,6 @@ class SerialPort:
             return data
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the device."""
         with self._open_port() as port:
             port.write(data)
 
@@ -107,7 +94,6 @@ class SerialPort:
             port.reset_input_buffer()
 
     def close(self) -> None:
-        """Close the port, if it is open."""
         port, self._port = self._port, None
         if port is not None:
             port.close()
@@ -205,7 +191,6 @@ class Connection:
     of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` where the
     protocol is unknown, or settings that it needs are missing. Tests have a clock of their own, s,
     and ports in place of a `SerialPort`.
-
     """
 
     def __init__(self, port: str, protocol: str = AUTO, baud: int = 0,
@@ -457,12 +442,8 @@ class Decimator:
             return
         stamps, samples = zip(*group, strict=True)
         begin = stamps[0]  # sums of seconds since 1970 would lose digits
-        output, *others = (_known_mean([getattr(sample, name) for sample in samples])
-                           for name in ('output', 'temperature', 'specific_force'))
+        known = ([value for sample in samples if (value := getattr(sample, name)) is not None]
+                 for name in ('output', 'temperature', 'specific_force'))
+        output, temperature, force = (fmean(values) if values else None for values in known)
         yield SampleMean(begin + fmean(stamp - begin for stamp in stamps),
-                         Sample(output or 0.0, others[0], specific_force=others[1]), len(group))
-
-
-def _known_mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
+                         Sample(output or 0.0, temperature, specific_force=force), len(group))

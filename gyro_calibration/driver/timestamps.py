@@ -23,10 +23,7 @@ date and is set by months when it finds a time server. `NodeTimeConverter` conve
 to stamps of such a clock, `HostTimeConverter` converts its stamps to a continuous time.
 
 No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
-
 """
-
-from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -71,7 +68,6 @@ class LowerLine:
         self._begin, self._block_begin = 0.0, -math.inf
 
     def value_at(self, x: float) -> float:
-        """Return the height of the line."""
         return self._anchor[1] + self.slope * (x - self._anchor[0])
 
     def time_span(self) -> float:
@@ -90,16 +86,6 @@ class LowerLine:
             self.points[-1] = (x, y)
         else:
             return
-        self._fit()
-
-    def shift(self, start: float, offset: float) -> None:
-        """Shift the points from a height on along x, and drop points that they overtake."""
-        moved = [(x + offset, y) for x, y in self.points if y >= start]
-        first = moved[0][0] if moved else math.inf
-        kept = [(x, y) for x, y in self.points if y < start and x < first]
-        self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
-
-    def _fit(self) -> None:
         # the edge of the lower hull over the mean; of a single point the given slope remains
         hull = _lower_hull(self.points)
         middle = sum(x for x, _ in self.points) / len(self.points)
@@ -108,6 +94,13 @@ class LowerLine:
         self._anchor = left
         if right is not None and right[1] > left[1]:
             self.slope = (right[1] - left[1]) / (right[0] - left[0])
+
+    def shift(self, start: float, offset: float) -> None:
+        """Shift the points from a height on along x, and drop points that they overtake."""
+        moved = [(x + offset, y) for x, y in self.points if y >= start]
+        first = moved[0][0] if moved else math.inf
+        kept = [(x, y) for x, y in self.points if y < start and x < first]
+        self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
 
 def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
@@ -226,7 +219,6 @@ class SampleClock:
     show that samples were lost. The nominal rate of the gyro, Hz, is used for the first samples
     only: its clock is 2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0
     without one, and `min_stamp` the last stamp of another clock.
-
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
@@ -454,7 +446,6 @@ class HostTimeConverter:
         The previous time is -inf for the first sample, which shows no step, and the usual interval
         inf while it is not known. Over a gap the jump of the stamps equals the time between their
         arrivals, but not over a step of the clock.
-
         """
         if previous_time == -math.inf:
             self._unshown_steps.clear()

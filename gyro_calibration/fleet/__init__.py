@@ -14,5 +14,4 @@ A fleet: many logs of many gyros, with errors attributed to the unit, the type a
 Reading order, each imports only from those before it: `logs` (the unit of each log, and the work
 on it), `run` (of many tasks), `pooling` (of one value over the logs of a type, and its outliers),
 `summary` (of a type: sentences, data, models, the page and tables).
-
 """

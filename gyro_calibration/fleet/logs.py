@@ -16,7 +16,6 @@ the calibration and the diagnosis. A single log does not distinguish slow effect
 warm-up, the temperature) from the wander of the bias. Each is fitted alone with scale factor error
 and bias, to the increments of the heading over spans, with the noise of `noise_grid`. An effect
 repeats over many logs, wander does not.
-
 """
 
 from __future__ import annotations
@@ -40,30 +39,17 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
-    bias_wander_columns,
-    fit_noise_grid,
-    heading_noise,
-)
+    bias_wander_columns, fit_noise_grid, heading_noise)
 from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.gates import (
-    is_at_rest,
-    is_implausible_factor,
-    refuse_mismatch,
-    refuse_unusable,
-)
+    is_at_rest, is_implausible_factor, refuse_mismatch, refuse_unusable)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.files import (
-    describe_error,
-    InputError,
-    open_regular_file,
-    read_bytes,
-    sha256_digest,
-    to_printable,
-    write_atomically,
-)
+    describe_error, InputError, open_regular_file, read_bytes, sha256_digest, to_printable,
+    write_atomically)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import find_delimiter
 from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES, read_log
@@ -80,8 +66,7 @@ import numpy as np
 ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
-#: Largest number of bytes that are read of the notes of a log.
-_MAX_NOTE_BYTES = 4096
+_MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)
@@ -108,7 +93,6 @@ class FleetLog:
     temperature: float | None = None  # degC
 
     def fill_missing(self, stated: Mapping[str, str]) -> FleetLog:
-        """Return the entry with its empty fields filled."""
         new: dict[str, Any] = {name: to_printable(text.strip())
                                for name, text in stated.items() if name in ENTRY_KEYS
                                and text.strip() and getattr(self, name) in ('', None)}
@@ -146,7 +130,6 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     A log that is named several times is one entry. A table inside a folder is used as well; the
     results of an earlier fleet, and of this one in `excluded_folder`, are not. Raise `InputError`
     where there is none, or a table is wrong or contradicts another one.
-
     """
     found: dict[str, FleetLog] = {}
     visited = {os.path.realpath(excluded_folder)} if excluded_folder else set()
@@ -162,9 +145,19 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
 
 
 def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
-    """Give the logs of a path; a folder that was visited before has none."""
+    """Give the logs of a path; a folder that was visited before, or holds results, has none."""
     if os.path.isdir(path):
-        yield from _search_folder(Path(path), visited)
+        folder = Path(path)
+        if os.path.realpath(folder) in visited or (folder / 'fleet.json').is_file():
+            return
+        visited.add(os.path.realpath(folder))
+        if (folder / 'metadata.yaml').is_file():
+            yield FleetLog(path)  # a recording
+            return
+        for inner in sorted(folder.iterdir()):
+            if (inner.is_dir() or inner.name.lower().endswith(LOG_SUFFIXES)
+                    and not inner.name.startswith('.')):
+                yield from _expand_path(str(inner), visited)
     elif not os.path.exists(path) and glob(path, recursive=True):
         for each in sorted(glob(path, recursive=True)):
             yield from _expand_path(each, visited)
@@ -176,20 +169,6 @@ def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
         yield from _read_rows(path, columns)
     else:
         yield FleetLog(path)
-
-
-def _search_folder(folder: Path, visited: set[str]) -> Iterator[FleetLog]:
-    """Give the logs in a folder and in those inside it; one with metadata.yaml is a recording."""
-    if os.path.realpath(folder) in visited or (folder / 'fleet.json').is_file():
-        return
-    visited.add(os.path.realpath(folder))
-    if (folder / 'metadata.yaml').is_file():
-        yield FleetLog(str(folder))
-        return
-    for path in sorted(folder.iterdir()):
-        if (path.is_dir() or path.name.lower().endswith(LOG_SUFFIXES)
-                and not path.name.startswith('.')):
-            yield from _expand_path(str(path), visited)
 
 
 def _read_text(path: str) -> str:
@@ -372,7 +351,7 @@ class LogTask:
     entry: FleetLog
     folder: str  # of the results
     technology: str = 'mems'  # of the gyros, one of `heading_regression.TECHNOLOGY_PRIORS`
-    file_pattern: re.Pattern[str] | None = None  # by `table.compile_file_pattern`
+    file_pattern: re.Pattern[str] | None = None  # by `compile_file_pattern`
     #: For the diagnosis, the same for each log; None without a diagnosis.
     generator: np.random.Generator | None = None
     default_type: str = ''  # of logs whose type is not stated
@@ -398,7 +377,6 @@ def process_log(task: LogTask) -> dict[str, Any]:
     ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
     ``slow`` the same of effects that a single log does not distinguish from the wander of the
     bias, each fitted alone; ``diagnosis`` is a summary.
-
     """
     try:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
@@ -425,7 +403,6 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
 
 def make_refused_record(entry: FleetLog, reason_text: str) -> dict[str, Any]:
-    """Return the record of an excluded log."""
     return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated_fields(entry),
             'status': NO_EVIDENCE, 'reason': reason_text}
 
@@ -480,7 +457,6 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
 
     The offset, s, comes with its standard deviation. A log at rest gives the bias only, and any
     other one is calibrated by `calibrate`. Raise `DataRefused` with the reason and the remedy.
-
     """
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
@@ -507,7 +483,6 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
 
 
 def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:
-    """Return a summary of the diagnosis, and write its page."""
     assert task.generator is not None
     try:
         found = (diagnose_table(log, None) if log.time is None

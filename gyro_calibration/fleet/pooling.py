@@ -39,7 +39,6 @@ is compared with their prediction for one more unit. Its p-value is multiplied b
 those that it was chosen from (Bonferroni). With 15 or more, the next one is tested together with
 it, since two outliers mask each other; the last one below the level, and all before it, are
 outliers (generalized extreme studentized deviate, Rosner 1983).
-
 """
 
 from __future__ import annotations
@@ -64,8 +63,7 @@ IntegerArray = NDArray[np.intp]
 UNITS, DRIVES, POWER_ONS, OWN_SHARE = 'units', 'drives', 'power_ons', 'own_share'
 #: Standard deviations of the slopes of units over the first column and the second.
 SLOPES = ('slopes_0', 'slopes_1')
-#: Points of the sequence over the variances.
-_SAMPLE_POINTS = 512
+_SAMPLE_POINTS = 512  # points of the sequence over the variances
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,6 @@ class _Equations:
 
     The columns are the fixed effects, the drives, and the values, whose last row is the right
     side. Units are eliminated; they have the parts value and slopes.
-
     """
 
     def __init__(self, observed: Observations, fixed: Array, has_drives: bool):
@@ -220,7 +217,6 @@ class PooledValue:
     error : standard deviation that a log will state; its own share is added, shape (k,)
     more : name of a variance -> its multiple that is added, for quantities that are not estimated,
         such as the next power-on
-
     """
 
     def __init__(self, observed: Observations):
@@ -390,7 +386,6 @@ class PooledValue:
 
         Return its place, the value pooled with it, its size, and the p-value of the largest of so
         many.
-
         """
         scores, none = [], np.array([-1])
         for column in columns:
@@ -494,19 +489,13 @@ class Alarm:
     since: str = ''  # first date after a change
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
         size = {'since': self.since, 'size': self.size} if self.since else {'excess': self.size}
         return {'name': self.name, **size, 'chance': self.p_value}
 
 
 def find_outliers(pooled: PooledValue, kind: str, names: Sequence[str],
                   significance: float) -> list[Alarm]:
-    """
-    Return the outlying units or drives with these names; `kind` is `UNITS` or `DRIVES`.
-
-    The significance is the probability of an outlier where there is none.
-
-    """
+    """Return the outlying units or drives; the significance is the probability of a false one."""
     number = pooled.observed.unit if kind == UNITS else pooled.observed.drive
     groups = np.unique(number[number >= 0]).tolist()
     if len(groups) < 4 or len(number) < 5 or kind not in pooled.variance_names:
@@ -528,7 +517,6 @@ def find_changes(pooled: PooledValue, date: IntegerArray, units: Sequence[str],
 
     `date` is the number of the date of each log, or -1, shape (n,); the significance is the
     probability of a change where there is none.
-
     """
     unit = pooled.observed.unit
     candidates = [(int(one), int(since)) for one in np.unique(unit)

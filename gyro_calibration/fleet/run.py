@@ -14,20 +14,13 @@ Many tasks on the processes of this machine, or on another executor of `concurre
 Two tasks for each worker are submitted at a time, so that the memory does not depend on the number
 of tasks. A worker that is killed breaks its pool: the submitted tasks are then repeated one by
 one, the one that kills its worker again is reported, and the others continue.
-
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
-    BrokenExecutor,
-    Executor,
-    FIRST_COMPLETED,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+    BrokenExecutor, Executor, FIRST_COMPLETED, Future, ProcessPoolExecutor, wait)
 from contextlib import contextmanager
 from fcntl import F_GETFL, F_SETFL, F_SETOWN, fcntl
 from itertools import islice
@@ -54,7 +47,6 @@ def process_executors(workers: int, memory: float | None = None,
 
     `workers` is the largest number in an executor, `memory` the number of bytes that each may
     allocate; modules of `preload` are imported once, and not by each new worker.
-
     """
     context = get_context('forkserver')
     context.set_forkserver_preload(list(preload))
@@ -92,7 +84,6 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
 
     Raise `ImportError` where `distributed` is not installed, `OSError` or `ValueError` where no
     scheduler answers at the address, or it is none.
-
     """
     from distributed import Client
     if '://' not in address:  # a client without a scheduler blocks when it is deleted
@@ -108,7 +99,6 @@ def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: 
 
     `work` is a function of a module, which raises nothing; `tasks` may be endless; `create` makes
     an executor of so many workers, of `process_executors` or `cluster_executors`.
-
     """
     remaining = iter(tasks)
     executor = create(workers)

@@ -12,10 +12,7 @@
 From the records of logs to the errors of the type, the unit and the reference.
 
 They are sentences, data, models, one page that needs nothing else, and tables in CSV and Parquet.
-
 """
-
-from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,42 +20,19 @@ from dataclasses import asdict, dataclass
 from datetime import date
 import io
 import math
+from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
 from gyro_calibration.diagnosis.report import (
-    Chart,
-    draw_chart,
-    element,
-    join_markup,
-    Line,
-    Markup,
-    render_page,
-)
+    Chart, draw_chart, element, join_markup, Line, Markup, render_page)
 from gyro_calibration.diagnosis.words import (
-    as_sentence,
-    display_unit,
-    format_amount,
-    format_quantity,
-    join_list,
-    readable_name,
-)
+    as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
-    Alarm,
-    DRIVES,
-    find_changes,
-    find_outliers,
-    IntegerArray,
-    Interval,
-    Observations,
-    OWN_SHARE,
-    PooledValue,
-    POWER_ONS,
-    SLOPES,
-    UNITS,
-)
+    Alarm, DRIVES, find_changes, find_outliers, IntegerArray, Interval, Observations, OWN_SHARE,
+    PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -123,7 +97,7 @@ class TypeSummary:
 
 
 def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
-    """Return the results of each type by records of `work.process_log` that are not excluded."""
+    """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
     values = {}  # the names in more than one log, and whether each is a slow effect
@@ -288,7 +262,6 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
     A diagnosis names a false effect at a stated rate. An effect is assigned to the type where more
     logs show it than that rate explains, even without the unit, and without the drive, that show
     it most; else to the unit or the drive whose own logs show it more often.
-
     """
     logs = [each for each in summary.records if each['diagnosis']]
     shown = [{one['effect'] for one in each['diagnosis']['findings']
@@ -323,7 +296,6 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
 
 
 def data(summary: TypeSummary) -> dict[str, Any]:
-    """Return the results of a type as JSON data."""
     return {'type': summary.name, 'units': list(summary.units), 'drives': list(summary.drives),
             'logs': len(summary.records), 'level': summary.significance,
             'values': {name: _value_data(each) for name, each in summary.values.items()},
@@ -368,7 +340,6 @@ def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     They hold the mean values, and as tolerance the deviation of a power-on from them, so that
     their interval of 95 % is that of the fleet. The compensation adds the tolerance until there is
     a self-calibration, which uses it as its prior (`GyroModel.prior_deviations`).
-
     """
     for unit in ('', *summary.units):
         terms, variances, tolerances = [], [], {'bias': 0.0, 'scale_factor_error': 0.0}
@@ -401,44 +372,6 @@ def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
 
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
-#: Sorts a table by the clicked column, and shows the rows that contain a text.
-_SCRIPT = Markup("""<script>
-'use strict';
-for (const table of document.querySelectorAll('table.sortable')) {
-  const body = table.tBodies[0], rows = [...body.rows], search = document.createElement('input');
-  search.type = 'search';
-  search.placeholder = 'Search';
-  search.setAttribute('aria-label', 'Search in the table below');
-  if (table.parentNode.classList.contains('tall')) table.parentNode.before(search);
-  search.addEventListener('input', () => {
-    const text = search.value.toLowerCase();
-    for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(text);
-  });
-  [...table.tHead.rows[0].cells].forEach((head, column) => {
-    const button = document.createElement('button');
-    for (const row of rows) row.cells[column].dataset.head = head.textContent;
-    button.textContent = head.textContent;
-    head.replaceChildren(button);
-    let sign = -1;
-    button.addEventListener('click', () => {
-      sign = -sign;
-      const key = row => row.cells[column].dataset.key;
-      rows.sort((a, b) => sign * (key(a) - key(b) || key(a).localeCompare(key(b))));
-      body.append(...rows);
-    });
-  });
-}
-</script>""")
-_STYLE = Markup("""<style>
-th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid; }
-input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-width: 20rem; }
-.scroll.fold { max-width: none; max-height: none; } .scroll.tall { max-height: 40rem; }
-.sortable th, .sortable td { overflow-wrap: normal; word-break: normal; }
-.sortable td:nth-child(n + 2):not(:empty) { min-width: 4.5rem; }
-@container (max-width: 29.99rem) {
-  .fold .sortable td:first-child { font-weight: 600; } .fold .sortable td:empty { display: none; }
-}
-</style>""")
 
 
 def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
@@ -452,12 +385,11 @@ def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, A
                 element('p', about, class_='gained') if about else None),
         element('main', *(part for place, found in enumerate(types)
                           for part in _type_sections(found, f't{place}')), _log_section(records)),
-        _STYLE, _SCRIPT)
+        Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
     return render_page(f'Fleet: {title}', body)
 
 
 def _type_sections(summary: TypeSummary, key: str) -> Iterator[Markup]:
-    """Give the sections of a type: its values, units, drives and dates."""
     name = summary.name or 'Type not stated'
     items = [element('li', as_sentence(text)) for text in describe_type(summary)]
     yield element('section', element('h2', name), element('ul', *items), _variance_table(summary))
@@ -536,7 +468,6 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
 
 
 def _cell(text: str, key: float | None = None) -> Markup:
-    """Return a cell with its sort key."""
     return element('td', text, data_key=text if key is None else f'{key:.9g}')
 
 
@@ -547,7 +478,6 @@ def _interval_cell(value: ValueSummary, interval: Interval | None) -> Markup:
 
 def _interval_chart(value: ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
                     style: str) -> Chart:
-    """Return the intervals of units or drives."""
     unit, factor = display_unit(value.unit, value.name)
     low, high = (np.array([getattr(each, end) for each in intervals.values()])
                  for end in ('low', 'high'))

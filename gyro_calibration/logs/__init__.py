@@ -12,5 +12,4 @@
 Recorded data: logs, ROS 2 recordings, time stamps and the quality of samples.
 
 Reading order: `columns`, `log`, `cdr`, `ros_bag`, `recording`, `stamps`, `quality`.
-
 """

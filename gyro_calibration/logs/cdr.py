@@ -14,10 +14,7 @@ Serialized ROS 2 messages of gyros, temperatures and references, without ROS.
 A message is in the common data representation (CDR): four bytes state the byte order, then come
 the fields, each aligned to its own size. The message definition, which recordings contain, lists
 the fields. It is parsed here into a table of formats; nothing in it is run.
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -13,10 +13,7 @@ Names and units of the columns of a log.
 
 A name of the log format states quantity and unit. The user assigns other names, with a unit, as
 `gyro=wz:deg/s`; without a unit, SI is assumed.
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 import difflib
@@ -28,8 +25,7 @@ from typing import NamedTuple
 from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
 DEGREE = math.pi / 180.0
-#: What devices call one g, m/s².
-STANDARD_GRAVITY = 9.80665
+STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
@@ -55,8 +51,7 @@ QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
 ATTITUDE = ('attitude_w', 'attitude_x', 'attitude_y', 'attitude_z')
 #: The rotation about the axis of the gyro and about the next two, in the order x, y, z, x, y.
 ROTATIONS = ('reference_heading', 'cross_axis_1', 'cross_axis_2')
-#: Axes of a gyro; column names may contain one, such as gyro_x_dps.
-AXES = ('x', 'y', 'z')
+AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as gyro_x_dps
 
 _RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
                'deg/h': DEGREE / 3600.0}
@@ -104,7 +99,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
     `user_columns` has the name of a quantity in options -> name of its column, or name:unit. The
     axis is that of names that contain one. Raise `InputError` for an unknown quantity, column or
     unit, a quantity in two columns, or no output.
-
     """
     found, by_user = dict[str, Column](), set[str]()
     for name, text in user_columns.items():

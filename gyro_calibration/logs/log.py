@@ -13,7 +13,6 @@ Read and write logs.
 
 A log is a CSV file, one row a sample or, without time, one row a dwell of a rate table. The header
 names each column with its unit.
-
 """
 
 from __future__ import annotations
@@ -34,29 +33,11 @@ from typing import Any, NamedTuple
 import zlib
 
 from gyro_calibration.files import (
-    describe_error,
-    format_rows,
-    InputError,
-    MAX_EXPANSION_RATIO,
-    MAX_MAGNITUDE,
-    MIN_EXPANSION_BYTES,
-    open_regular_file,
-    open_replacement,
-    to_printable,
-)
+    describe_error, format_rows, InputError, MAX_EXPANSION_RATIO, MAX_MAGNITUDE,
+    MIN_EXPANSION_BYTES, open_regular_file, open_replacement, to_printable)
 from gyro_calibration.logs.columns import (
-    ATTITUDE,
-    AXES,
-    Column,
-    COLUMNS,
-    DEGREE,
-    find_columns,
-    find_delimiter,
-    is_header,
-    QUANTITIES,
-    ROTATIONS,
-    suggest_columns,
-)
+    ATTITUDE, AXES, Column, COLUMNS, DEGREE, find_columns, find_delimiter, is_header, QUANTITIES,
+    ROTATIONS, suggest_columns)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -72,10 +53,8 @@ NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
 CACHE_BLOCK_SAMPLES = 1 << 14
-#: Rows in a block of a log.
-BLOCK_ROWS = 1 << 16
-#: Least interval between samples, s.
-MIN_SAMPLE_INTERVAL = 1e-9
+BLOCK_ROWS = 1 << 16  # rows in a block of a log
+MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
 #: Largest number of characters of a line; and of notes and header, of a block of lines, or of a
 #: row that spans several lines.
 _MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24
@@ -153,7 +132,6 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
 
     Values are separated by commas, or by semicolons or tabs; then the decimal mark may be a comma.
     `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
-
     """
     blocks, numbers = [], 0
     for block in read_log_blocks(path, sensitivity, rate, on_progress=on_progress,
@@ -179,7 +157,6 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 
     A block has `rows` rows, at least 2; the last one may have fewer, as may blocks with texts that
     span lines. After each, `on_progress` takes the number of bytes read, unless from a pipe.
-
     """
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
     rotation = _AxisRotation(axis)
@@ -445,7 +422,6 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     Return a log from a pandas DataFrame, or from a mapping of names to arrays of shape (n,).
 
     Raise `LogError` for no output, different lengths, values that are no numbers, unordered time.
-
     """
     try:
         header = [str(name) for name in table]
@@ -493,7 +469,6 @@ def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> No
 
 
 def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
-    """Return some rows of a log."""
     which = np.arange(len(log))[rows]
     arrays: dict[str, Any] = {name: getattr(log, name)[which] for name in QUANTITIES
                               if getattr(log, name) is not None}
@@ -509,7 +484,6 @@ class _AxisRotation:
     the sensor, less what coning adds to it (Bortz 1971). A quaternion turns axes of the sensor
     into those of the room. Over a gap in which the axis of the rotation changes, that component is
     not the angle: there the gyro's own angle is taken, if it drifts by less.
-
     """
 
     def __init__(self, axis: str):
@@ -600,7 +574,6 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     the reference are estimated from the values that lie close together. A heading in deg instead
     of rad is left as it is, as its unit is to be corrected first. The reference, s and rad, has
     shape (m,), nan where it was lost; time and output of the gyro, s and rad/s, shape (n,).
-
     """
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
     if known.sum() < 2:
@@ -683,7 +656,6 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = Non
     Write a log, .csv or .csv.gz, in SI columns and its other columns, atomically.
 
     `more` holds further columns: name -> array of shape (n,).
-
     """
     write_log_blocks(path, [(log, more or {})])
 

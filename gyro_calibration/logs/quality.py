@@ -10,8 +10,6 @@
 
 """The quality of samples: white noise, quantization, outliers, repeated and saturated samples."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
@@ -49,19 +47,14 @@ def bridge_gaps(values: Array) -> Array:
 
 
 def cross_rotation(log: Log) -> Array:
-    """
-    Return the rotation about the cross axes, rad, gaps bridged, (n, 2); (n, 0) if it is planar.
-
-    It is planar if by a usual misalignment it turns the heading by less than the white noise of
-    the gyro does.
-
-    """
+    """Return the rotation about the cross axes, rad, gaps bridged, (n, 2); (n, 0) if planar."""
     given = [getattr(log, name) for name in ROTATIONS[1:]]
     if log.time is None or log.output is None or any(
             each is None or np.isfinite(each).sum() < 2 for each in given):
         return np.empty((len(log), 0))
     turned, interval = np.column_stack([bridge_gaps(each) for each in given]), np.diff(log.time)
     noise = white_noise_deviation(log.output) * math.sqrt(np.median(interval) * interval.sum())
+    # by a usual misalignment it turns the heading by less than the noise does
     is_planar = MISALIGNMENT_DEVIATION * np.ptp(turned, axis=0).max() <= noise
     return turned[:, :0] if is_planar else turned
 
@@ -72,7 +65,6 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
 
     Those with nan are left out. Their order is 3 in motion, and 1 at rest, which shows filtered
     noise best.
-
     """
     off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]
@@ -182,15 +174,9 @@ def noise_before_rounding(variance: Array) -> Array:
     Return the variance of the noise of samples by that after they are rounded, steps².
 
     Over all places in a step, rounding adds 1/12 less the variance of the error of the mean.
-
     """
     noise = np.linspace(0.0, 1.0, 1001)
     return np.interp(variance, noise + 1.0 / 12.0 - rounding_product(noise, np.zeros(1)), noise)
-
-
-#: Least share of the changes of an encoder heading that are not collinear with the two before; in
-#: a calculated motion, rates are constant or change evenly.
-_MIN_IRREGULAR_SHARE = 0.1
 
 
 def encoder_step(heading: Array) -> float:
@@ -200,7 +186,8 @@ def encoder_step(heading: Array) -> float:
     change = np.diff(known)
     changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
                           for each in (change, np.diff(change, 2)))
-    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
+    # a calculated motion has constant or evenly changing rates
+    return step if step and differing > 0.1 * changes else 0.0
 
 
 def find_runs(mask: Mask) -> list[slice]:
@@ -218,12 +205,7 @@ def mark_rows(ends: Iterable[Sequence[int]], count: int) -> Mask:
 
 
 def mask_outliers(values: Array, limit: float) -> Mask:
-    """
-    Mark single samples beyond a limit from their neighbours and from the median.
-
-    The limit is in robust standard deviations. Drift and vibration are not marked.
-
-    """
+    """Mark single samples beyond a limit, robust deviations, from neighbours and median."""
     if len(values) < 4:
         return np.zeros(len(values), dtype=bool)
     # The median of six neighbours resists two outliers among them.

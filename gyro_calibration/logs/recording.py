@@ -15,7 +15,6 @@ The gyro is an Imu; temperature and reference are interpolated at its stamps. Ot
 with a rate, an orientation or a temperature are used where their topic is named. Times are the
 stamps of the headers; times of receipt are used only where headers have no stamps. Notes list this
 and all other corrections.
-
 """
 
 from __future__ import annotations
@@ -47,8 +46,7 @@ _ROLES = {
 
 #: Largest step back of stamps by messages out of order, s; at a larger one a clock was set.
 _MAX_STEP_BACK = 1.0
-#: Largest number of topics in a message.
-_MAX_LISTED_TOPICS = 20
+_MAX_LISTED_TOPICS = 20  # largest number of topics in a message
 #: Time without a temperature beyond which a note is made, s; gyros take minutes to warm up.
 _MAX_TEMPERATURE_GAP = 30.0
 
@@ -163,7 +161,6 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     A sample rate, Hz, replaces the stamps. `on_progress` takes the number of bytes read, `on_note`
     each note on selections and corrections. Raise `LogError` for a recording that cannot be read,
     or has no gyro or several; it names the topics.
-
     """
     contents, series = Contents(), dict[str, _TopicBuffer]()
     for message in read_messages(path, contents, on_progress):
@@ -196,7 +193,12 @@ class _LogBuilder:
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.topic} declares that it reports no angular velocity; name '
                            'another by --topic')
-        reference, temperature = self._find_reference(), self._find_temperature(gyro.topic)
+        reference, temperature = None, self._find_temperature(gyro.topic)
+        if self._topics.reference is not None:
+            reference = self._topic_series(self._find_topic(self._topics.reference, 'reference'))
+        elif possible := self._topics_of_type(set(REFERENCE_TYPES) - {cdr.IMU}):
+            self._notes.append('no reference was asked for; --reference-topic may be '
+                               f'{_join_names(possible)}')
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were '
@@ -235,15 +237,6 @@ class _LogBuilder:
         remedy = (f'select {_join_names(others, "or")} with --topic' if others
                   else 'record the topic of the gyro')
         raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; {remedy}')
-
-    def _find_reference(self) -> _TopicSeries | None:
-        if self._topics.reference is not None:
-            return self._topic_series(self._find_topic(self._topics.reference, 'reference'))
-        found = self._topics_of_type(set(REFERENCE_TYPES) - {cdr.IMU})
-        if found:
-            self._notes.append('no reference was asked for; --reference-topic may be '
-                               f'{_join_names(found)}')
-        return None
 
     def _find_temperature(self, gyro: str) -> _TopicSeries | None:
         if self._topics.temperature is not None:

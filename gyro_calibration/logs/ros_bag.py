@@ -16,10 +16,7 @@ are read from the beginning up to the end, or to the point of truncation. No rec
 memory than `MAX_RECORD_BYTES`, and no file may expand to more than an `ExpansionBudget` of its
 size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
-
 """
-
-from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -50,12 +47,9 @@ MAX_RECORD_BYTES = 1 << 28
 _READ_BYTES = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
-_ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
-#: Name of the metadata record of this program.
-METADATA_NAME = 'gyro_calibration'
+METADATA_NAME = 'gyro_calibration'  # name of the metadata record of this program
 
-#: Is called with the number of bytes read of all files.
-OnProgress = Callable[[int], object]
+OnProgress = Callable[[int], object]  # is called with the number of bytes read of all files
 
 
 @dataclass(frozen=True)
@@ -80,8 +74,7 @@ class Contents:
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    #: Number of parts that are damaged or too large.
-    skipped_parts: int = 0
+    skipped_parts: int = 0  # number of parts that are damaged or too large
 
     def add_topic(self, topic: str, kind: str, encoding: str,
                   definition: str) -> tuple[str, str] | None:
@@ -133,7 +126,6 @@ def read_messages(path: str | Path, contents: Contents,
 
     It is a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd; `LogError` for others. The
     progress is the number of bytes read.
-
     """
     done = 0
 
@@ -213,8 +205,8 @@ def _decompress_up_to(size: int, compression: str, data: bytes, budget: Expansio
 
 
 def _decompress_message(data: bytes, budget: ExpansionBudget) -> bytes:
-    return (_decompress_up_to(1 << 16, 'zstd', data, budget)
-            if data.startswith(_ZSTANDARD_MAGIC) else data)
+    is_packed = data.startswith(b'\x28\xb5\x2f\xfd')  # as Zstandard begins
+    return _decompress_up_to(1 << 16, 'zstd', data, budget) if is_packed else data
 
 
 _RecordCode = IntEnum('_RecordCode', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX '
@@ -453,7 +445,6 @@ class McapWriter:
         return data_end + summary + footer + checked + _MAGIC
 
 
-_TABLES = ('topics', 'messages', 'message_definitions')
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
 _MESSAGES_QUERY = """
     SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
@@ -529,7 +520,8 @@ def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
         database.execute('PRAGMA trusted_schema = OFF')
         tables = {name for name, text in database.execute(
             "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-            if name in _TABLES and str(text).upper().startswith('CREATE TABLE')
+            if name in ('topics', 'messages', 'message_definitions')
+            and str(text).upper().startswith('CREATE TABLE')
             and not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
         return database, tables
     except BaseException:

@@ -14,10 +14,7 @@ Stamps of samples on an even grid.
 A gyro samples by its own clock, and the stamps of a host jitter. So the samples are numbered, and
 a line fitted to the stamps gives the interval. Samples are lost where the stamps stay late after a
 long step. Where the stamps catch up again, samples were only delayed.
-
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -59,7 +56,6 @@ class StampGrid:
 
     @property
     def loss_remarks(self) -> list[str]:
-        """Return a sentence on lost samples, if any."""
         if not self.lost_after.any():
             return []
         longest, gaps = int(np.argmax(self.lost_after)), int(np.count_nonzero(self.lost_after))
@@ -130,7 +126,6 @@ def _typical_interval(time: Array, steps: Array) -> float:
 
 
 def _count_lost_per_step(time: Array, steps: Array, interval: float, has_bursts: bool) -> Integers:
-    """Return how many samples are lost in each step."""
     # It is the number of intervals by which the stamps remain late. Samples that were delayed at a
     # host arrive in one burst of any size; the time to catch up begins after it.
     lost: Integers = np.zeros(len(steps), dtype=np.int64)

@@ -13,5 +13,4 @@ Models of gyros: effects with values, and noise; simulation and compensation.
 
 Reading order: `effects`, `channels`, `noise`, `gyro_model`, `presets`, `settings_file`,
 `model_file`, `motion`, `simulator_export`, `compensation`.
-
 """

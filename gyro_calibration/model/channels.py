@@ -14,7 +14,6 @@ Channels that need a history: time since power-on, lagged channels, the sign of 
 A `ChannelHistory` takes a stream sample by sample, or a log as a whole or in blocks, with the same
 results but for rounding (1e-14 rad/s). Each lag that is requested starts at the value of its
 channel at that time and is updated from then on.
-
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ class ChannelHistory:
 
         Stamps are in s, quantities in degC, m/s², V and rad, or None where they are not known.
         Rate and output of the channels are 0.
-
         """
         if self._block is None:
             self._start_time = float(_edge_value(time, 0))
@@ -89,7 +87,6 @@ class _Block:
         self._interval = _differences(time, begin)
 
     def signal(self, channel: str) -> Number:
-        """Return a channel."""
         if channel == 'vibration' and channel not in self._signals:
             # a second high-pass filter of 1 s, since after one a tilt within seconds still counts
             self._signals['fast_force'] = self.lag_difference('specific_force', 1.0)
@@ -129,12 +126,7 @@ class _Block:
 
 
 def channels_from_log(log: Log) -> Channels:
-    """
-    Return the channels of a whole log, with rate and output 0.
-
-    Without stamps all rows have time 0. The heading is that of the reference, or 0 without one.
-
-    """
+    """Return the channels of a whole log, with rate and output 0, and time 0 without stamps."""
     time = np.zeros(len(log)) if log.time is None else log.time
     heading = np.zeros(len(log)) if log.reference_heading is None else log.reference_heading
     return ChannelHistory().update(time, log.temperature, log.specific_force, log.supply, heading)

@@ -15,10 +15,7 @@ Where an effect is a function of the true rate, the model equation is solved by 
 with a fixed number of passes, so that a sample and a log take the same steps. A constant slope
 needs one pass, and a model of the output alone none. No separate inverse formula exists that could
 differ from the simulation.
-
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 import math
@@ -62,7 +59,6 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     Output, rad/s, and temperature, degC, are numbers or have shape (n,); no temperature is the
     reference temperature. A model that `needs_history` needs the environment: further channels,
     from the history (`GyroModel.start_history`) that took the same temperatures.
-
     """
     given = model.reference_temperature if temperature is None else temperature
     return (_compensate_blocks(model, output, given)
@@ -136,7 +132,6 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     order of `covariance`. The rate of the model solves ``rate = output - error(rate)``, so the
     derivative of the error is divided by the slope of the output there: 0.5 for a sine response at
     a phase of 60 deg. Effects that compensation cannot undo have a derivative of 0.
-
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None or model.active_tolerances:

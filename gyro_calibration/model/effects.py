@@ -21,7 +21,6 @@ In this order: the records and a first-order lag; the polynomial of Ojeda, Chung
 all other effects: of rate and temperature alone, which dwells of a rate table show; of past
 temperatures; of the time since power-on; of the surroundings; and those that change the signal. A
 new effect is one more record here.
-
 """
 
 from __future__ import annotations
@@ -136,7 +135,6 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
     that is linear between its samples. The difference decays by exp(-x) over an interval of x time
     constants, and a change d of the signal reduces it by ``d (1 - exp(-x)) / x``. Interval, s, not
     negative, and change are those since the previous sample.
-
     """
     if not isinstance(interval, np.ndarray):
         x = interval / time_constant
@@ -176,7 +174,6 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     degC is about 1e11. The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of
     output. The index of eq. 10 as printed collides; here each product has its own column. The
     orders are p and q of the paper, not negative.
-
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 
@@ -242,7 +239,6 @@ def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:
 
     The matrix has shape (q + 1, p + 1), for deg/s and degC, highest powers first:
     ``error = [T² T 1] C [w³ w² w 1]'`` (eq. 12).
-
     """
     c = np.array(matrix, dtype=float)
     rows, columns = c.shape
@@ -507,7 +503,6 @@ def add_effects(effects: Iterable[Effect]) -> None:
 
     Raise `ValueError` for an item that is no `Effect`, a name that is taken, a nonlinear parameter
     to be fitted without initial values, or columns that do not match the coefficients.
-
     """
     rate = np.linspace(-1.0, 1.0, 5)
     channels = Channels(rate, rate, 25.0 + rate, 1.0 + rate, rate, 5.0 + rate, rate,

@@ -30,11 +30,6 @@ _PLAUSIBLE_TEMPERATURES = (-100.0, 200.0)
 #: The response is inverted where the slope of the output over the rate is at least this, 1: noise
 #: is amplified up to ten times.
 _MIN_OUTPUT_SLOPE = 0.1
-#: Python floats need no error state of numpy; setting one for each sample would cost time.
-_NO_ERROR_STATE = nullcontext()
-#: Largest last step of a converged iteration, relative to 1 rad/s plus the rate; the error is much
-#: smaller.
-_STEP_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -45,12 +40,10 @@ class Term:
     values: tuple[float, ...]
 
     def columns(self, channels: Channels) -> Sequence[Number]:
-        """Return one column for each coefficient."""
         return self.effect.columns(channels, *self.values[:len(self.effect.nonlinear_parameters)])
 
     @cached_property
     def error(self) -> Callable[[Channels], Number]:
-        """Return the function of the channels that the effect adds to the output, rad/s."""
         return self.effect.error_function(self.values)
 
     @cached_property
@@ -175,7 +168,6 @@ class GyroModel:
             yield term.effect.name, term.effect.parameters[place], term.values[place], deviation
 
     def error(self, channels: Channels) -> Number:
-        """Return the sum of all effects, rad/s."""
         return _sum_errors(self.terms, channels)
 
     def output_slope(self, channels: Channels) -> Number:
@@ -266,7 +258,6 @@ class GyroModel:
         return float(distances[-1] if good.all() else distances[np.argmin(good)])
 
     def uses_channel(self, channel: str) -> bool:
-        """Tell whether an effect uses the channel."""
         return any(channel in term.effect.inputs for term in self.terms)
 
     @cached_property
@@ -305,7 +296,6 @@ class GyroModel:
 
         The rate of the channels is not used. The second value tells whether no rate of the
         `rate_domain` has this output; the correction at the end of the domain is held there.
-
         """
         output, (independent, dependent) = channels.output, self._split_by_rate
         given = output - _sum_errors(independent, channels)
@@ -383,15 +373,14 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
 
     Return the rate, and whether there is none in the domain; the correction at the nearer end of
     the domain is used then. A start and an output have shape (n,), or are numbers.
-
     """
     low, high = domain
     many = isinstance(output, np.ndarray)
-    with np.errstate(all='ignore') if many else _NO_ERROR_STATE:
+    # Python floats need no error state of numpy; setting one for each sample would cost time
+    with np.errstate(all='ignore') if many else nullcontext():
         # a single sample may leave the domain by at most 1 rad/s during the iteration
         rate, step = _iterate_secant(lambda x: output - error_at(x), start, low - 1.0, high + 1.0)
-        solved = ((low <= rate) & (rate <= high)
-                  & (abs(step) <= _STEP_TOLERANCE * (1.0 + abs(rate))))
+        solved = (low <= rate) & (rate <= high) & (abs(step) <= 1e-10 * (1.0 + abs(rate)))
     if solved.all() if many else solved:
         return rate, False
     with np.errstate(all='ignore'):
@@ -409,7 +398,6 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
 
 
 def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None) -> GyroModel:
-    """Return the model with another self-calibration."""
     return replace(model, self_calibration=calibration)
 
 

@@ -10,46 +10,28 @@
 
 """A gyro's model as a YAML file that a person can read and write."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import math
 from pathlib import Path
 from typing import Any
 
 from gyro_calibration.files import (
-    describe_error,
-    InputError,
-    MAX_MAGNITUDE,
-    suggest_nearest,
-    write_atomically,
-)
+    describe_error, InputError, MAX_MAGNITUDE, suggest_nearest, write_atomically)
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
-    CATALOGUE,
-    Effect,
-    polynomial_from_matrix,
-    rate_temperature_polynomial,
-)
+    CATALOGUE, Effect, polynomial_from_matrix, rate_temperature_polynomial)
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.settings_file import (
-    format_settings,
-    InvalidValue,
-    parse_number,
-    parse_text,
-    read_settings,
-    refuse_unknown_names,
-    validate,
-)
+    format_settings, InvalidValue, parse_number, parse_text, read_settings, refuse_unknown_names,
+    validate)
 import numpy as np
 
 FORMAT = 'gyro_calibration/model'
 VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
 _NOISE_NAMES = tuple(Noise.__dataclass_fields__)
-#: Highest order of a polynomial.
-_MAX_POLYNOMIAL_ORDER = 20
+_MAX_POLYNOMIAL_ORDER = 20  # highest order of a polynomial
 
 
 class ModelError(InputError):
@@ -239,7 +221,6 @@ def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
 
 
 def format_model(model: GyroModel) -> str:
-    """Return the text of a model file."""
     effects: dict[str, Any] = {}
     for term in model.terms:
         named: dict[str, Any] = {parameter.name: value

@@ -10,8 +10,6 @@
 
 """Motion profiles about one axis, and the simulated output of a gyro in them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import csv
 from dataclasses import dataclass, replace
@@ -21,30 +19,15 @@ import os
 from pathlib import Path
 
 from gyro_calibration.files import (
-    describe_error,
-    InputError,
-    MAX_MAGNITUDE,
-    read_bytes,
-    suggest_nearest,
-)
+    describe_error, InputError, MAX_MAGNITUDE, read_bytes, suggest_nearest)
 from gyro_calibration.logs.columns import COLUMNS
 from gyro_calibration.logs.log import (
-    Array,
-    DataRefused,
-    DEGREE,
-    excerpt,
-    Log,
-    MIN_SAMPLE_INTERVAL,
-    Number,
-)
+    Array, DataRefused, DEGREE, excerpt, Log, MIN_SAMPLE_INTERVAL, Number)
 from gyro_calibration.model.channels import ChannelHistory
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import simulate_noise
 import numpy as np
-
-#: Largest motion profile, bytes: twice the size of an hour at 100 Hz.
-MAX_PROFILE_BYTES = 16_000_000
 
 
 class MotionError(InputError):
@@ -97,7 +80,6 @@ def motion_from_log(log: Log) -> tuple[Motion, float]:
     Return the motion of the reference of a log, and the time of its beginning, s.
 
     Raise `InputError` without a reference over time, `DataRefused` with less than two values.
-
     """
     for values, motion in ((log.reference_heading, motion_from_headings),
                            (log.reference_rate, motion_from_rates)):
@@ -169,10 +151,10 @@ def read_motion(path: str | Path) -> Motion:
     is a profile too: its heading where it has both, and without the rows where it was lost.
 
     Raise `MotionError` for other columns, values that are not finite, times that do not increase.
-
     """
     try:
-        lines = io.StringIO(read_bytes(path, MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
+        # twice the size of an hour at 100 Hz
+        lines = io.StringIO(read_bytes(path, 16_000_000).decode('utf-8-sig'), newline=None)
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
         found = sorted(name for name in _COLUMN_UNITS if name in header)
@@ -219,7 +201,6 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
 
     Without a generator there is no noise; without a temperature, degC, of all samples or of each,
     it is the reference temperature.
-
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
     rate, heading = motion.rate_at(time), motion.heading_at(time)
@@ -241,7 +222,6 @@ def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
 
     The channels have the true rate and surroundings at the stamps, s, shape (n,). The noise is
     that of samples at their median interval; without a generator there is none.
-
     """
     rate = model.distort('rate', channels.rate, time)
     output = model.output_from_channels(channels.with_rate(rate, rate))

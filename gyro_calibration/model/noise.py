@@ -10,8 +10,6 @@
 
 """Noise of a gyro by IEEE Std 952: terms, Allan variances, processes and simulated samples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
@@ -89,7 +87,6 @@ def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
 
     The process is a Gauss-Markov process of unit variance; the covariance is that of the mean and
     the value at the end of the interval.
-
     """
     ratio = BIAS_AVERAGING_TIME / time_constant
     decayed = 1.0 - np.exp(-ratio)
@@ -103,7 +100,6 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     Flicker and random walk have no finite variance, but their increments do
     (`NoiseTerm.angle_covariance`). The result holds for sums whose weights add up to zero, such as
     the difference of two biases.
-
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
     angle = (noise.bias_instability ** 2 * FLICKER.angle_covariance(apart)

@@ -10,8 +10,6 @@
 
 """Gyros by published figures, for simulations, plans and benchmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from gyro_calibration.logs.log import DEGREE

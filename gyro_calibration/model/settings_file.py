@@ -13,10 +13,7 @@ YAML files of settings: models, bias tables, limits.
 
 They are data only: nothing in them is run, and they cannot name other files. A schema states what
 each name may hold.
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import math
@@ -25,18 +22,12 @@ import re
 from typing import Any
 
 from gyro_calibration.files import (
-    MAX_DEPTH,
-    MAX_MAGNITUDE,
-    read_bytes,
-    suggest_nearest,
-    to_printable,
-)
+    MAX_DEPTH, MAX_MAGNITUDE, read_bytes, suggest_nearest, to_printable)
 import numpy as np
 import yaml
 
 #: Largest file, bytes: twice the size of a model with the covariance of 150 values.
 MAX_SETTINGS_BYTES = 1_000_000
-_INTEGER = re.compile('[-+]?[0-9]{1,400}')
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
@@ -48,7 +39,6 @@ def read_settings(path: str | Path, max_size: int = MAX_SETTINGS_BYTES) -> Any:
     programs write it, must end with a line end: a truncated 9.3e-06 could read as 9.3.
 
     Raise `ValueError` for any other file; its message is part of a sentence.
-
     """
     try:
         text = read_bytes(path, max_size).decode('utf-8-sig')
@@ -79,7 +69,6 @@ def validate(key_path: str, value: Any, schema: Any) -> Any:
 
     A schema is a function of place and value; or a mapping of names to schemas, all of them
     optional in the file; or None, for a mapping of any names. Raise `InvalidValue` for others.
-
     """
     if callable(schema):
         return schema(key_path, value)
@@ -130,7 +119,7 @@ def _parse_plain(text: str) -> Any:
         return None
     if text.lower() in ('true', 'false'):
         return text.lower() == 'true'
-    if _INTEGER.fullmatch(text):
+    if re.fullmatch('[-+]?[0-9]{1,400}', text):
         return int(text)
     if text.lower().lstrip('+-') in ('.inf', '.nan'):
         return float(text.lower().replace('.', ''))

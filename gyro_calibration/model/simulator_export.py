@@ -13,10 +13,7 @@ Export of a gyro model to the formats of robot simulators.
 
 Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configuration, MuJoCo from
 a `<gyro>` sensor. Each supports some of the parameters; the export lists those that are left out.
-
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,7 +35,6 @@ def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussM
     The logarithms of the Allan variances, angle random walk included, are compared at one
     averaging time per octave, from the interval of the samples to the span, s. The error is the
     largest relative one of the Allan deviation. If both figures are 0, the process has density 0.
-
     """
     floor, walk = noise.bias_instability, noise.rate_random_walk
     if not floor and not walk:
@@ -84,7 +80,6 @@ def simulator_parameters(model: GyroModel, sample_rate: float, temperature: floa
 
     The sample rate is in Hz, the operating temperature in degC; span and error are those of
     `fit_gauss_markov`.
-
     """
     interval = 1.0 / sample_rate
     run = model.self_calibration
@@ -152,18 +147,12 @@ def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
 
 _FORMATTERS: dict[str, Callable[[SimulatorParameters], tuple[str, set[str]]]] = {
     'sdf': _format_sdf, 'isaac': _format_isaac, 'mujoco': _format_mujoco}
-#: Names of the simulators.
-SIMULATORS = tuple(_FORMATTERS)
+SIMULATORS = tuple(_FORMATTERS)  # names of the simulators
 
 
 def export_model(parameters: SimulatorParameters, model: GyroModel,
                  simulator: str) -> tuple[str, list[str]]:
-    """
-    Return the `simulator_parameters` of a gyro as text for one of `SIMULATORS`.
-
-    A comment lists the parameters that are left out; they are returned too, one text each.
-
-    """
+    """Return a text for one of `SIMULATORS`, and what it does not hold, which a comment lists."""
     text, names = _FORMATTERS[simulator](parameters)
     run, noise = model.self_calibration, model.noise
     found = {term.effect.name: ', '.join(

@@ -16,5 +16,4 @@ connect them to topics.
 
 Reading order: `inputs`, `runner`, `health_monitor`, `state_store`, `driver_node`, `recorder_node`,
 `calibration_session`, `pipeline`, `compensation_node`.
-
 """

@@ -18,7 +18,6 @@ then fits it.
 
 A foreign command is one of another node: own commands come back on `cmd_vel` in the order of
 sending, and every other command is foreign, also an additional zero.
-
 """
 
 from __future__ import annotations
@@ -34,42 +33,22 @@ from types import SimpleNamespace
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
-    calibrate_bias,
-    check_rest,
-    describe_implausible_scale,
-    find_rest_after,
-    ReferenceErrors,
-    RunLimits,
-    self_calibrate,
-    SETTLING_TIME,
-    to_model_record,
-)
+    calibrate_bias, check_rest, describe_implausible_scale, find_rest_after, ReferenceErrors,
+    RunLimits, self_calibrate, SETTLING_TIME, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    Motion,
-    motion_from_headings,
-    motion_from_rates,
-    MotionError,
-    read_motion,
-)
+    CALIBRATION_MOTION, Motion, motion_from_headings, motion_from_rates, MotionError, read_motion)
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
 from gyro_calibration.ros.inputs import (
-    Clock,
-    MAX_ANGULAR_ACCELERATION,
-    node_time,
-    StampDelay,
-    Velocity,
-)
+    Clock, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
 from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
@@ -133,7 +112,7 @@ class CalibrationRun:
     @property
     def extra_duration(self) -> float:
         """Return the duration of samples after the motion, s."""
-        return {REST: 0.0, TURNS: REST_AFTER_TURNS}.get(
+        return {REST: 0.0, TURNS: 2.5}.get(
             self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property
@@ -148,7 +127,6 @@ class CalibrationRun:
 
     @property
     def status(self) -> str:
-        """Return the progress in words."""
         return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
                 if math.isinf(self.duration)
                 else f'{self.elapsed:.0f} of {self.max_duration:.0f} s')
@@ -160,7 +138,6 @@ class Drive:
     INTERVAL = 0.02  # time between commands, s
 
     def __init__(self, run: CalibrationRun, motion: Motion, clock: Clock):
-        """Start to wait for a receiver of the commands."""
         self._run, self._motion, self._clock = run, motion, clock
         self._start_time = self._last_poll = clock.steady()
         self._has_receiver = self._had_callers = self._lost_callers = False
@@ -247,7 +224,6 @@ class CalibrationSession:
 
     @property
     def is_driving(self) -> bool:
-        """Tell whether a run drives the robot."""
         return self._drive is not None
 
     # Start
@@ -345,7 +321,6 @@ class CalibrationSession:
         To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
         `receivers` is the number of other nodes that receive the commands, and `conflict` why the
         samples cannot be used, or ''.
-
         """
         run, drive, now = self.run, self._drive, self._clock.steady()
         if now < self._stop_repeat_end and not drive:
@@ -398,23 +373,17 @@ class CalibrationSession:
         self._pending_commands.append(rate)
         self._send(rate)
 
-    def stop_robot(self) -> bool:
-        """Command zero if the robot is driven; return whether it was."""
-        if not self._drive:
-            return False
-        self._command(0.0)
-        self._stop_time = self._clock.steady()
-        return True
-
     # End
 
     def end(self, reason: str) -> None:
         """End the run and stop the robot; the reason is '' if its samples are complete."""
         if self.run and self.run.end_reason is None:
             self.run.end_reason = reason
-            if self.stop_robot() and reason:
-                # zero is repeated for 1 s, since the link to the base may lose some
-                self._stop_repeat_end = self._stop_time + 1.0
+            if self._drive:
+                self._command(0.0)
+                self._stop_time = self._clock.steady()
+                if reason:  # zero is repeated for 1 s, since the link to the base may lose some
+                    self._stop_repeat_end = self._stop_time + 1.0
 
     def finish(self) -> tuple[bool, str]:
         """End the motion of a run by turns or by odometry."""
@@ -427,7 +396,6 @@ class CalibrationSession:
         return True, run.finish()
 
     def cancel(self) -> tuple[bool, str]:
-        """Cancel the run without a change of the calibration."""
         if self.run is None:
             return False, 'no calibration is in progress'
         if self.run.end_reason is not None:

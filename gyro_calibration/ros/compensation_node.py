@@ -13,7 +13,6 @@ The compensation node: connects `pipeline` to topics, services and timers, and r
 
 It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``, and publishes
 ``imu/data``, ``heading``, ``yaw_rate``, ``~/calibration_status`` and diagnostics.
-
 """
 
 from __future__ import annotations
@@ -28,40 +27,18 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
-    PoseWithCovarianceStamped,
-    Quaternion,
-    Twist,
-    TwistStamped,
-    TwistWithCovarianceStamped,
-)
+    PoseWithCovarianceStamped, Quaternion, Twist, TwistStamped, TwistWithCovarianceStamped)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.logs.cdr import (
-    NOT_REPORTED,
-    NOT_REPORTED_COVARIANCE,
-    NSEC_PER_SEC,
-    UNMEASURED_COVARIANCE,
-    UNMEASURED_VARIANCE,
-    z_axis_covariance,
-)
+    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, UNMEASURED_COVARIANCE,
+    UNMEASURED_VARIANCE, z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
 from gyro_calibration.ros.inputs import Clock, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
-    allow_future_response,
-    call_every,
-    declare_parameters,
-    Diagnostics,
-    ERROR,
-    LATCHED_QOS,
-    OK,
-    publish_on,
-    Report,
-    run_node,
-    status_array,
-    subscribe_to,
-    WARN,
-)
+    allow_future_response, call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK,
+    publish_on, Report, run_node, status_array, subscribe_to, WARN)
 from nav_msgs.msg import Odometry
 from rclpy.clock import ROSClock
 from rclpy.duration import Duration
@@ -75,12 +52,11 @@ from std_srvs.srv import Trigger
 
 
 class NodeClock:
-    """The clocks of a node; see `clock.Clock`."""
+    """The clocks of a node; see `inputs.Clock`."""
 
     steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
 
     def __init__(self, node: Node):
-        """Read ROS time from a node."""
         self._clock = node.get_clock()
 
     def simulated(self) -> float | None:
@@ -149,7 +125,9 @@ class CompensationNode(Node):
                      lambda message: self._pipeline.add_temperature(
                          _stamp_ns(message.header), message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
-        subscribe_to(self, Odometry, 'odom', self._on_odometry)
+        subscribe_to(self, Odometry, 'odom', lambda message: self._pipeline.add_odometry(
+            _stamp_ns(message.header), quaternion_heading(message.pose.pose.orientation),
+            _to_velocity(message.twist.twist)))
         subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
         if self._pipeline.values.calibration_drive:
             self._offer_velocity()  # calibrate reports a failure
@@ -160,11 +138,6 @@ class CompensationNode(Node):
             self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response)))
 
     # Subscriptions
-
-    def _on_odometry(self, message: Odometry) -> None:
-        heading = quaternion_heading(message.pose.pose.orientation)
-        self._pipeline.add_odometry(_stamp_ns(message.header), heading,
-                                    _to_velocity(message.twist.twist))
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
         self._pipeline.add_command(
@@ -228,7 +201,6 @@ class CompensationNode(Node):
             self._yaw_rate.publish(rate)
 
     def _publish_status(self) -> None:
-        """Publish the latched state of the calibration."""
         self._status.publish(status_array(self, 'calibration', calibration_status(self._pipeline)))
 
     def _poll_graph(self) -> None:
@@ -351,12 +323,10 @@ class CompensationReport:
     """Makes reports of a pipeline; counts are compared with those of the last report."""
 
     def __init__(self, pipeline: Pipeline, clock: Clock):
-        """Start without a report."""
         self._pipeline, self._clock = pipeline, clock
         self._previous_counts, self._last_report_time = dict.fromkeys(COUNT_NAMES, 0), math.nan
 
     def level(self) -> bytes:
-        """Return the level of a report made now."""
         return self._evaluate()[0]
 
     def make(self) -> Report:
@@ -531,7 +501,6 @@ def _to_velocity(twist: Twist) -> Velocity:
 
 
 def main() -> int:
-    """Run the node until SIGINT or SIGTERM."""
     return run_node(CompensationNode)
 
 

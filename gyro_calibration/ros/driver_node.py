@@ -13,7 +13,6 @@ The driver node: reads a gyro on a serial port and publishes its samples.
 
 One thread reads, decodes, stamps and publishes; the executor only reports once per second. If the
 thread ends by a fault of the program, the node ends too, so that a launch file can restart it.
-
 """
 
 from __future__ import annotations
@@ -25,33 +24,15 @@ import time
 from types import SimpleNamespace
 
 from gyro_calibration.driver.connection import (
-    Connection,
-    ConnectionCounts,
-    ConnectionState,
-    Decimator,
-    MAX_BAUD,
-    SampleMean,
-)
+    Connection, ConnectionCounts, ConnectionState, Decimator, MAX_BAUD, SampleMean)
 from gyro_calibration.driver.protocols import AUTO, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, TRISTATE
 from gyro_calibration.driver.timestamps import (
-    NodeTimeConverter,
-    read_clock_pair,
-    read_steady_clock,
-)
+    NodeTimeConverter, read_clock_pair, read_steady_clock)
 from gyro_calibration.logs.cdr import NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, z_axis_covariance
 from gyro_calibration.ros.inputs import Parameter
 from gyro_calibration.ros.runner import (
-    call_every,
-    declare_parameters,
-    Diagnostics,
-    ERROR,
-    OK,
-    publish_on,
-    Report,
-    run_node,
-    WARN,
-)
+    call_every, declare_parameters, Diagnostics, ERROR, OK, publish_on, Report, run_node, WARN)
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
 
@@ -94,7 +75,6 @@ class DriverNode(Node):
     Stamps are those of the node's clock. With ``use_sim_time`` that is the simulated time, and the
     system time before a simulation starts. A gyro on a port measures in real time: its rates are
     wrong in a simulation that runs faster or slower.
-
     """
 
     def __init__(self) -> None:
@@ -218,7 +198,6 @@ class DriverReport:
         self._temperature, self._health = None, {}
 
     def make(self) -> Report:
-        """Return level, message and values."""
         counts, now, connection = self._connection.counts(), self._clock(), self._connection
         elapsed = now - self._last_time
         if elapsed >= 0.5:
@@ -308,7 +287,6 @@ def settings_from_parameters(values: SimpleNamespace) -> Settings:
 
 
 def main() -> int:
-    """Run the node; returns the exit code."""
     return run_node(DriverNode)
 
 

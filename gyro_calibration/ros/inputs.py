@@ -13,7 +13,6 @@ What a node takes from outside, without rclpy: parameters, clocks, and the motio
 
 Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
 ROS time, which may be paused. The motion is that of odometry and commands of the last second.
-
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ class Parameter:
 
     @property
     def choices_text(self) -> str:
-        """Return the choices as text; '' if any value is allowed."""
         return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
 
     def check(self, value: object) -> object:
@@ -117,7 +115,6 @@ class StampDelay:
 
         The test compares with the delays of a window, s. A tolerance is a duration, s, the
         shortest one first, in which some samples are not late, and a change of their delay, s.
-
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
         # Time of arrival and delay, s, of samples with less delay than any after them.
@@ -172,7 +169,6 @@ class RosTime:
     """Whether ROS time advances."""
 
     def __init__(self) -> None:
-        """Start without readings."""
         # time since its last advance, s of the steady clock; 0 where it is not simulated, inf
         # before a simulation starts
         self.paused_duration = 0.0
@@ -191,14 +187,10 @@ class RosTime:
         self._last_poll = now
 
 
-#: Largest age of a velocity that is used, s; slower odometry shows nothing.
-MAX_VELOCITY_AGE = 1.0
+MAX_VELOCITY_AGE = 1.0  # largest age of a velocity that is used, s; slower odometry shows nothing
 #: Longest motion after the last command to move, s: the default time-out of ros2_control's
 #: diff_drive_controller.
 COASTING_DURATION = 0.5
-#: Largest speeds of wheels at standstill, m/s and rad/s: what turns slower adds to the bias at
-#: rest, 0.011 deg/s at most.
-STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s: 2.9 deg/s, beyond the bias of a gyro.
 MIN_TURN_RATE = 0.05
 #: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
@@ -215,9 +207,10 @@ class Velocity:
 
     @property
     def is_moving(self) -> bool:
-        """Tell whether it exceeds the speeds at standstill."""
-        return (any(abs(part) > STANDSTILL_SPEED for part in self.linear)
-                or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
+        """Tell whether it exceeds 0.001 m/s or 0.0002 rad/s."""
+        # what turns slower adds to the bias at rest, 0.011 deg/s at most
+        return (any(abs(part) > 0.001 for part in self.linear)
+                or any(abs(part) > 0.0002 for part in self.angular))
 
 
 class TurnComparison:
@@ -226,14 +219,12 @@ class TurnComparison:
 
     Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
-    wheels; a robot may be turned by others than the commands, or scale them. So beside commands
+    wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
     distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
-
     """
 
     def __init__(self) -> None:
-        """Start without turns."""
         self.ratio, self.source = math.nan, ''  # of the last turns
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
@@ -243,7 +234,6 @@ class TurnComparison:
 
     @property
     def is_contradictory(self) -> bool:
-        """Tell whether the last turns contradict each other."""
         return self._contradictions > 1
 
     @property
@@ -252,7 +242,6 @@ class TurnComparison:
         Return duration, s, and turn by the gyro, rad, while odometry shows standstill.
 
         The least rate in a second of it, rad/s, follows: a push is over, a bias is not.
-
         """
         # two seconds pass before a robot stands, and one until a late odometry shows its turn
         if len(self._at_rest) < 4:
@@ -262,12 +251,7 @@ class TurnComparison:
 
     def add(self, source: str, time: float, rate: float, heading: float, *,
             stands: bool = False) -> None:
-        """
-        Add time, s, and rate, rad/s, of a source, and the heading by the gyro, rad.
-
-        The heading must not be changed by resets. Tell whether odometry shows standstill.
-
-        """
+        """Add time, s, and rate, rad/s, by a source, and the heading by the gyro, not reset."""
         (then, before), self._last = self._last, (time, heading)
         is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
         self.source = source
@@ -307,11 +291,9 @@ class AlternateTurns:
     without a function, have the same topic and frame. A vibration near half the sample rate has
     the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
     biases of the two may differ.
-
     """
 
     def __init__(self) -> None:
-        """Start without samples."""
         self._samples: list[tuple[float, float]] = []  # the last ones, up to 2; s and rad/s
         self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
         # difference over sum in turns of a row, their last sense, and how often it changed
@@ -319,7 +301,6 @@ class AlternateTurns:
 
     @property
     def is_contradictory(self) -> bool:
-        """Tell whether the last turns contradict each other."""
         return self._changes > 1
 
     def add(self, time: float, rate: float) -> None:
@@ -354,7 +335,6 @@ class Wheels:
     """The last velocity from each source, by the steady clock."""
 
     def __init__(self) -> None:
-        """Start without velocities."""
         self._last: dict[str, tuple[float, Velocity]] = {}
         # begin of uninterrupted standstill by each source, s
         self._standing_since: dict[str, float] = {}

@@ -18,7 +18,6 @@ the steady clock.
 Two publishers are detected by their stamps: a sample of a second one divides an interval so that
 one part is at most half of it. Two such intervals while the graph lists several publishers are the
 proof. The graph alone is not, since it lists a killed driver for up to 20 s.
-
 """
 
 from __future__ import annotations
@@ -36,42 +35,19 @@ from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pai
 from gyro_calibration.files import to_printable
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
-    Assumptions,
-    HeadingEstimator,
-    MAX_SPECIFIC_FORCE,
-    TEMPERATURE_TIMEOUT,
-)
+    Assumptions, HeadingEstimator, MAX_SPECIFIC_FORCE, TEMPERATURE_TIMEOUT)
 from gyro_calibration.heading.integration import MAX_GAP, Threshold
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession,
-    DRIVE_SAMPLE_TIMEOUT,
-    MIN_TURN_ANGLE,
-    REST,
-    ROS_TIME_PAUSED,
-)
+    CalibrationSession, DRIVE_SAMPLE_TIMEOUT, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
-    HealthMonitor,
-    PulseDetector,
-    RepeatedOutputDetector,
-)
+    HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
-    AlternateTurns,
-    Clock,
-    COMMAND,
-    MAX_ANGULAR_ACCELERATION,
-    MAX_VELOCITY_AGE,
-    ODOMETRY,
-    Parameter,
-    RosTime,
-    StampDelay,
-    TurnComparison,
-    Velocity,
-    Wheels,
-)
+    AlternateTurns, Clock, COMMAND, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE, ODOMETRY,
+    Parameter, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
 from gyro_calibration.ros.state_store import StateStore
 
 PARAMETERS = (
@@ -303,7 +279,6 @@ class Pipeline:
 
     @property
     def odometry_fault(self) -> str:
-        """Return why odometry does not show standstill; ''."""
         if self._clock.steady() - self._contradiction_time > 600.0:  # s
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
@@ -311,7 +286,6 @@ class Pipeline:
 
     @property
     def turn_fault(self) -> str:
-        """Return that the turns by the gyro and by odometry or commands do not agree; ''."""
         turns = self._turns
         return (f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check the '
                 f'unit and the sense of rotation of the gyro, and those of {turns.source}'
@@ -319,14 +293,12 @@ class Pipeline:
 
     @property
     def alternation_fault(self) -> str:
-        """Return that every other sample shows another turn; ''."""
         return ('every other sample on imu/data_raw shows another turn, as with two gyros on one '
                 'topic: give each gyro a topic of its own'
                 if self._alternate_turns.is_contradictory else '')
 
     @property
     def standstill_fault(self) -> str:
-        """Return that the gyro shows a turn while odometry shows standstill; ''."""
         return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
                 'the robot stands: unless others turn it, call calibrate_bias, or check odom'
                 if self._false_turn[1] else '')
@@ -347,7 +319,6 @@ class Pipeline:
         The stamp is in ns, the output in rad/s, and the specific force along the input axis in
         m/s², which counts as missing where it is not plausible; `receivers` is the number of other
         nodes that receive cmd_vel.
-
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
@@ -420,7 +391,6 @@ class Pipeline:
 
     @property
     def frame_fault(self) -> str:
-        """Return that the samples are not in the frame of the first one; ''."""
         if self._frame == self._first_frame:
             return ''
         return to_printable(
@@ -578,7 +548,6 @@ class Pipeline:
     # Periodic calls
 
     def use_parameters(self, values: SimpleNamespace) -> None:  # noqa: A003
-        """Continue with other values of the parameters."""
         self.values = values
         tracking = _tracker_settings(values, self.store.model.noise)
         if tracking != self._tracking_settings:

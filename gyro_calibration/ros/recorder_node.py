@@ -13,7 +13,6 @@ A node that receives serialized messages from topics, for the verb record.
 
 A subscription requests the offered QoS: best effort publishers are received, and reliable ones
 lose nothing. Publishers may start late, stop, and start again with another QoS.
-
 """
 
 from __future__ import annotations
@@ -121,7 +120,6 @@ def take_messages(roles: Mapping[str, str], on_message: Callable[[str, Message],
     `on_message` is called with the role and each message, and `tick` at least every 50 ms with the
     node. Raise `LogError` where a topic name is not valid, a topic has another type than its role
     wants, or ROS 2 cannot be started, as with an invalid ROS_DOMAIN_ID.
-
     """
     context = rclpy.Context()
     domain = os.environ.get('ROS_DOMAIN_ID', '')

@@ -17,7 +17,6 @@ and joins its threads in `destroy_node`. Its ``main`` is ``return run_node(TheNo
 Signals set an event, the loop of `spin_once` ends, threads are joined, and then the node is
 destroyed. The handlers of rclpy invalidate the context while a callback still publishes, which
 ends some runs in a traceback.
-
 """
 
 from __future__ import annotations
@@ -33,11 +32,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from gyro_calibration.ros.inputs import Parameter, parameter_values
 from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+    FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
@@ -67,8 +62,7 @@ SHUTDOWN_TIMEOUT = 10.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-#: Level, sentence and values by name.
-Report = tuple[bytes, str, Mapping[str, object]]
+Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values by name
 
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
@@ -97,7 +91,6 @@ def declare_parameters(
 
     `on_change` is called with the record of all values after a change. `ValueError` says in a
     sentence that an override has the wrong type or is out of range.
-
     """
     known = {each.name: each for each in table}
 
@@ -136,7 +129,6 @@ def declare_parameters(
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return the descriptor that ``ros2 param describe`` shows."""
     unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.description + unit, read_only=not parameter.dynamic,
@@ -196,7 +188,6 @@ def run_node(node_class: Callable[[], Node]) -> int:
 
     It is 0 after a signal, and 2 where an argument or a parameter was refused, with a sentence on
     standard error.
-
     """
     stop = threading.Event()
     for number in _SIGNALS:

@@ -13,7 +13,6 @@ The state of a robot in files: the gyro model, the last self-calibration, biases
 
 The calibration file is a complete model file with the effects that were in use at the calibration.
 If they differ from the model in use, the self-calibration is not used.
-
 """
 
 from __future__ import annotations
@@ -22,20 +21,10 @@ import os
 from pathlib import Path
 
 from gyro_calibration.files import (
-    describe_error,
-    file_version,
-    keep_aside,
-    remedy,
-    remove_leftovers,
-    to_printable,
-)
+    describe_error, file_version, keep_aside, remedy, remove_leftovers, to_printable)
 from gyro_calibration.heading.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
 from gyro_calibration.model.gyro_model import (
-    GyroModel,
-    have_same_effects,
-    SelfCalibration,
-    with_self_calibration,
-)
+    GyroModel, have_same_effects, SelfCalibration, with_self_calibration)
 from gyro_calibration.model.model_file import ModelError, ModelNotFound, read_model, write_model
 
 
@@ -46,7 +35,6 @@ class StateStore:
     `problem` says why the rates are uncalibrated, `calibration_hint` and `table_hint` a fault of
     the calibration file and of the table, `shared_hint` that another process has written to a
     file, each in a sentence or ''. `table_written_time` is in s since 1970, None before the first.
-
     """
 
     def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior):
@@ -98,13 +86,7 @@ class StateStore:
         return with_self_calibration(model, stored.self_calibration)
 
     def store_calibration(self, calibration: SelfCalibration) -> str:
-        """
-        Use and store a calibration; return the fault of the storage, '' without one.
-
-        A file in its place that was not used, such as that of another gyro, is kept under another
-        name, in a sentence that is returned.
-
-        """
+        """Use and store a calibration; return a fault, or where an unused file is kept, or ''."""
         self.model, self.calibration_hint = with_self_calibration(self.model, calibration), ''
         kept = ''
         try:

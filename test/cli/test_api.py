@@ -18,20 +18,8 @@ import sys
 
 import gyro_calibration
 from gyro_calibration import (
-    allan,
-    compensate,
-    diagnose,
-    fit,
-    GyroModel,
-    Log,
-    read_log,
-    read_model,
-    self_calibrate,
-    simulate,
-    track,
-    write_log,
-    write_model,
-)
+    allan, compensate, diagnose, fit, GyroModel, Log, read_log, read_model, self_calibrate,
+    simulate, track, write_log, write_model)
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest

@@ -13,7 +13,6 @@ Files that are no files, that cannot be opened, that grow without end, or that s
 
 Each ends within seconds in one sentence that names it and says what to do, or is read for what it
 is; what was there before is there afterwards.
-
 """
 
 import json

@@ -16,14 +16,8 @@ from functools import cache
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects, MIN_TURN_RATE
 from gyro_calibration.cli.plots import (
-    draw_error_surface,
-    draw_headings,
-    draw_motion,
-    draw_reference,
-    draw_residuals,
-    draw_run,
-    draw_turn_errors,
-)
+    draw_error_surface, draw_headings, draw_motion, draw_reference, draw_residuals, draw_run,
+    draw_turn_errors)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.motion import CALIBRATION_MOTION

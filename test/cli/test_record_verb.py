@@ -46,7 +46,6 @@ def gyro(link, rate=RATE):
     Emulate a gyro that counts: its outputs rise by 1e-4 rad/s a sample, which numbers them.
 
     It is a replay at double speed, which waits for a reader on a busy machine.
-
     """
     samples = (Sample(1e-4 * (number % 10_000), 25.0, time=2.0 * number / rate)
                for number in range(10 ** 6))

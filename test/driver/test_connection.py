@@ -22,12 +22,7 @@ import tty
 
 from fake_port import BEGIN, damaged, Reading, SETTINGS, World
 from gyro_calibration.driver.connection import (
-    Connection,
-    Decimator,
-    PortError,
-    resolve_port,
-    SerialPort,
-)
+    Connection, Decimator, PortError, resolve_port, SerialPort)
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import numpy as np

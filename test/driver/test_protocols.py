@@ -12,7 +12,6 @@
 The wire formats: their bytes, bad bytes, settings, recognition, and what single ones have.
 
 Any bytes, in any pieces, are decoded in test_fuzz.py: alike, and right again after two frames.
-
 """
 
 from dataclasses import replace
@@ -26,13 +25,7 @@ import time
 from fake_port import SETTINGS
 from gyro_calibration.driver import protocols
 from gyro_calibration.driver.protocols import (
-    BAUDS,
-    find_protocol,
-    PROTOCOLS,
-    recognize_protocol,
-    Sample,
-    Settings,
-)
+    BAUDS, find_protocol, PROTOCOLS, recognize_protocol, Sample, Settings)
 import pytest
 
 ALL = sorted(PROTOCOLS)
@@ -163,8 +156,7 @@ def test_a_flipped_bit_gives_no_wrong_rate(name):
 @pytest.mark.parametrize('name', ALL)
 def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
     encode, decoder = find_protocol(name).encoder(SETTINGS[name]), opened(name)
-    frames = [encode(Sample(0.1 * number, 20.0, 0.01 * number))
-              for number in range(1, 9)]
+    frames = [encode(Sample(0.1 * number, 20.0, 0.01 * number)) for number in range(1, 9)]
     frames[3] = frames[3][:2] + b'\x55' + frames[3][4:]
     frames[4] = frames[4][:3] + b'\x55' + frames[4][3:]
     assert [sample.missing for sample in decoder.feed(b''.join(frames))] == [0, 0, 0, 2, 0, 0]
@@ -284,7 +276,6 @@ def received(data, ratio, idle=0):
     Each byte is 10 bits: low, the data from the lowest bit on, high. The receiver waits for a
     falling edge and samples the middle of each of its bits; it ignores a missing stop bit, as in a
     break, as terminals do in raw mode.
-
     """
     line = [1]
     for byte in data:
@@ -567,8 +558,7 @@ def witmotion(kind, *numbers):
     return data + bytes([sum(data) % 256])
 
 
-@pytest.mark.parametrize('axis, rate, force',
-                         [('x', 100, 4), ('y', -200, -5), ('z', 300, 2048)])
+@pytest.mark.parametrize('axis, rate, force', [('x', 100, 4), ('y', -200, -5), ('z', 300, 2048)])
 def test_the_axis_chooses_rate_and_acceleration_of_a_witmotion(axis, rate, force):
     sample, = decoded(WITMOTION, witmotion(0x51, 4, -5, 2048, 2500),
                       witmotion(0x52, 100, -200, 300, 2534), axis=axis)

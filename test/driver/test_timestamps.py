@@ -16,11 +16,7 @@ from itertools import pairwise
 
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import (
-    HostTimeConverter,
-    NodeTimeConverter,
-    read_clock_pair,
-    SampleClock,
-)
+    HostTimeConverter, NodeTimeConverter, read_clock_pair, SampleClock)
 import numpy as np
 import pytest
 

@@ -27,24 +27,11 @@ from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.logs import (
-    compile_file_pattern,
-    describe_log,
-    find_logs,
-    FleetLog,
-    LogTask,
-    process_log,
-)
+    compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
 from gyro_calibration.fleet.pooling import find_changes, find_outliers, Observations, PooledValue
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models,
-    count_effects,
-    data,
-    describe_type,
-    render_report,
-    summarize_types,
-    table_files,
-)
+    build_models, count_effects, data, describe_type, render_report, summarize_types, table_files)
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance

@@ -16,17 +16,8 @@ import math
 
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.logs.log import (
-    DEGREE,
-    Log,
-    log_from_table,
-    LogError,
-    read_log,
-    read_log_blocks,
-    select_rows,
-    unwrap_heading,
-    write_log,
-    write_log_blocks,
-)
+    DEGREE, Log, log_from_table, LogError, read_log, read_log_blocks, select_rows, unwrap_heading,
+    write_log)
 from gyro_calibration.logs.stamps import fit_stamp_grid
 import numpy as np
 import pytest
@@ -231,22 +222,6 @@ def test_the_reader_says_how_far_it_is(tmp_path, name):
     said = []
     list(read_log_blocks(tmp_path / name, rows=1000, on_progress=said.append))
     assert len(said) == 5 and said == sorted(said) and said[-1] == (tmp_path / name).stat().st_size
-
-
-@pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
-def test_a_log_written_in_blocks_is_the_log_written_at_once(tmp_path, name):
-    generator = np.random.default_rng(0)
-    log = Log(output=generator.normal(size=9), time=np.arange(9.0), notes=('a',),
-              others={'lap': tuple('abcdefghi')})
-    more = generator.normal(size=9)
-    write_log(tmp_path / f'whole_{name}', log, {'rate_rad_s': more})
-    pieces = [slice(0, 4), slice(4, 5), slice(5, 9)]
-    write_log_blocks(tmp_path / name, ((Log(output=log.output[here], time=log.time[here],
-                                            notes=('a',), others={'lap': log.others['lap'][here]}),
-                                        {'rate_rad_s': more[here]}) for here in pieces))
-    assert read_log(tmp_path / name).others == read_log(tmp_path / f'whole_{name}').others
-    opened = gzip.open if name.endswith('.gz') else open
-    assert opened(tmp_path / name).read() == opened(tmp_path / f'whole_{name}').read()
 
 
 # Logs of other programs

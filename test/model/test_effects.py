@@ -18,12 +18,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.channels import ChannelHistory
 from gyro_calibration.model.compensation import compensate, rate_sensitivity
 from gyro_calibration.model.effects import (
-    CATALOGUE,
-    Channels,
-    polynomial_from_matrix,
-    polynomial_to_matrix,
-    rate_temperature_polynomial,
-)
+    CATALOGUE, Channels, polynomial_from_matrix, polynomial_to_matrix, rate_temperature_polynomial)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration.model.noise import Noise

@@ -19,15 +19,8 @@ from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    constant_rate_motion,
-    motion_from_headings,
-    MotionError,
-    NAMED_MOTIONS,
-    read_motion,
-    ROBOT_MOTION,
-    simulate,
-)
+    CALIBRATION_MOTION, constant_rate_motion, motion_from_headings, MotionError, NAMED_MOTIONS,
+    read_motion, ROBOT_MOTION, simulate)
 from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
@@ -173,7 +166,6 @@ def test_simulated_noise_has_the_allan_variance_of_ieee_952(noise, sizes, wanted
 
     The n differences of neighbours correlate by -1/2 or less, so that their mean square has a
     relative variance of at most 3 / n.
-
     """
     assert round(ALLAN_FLOOR_RATIO, 3) == 0.664
     generator = np.random.default_rng(952)

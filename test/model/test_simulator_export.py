@@ -19,11 +19,7 @@ from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.simulator_export import (
-    export_model,
-    fit_gauss_markov,
-    simulator_parameters,
-    SIMULATORS,
-)
+    export_model, fit_gauss_markov, simulator_parameters, SIMULATORS)
 import numpy as np
 import pytest
 

@@ -18,15 +18,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
-    CalibrationRun,
-    Drive,
-    FINISH_TIMEOUT,
-    fit_run,
-    ODOMETRY,
-    REST,
-    SAMPLE_TIMEOUT,
-    TURNS,
-)
+    CalibrationRun, Drive, FINISH_TIMEOUT, fit_run, ODOMETRY, REST, SAMPLE_TIMEOUT, TURNS)
 from gyro_calibration.ros.inputs import Velocity
 import numpy as np
 import pytest
@@ -329,8 +321,7 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_lat
     rig.go(1.0)
     assert 'command time-out of its base' in rig.session.warning
     rig.robot.deaf = False
-    rig.robot.command(0.0)
-    rig.go(5.0)
+    rig.turn(0.0, 5.0)
     assert not rig.begin() and not rig.session.warning, 'a new run has a new chance'
     late = driven(tmp_path, robot=Robot(lag=0.3))
     late.stop()
@@ -454,8 +445,7 @@ def turn_to_and_fro(rig, rest):
     """Begin a run by odometry, turn each way by somebody's commands, and rest for so many s."""
     rig.begin(ODOMETRY)
     for rate, seconds in ((0.6, 4.0), (0.0, 3.0), (-0.6, 4.0), (0.0, rest)):
-        rig.robot.command(rate)
-        rig.go(seconds)
+        rig.turn(rate, seconds)
 
 
 @pytest.mark.parametrize('has_yaw', [True, False], ids=['headings', 'rates alone'])
@@ -516,10 +506,8 @@ def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
     rig.begin(TURNS)
     assert 'no sample has come since' in rig.session.finish()[1]
     rig.go(3.0)
-    rig.robot.command(0.6)
-    rig.go(2.0 * math.tau / 0.6)
-    rig.robot.command(0.0)
-    rig.go(4.0)
+    rig.turn(0.6, 2.0 * math.tau / 0.6)
+    rig.turn(0.0, 4.0)
     assert rig.robot.heading == pytest.approx(2.0 * math.tau, abs=0.02), 'two turns'
     assert rig.session.finish()[0]
     success, message = rig.end(5.0)

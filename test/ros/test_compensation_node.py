@@ -13,7 +13,6 @@ The compensation node: its messages, parameters and services, and drives of a sm
 
 What it computes and decides is tested in test_pipeline.py and test_calibration_session.py. Here
 are its messages and services, by a node that nobody spins, and drives of a process on real DDS.
-
 """
 
 from contextlib import ExitStack

@@ -26,12 +26,7 @@ from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.ros.compensation_node import CompensationNode
 from gyro_calibration.ros.driver_node import (
-    DriverNode,
-    DriverReport,
-    PARAMETERS,
-    SampleMessages,
-    settings_from_parameters,
-)
+    DriverNode, DriverReport, PARAMETERS, SampleMessages, settings_from_parameters)
 from gyro_calibration.ros.inputs import parameter_values
 from gyro_calibration.ros.runner import ERROR, OK, WARN
 from rclpy.clock import ClockType

@@ -19,11 +19,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import (
-    describe_change,
-    examine_stretch,
-    HealthMonitor,
-)
+from gyro_calibration.ros.health_monitor import describe_change, examine_stretch, HealthMonitor
 import numpy as np
 import pytest
 

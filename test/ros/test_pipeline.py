@@ -20,14 +20,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.inputs import (
-    AlternateTurns,
-    COASTING_DURATION,
-    COMMAND,
-    MAX_VELOCITY_AGE,
-    ODOMETRY,
-    Velocity,
-    Wheels,
-)
+    AlternateTurns, COASTING_DURATION, COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels)
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -135,12 +128,10 @@ def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothin
     rig = rested(tmp_path, seconds=5.0, wheels=wheels)
     begin, right, still = len(rig.outputs) - 1, rig.robot.distort, rig.robot.bias
     if value == 'in a turn':
-        rig.robot.command(0.7)
-        rig.go(3.0)
+        rig.turn(0.7, 3.0)
     rig.robot.distort = {'at rest': lambda _: still, 'in a turn': lambda _: 0.7,
                          'saturated': lambda output: min(output, 0.3)}[value]
-    rig.robot.command(0.0 if value == 'in a turn' else 0.7)
-    rig.go(6.0)
+    rig.turn(0.0 if value == 'in a turn' else 0.7, 6.0)
     level, message, _ = reported(rig)
     assert level == ERROR and 'the gyro repeats' in message and 'it is dead' in message, message
     rig.robot.distort = right
@@ -210,8 +201,7 @@ def test_single_samples_that_deviate_do_not_turn_the_heading(tmp_path, size):
 def test_several_samples_that_deviate_are_in_the_variance_and_a_turn_of_a_robot_is_not(
         tmp_path, size, count):
     rig = rested(tmp_path, model=CERTAIN, robot=Robot(bias=0.01, scale_factor_error=0.0))
-    rig.robot.command(0.7)
-    rig.go(0.4)  # the robot has begun to turn
+    rig.turn(0.7, 0.4)  # the robot has begun to turn
     rig.go(2.6)
     assert rig.error()[1] < 0.1 * DEGREE
     numbers = iter(range(10 ** 6))
@@ -237,8 +227,7 @@ def test_a_turn_while_one_value_is_held_for_a_short_time_is_in_the_variance(
         return outputs[begin - 1] if value is None else value
     rig.robot.distort = hold
     rig.go(2.3)
-    rig.robot.command(1.5)
-    rig.go(3.0)
+    rig.turn(1.5, 3.0)
     assert 'repeats' not in rig.journal.event
     error, deviation = rig.error()
     assert abs(error) < 4.0 * deviation < 1.0
@@ -269,8 +258,7 @@ def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill
     rig = rested(tmp_path, seconds=60.0, wheels='odom')
     begin, odometry = len(rig.outputs) - 1, rig.pipeline.add_odometry
     rig.pipeline.add_odometry = lambda stamp, heading, _: odometry(stamp, heading, Velocity())
-    rig.robot.command(0.05 * DEGREE)
-    rig.go(60.0)
+    rig.turn(0.05 * DEGREE, 60.0)
     level, message, _ = reported(rig)
     assert level == WARN and 'odom turns by its headings' in message, message
     assert rig.pipeline.wheels.is_moving(rig.clock.now) is None
@@ -284,12 +272,10 @@ def test_a_turn_by_the_gyro_alone_while_odometry_stands_is_a_warning_and_in_the_
     """As of a bias that changed in the drive before, or of odometry that has stopped."""
     rig = rested(tmp_path, model=CERTAIN, seconds=12.0, wheels=wheels,
                  robot=Robot(bias=0.01, scale_factor_error=0.0))
-    rig.robot.command(0.3)
-    rig.go(3.0)
+    rig.turn(0.3, 3.0)
     rig.robot.bias += moved * DEGREE
     rig.go(10.0)
-    rig.robot.command(0.0)
-    rig.go(10.0)
+    rig.turn(0.0, 10.0)
     rig.pipeline.reset_heading() if not moved else None
     rig.go(2.0)
     level, message, _ = reported(rig)
@@ -326,10 +312,8 @@ def test_turns_that_contradict_odometry_are_a_warning_and_the_heading_claims_not
     rig.pipeline.add_odometry = lambda stamp, heading, velocity: odometry(
         stamp, heading, Velocity(angular=(0.0, 0.0, wheels * velocity.angular[2])))
     rig.robot.distort = lambda output: gyro * output
-    rig.robot.command(0.7)
-    rig.go(10.0)
-    rig.robot.command(-0.7)
-    rig.go(10.0)
+    rig.turn(0.7, 10.0)
+    rig.turn(-0.7, 10.0)
     level, message, _ = reported(rig)
     assert (level == WARN and 'times what odom shows: check the unit' in message) == warns
     assert (rig.error(begin)[1] > math.tau) == warns
@@ -409,8 +393,7 @@ def test_every_other_sample_of_another_gyro_is_a_warning_and_the_heading_claims_
     rig, count = rested(tmp_path), itertools.count()
     rig.robot.distort = lambda output: other(output) if next(count) % 2 else output
     for rate in (0.5, -0.8, 0.6, -0.4):
-        rig.robot.command(rate)
-        rig.go(6.0)
+        rig.turn(rate, 6.0)
     level, message, _ = reported(rig)
     assert (level == WARN and 'every other sample on imu/data_raw' in message) == warns, message
     assert (rig.error()[1] > math.tau) == warns
@@ -579,8 +562,7 @@ def test_a_clock_of_the_host_that_is_set_changes_neither_heading_nor_variance(tm
     plain, stepped = (Rig(folder, stationary_method='none', robot=Robot(seed=3))
                       for folder in (_folder(tmp_path, 'a'), _folder(tmp_path, 'b')))
     for rig in (plain, stepped):
-        rig.robot.command(0.5)
-        rig.go(5.0)
+        rig.turn(0.5, 5.0)
     stepped.clock.set_by = step
     for rig in (plain, stepped):
         rig.go(5.0)
@@ -599,8 +581,7 @@ def _folder(path, name):
 def test_stamps_that_leap_by_less_than_a_gap_are_in_the_variance(tmp_path):
     rig = rested(tmp_path)
     begin, stamp = len(rig.outputs) - 1, rig.stamp
-    rig.robot.command(0.7)
-    rig.go(3.0)
+    rig.turn(0.7, 3.0)
     rig.stamp = lambda reading: stamp(reading) + 9 * 10 ** 8
     rig.go(3.0)
     last = rig.outputs[-1]
@@ -699,8 +680,7 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
     rig = rested(tmp_path)
     first = len(rig.outputs) - 1
     rig.pace_stamps(pace)
-    rig.robot.command(0.5)
-    rig.go(17.0)
+    rig.turn(0.5, 17.0)
     reported(rig)
     rig.go(1.0)
     level, message, _ = reported(rig)

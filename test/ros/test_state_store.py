@@ -152,8 +152,7 @@ def test_a_kill_at_any_line_leaves_the_old_file_or_the_new_one(remember, tmp_pat
     memory, found = remember(ONE), []
     memory.store_calibration(SelfCalibration(0.01, 1e-3))
     old = (tmp_path / 'calibration.yaml').read_bytes()
-    while is_killed_at(len(found),
-                       lambda: memory.store_calibration(SelfCalibration(0.02, 1e-3))):
+    while is_killed_at(len(found), lambda: memory.store_calibration(SelfCalibration(0.02, 1e-3))):
         found.append((tmp_path / 'calibration.yaml').read_bytes())
         (tmp_path / 'calibration.yaml').write_bytes(old)
     new = (tmp_path / 'calibration.yaml').read_bytes()

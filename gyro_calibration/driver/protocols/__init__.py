@@ -18,7 +18,6 @@ records. No port, no ROS and no clock is used here.
 >>> decoder = find_protocol('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
 [Sample(output=-0.00027459265121626786, ...)]
-
 """
 
 from __future__ import annotations
@@ -38,16 +37,11 @@ PROTOCOLS = {
     value.name: value for each in pkgutil.iter_modules(__path__)
     for value in vars(importlib.import_module(f'{__name__}.{each.name}')).values()
     if isinstance(value, Protocol)}
-#: Name that stands for recognition by listening.
-AUTO = 'auto'
+AUTO = 'auto'  # name that stands for recognition by listening
 #: Bits per second, in order of the attempts: first the defaults of gyros, then others.
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 
-_MAX_BYTES = 8192  # number of last bytes that are used, which limits the cost
 _MIN_FRAMES = 3  # least number of frames; fewer may be chance
-_MIN_EXPLAINED_SHARE = 0.5  # least share of the bytes in frames; a line may damage the rest
-_MIN_IDENTICAL_SHARE = 0.95  # least share where all frames are equal: zeros may pass a weak check
-_AMBIGUITY_RATIO = 0.8  # the result is ambiguous if another format has this times the best share
 
 
 def find_protocol(name: str) -> Protocol:
@@ -74,15 +68,15 @@ def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recogni
 
     The settings may be incomplete for the recognized format. `csv` is recognized by the number of
     their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
-
     """
-    settings, data = settings or Settings(), data[-_MAX_BYTES:]
+    settings, data = settings or Settings(), data[-8192:]
     scores = [(*_explain(protocol, settings, data), protocol) for protocol in PROTOCOLS.values()]
     (share, frames, best), (next_share, _, second) = sorted(scores, key=lambda each: -each[0])[:2]
-    if next_share and next_share >= _AMBIGUITY_RATIO * share:
+    if next_share and next_share >= 0.8 * share:
         return Recognition(None, share, f'the bytes may be {best.name} or {second.name}: set '
                            'protocol')
-    least = _MIN_EXPLAINED_SHARE if len(set(frames)) >= _MIN_FRAMES else _MIN_IDENTICAL_SHARE
+    # a line may damage half of the bytes; where all frames are equal, zeros may pass a weak check
+    least = 0.5 if len(set(frames)) >= _MIN_FRAMES else 0.95
     if len(frames) >= _MIN_FRAMES and share >= least:
         following = f'; next is {second.name} with {next_share:.0%}' if next_share else ''
         return Recognition(best, share, f'{best.name} explains {share:.0%} of {len(data)} bytes, '

@@ -24,29 +24,17 @@ the device.
 
 An XV-3500CB gives 0.67 mV per deg/s. A converter of 12 bits and 3.3 V has 1.2 deg/s a count:
 amplify or oversample.
-
 """
-
-from __future__ import annotations
 
 import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    GYRO_COLUMNS,
-    LineSplitter,
-    NUMBER,
-    OPTIONAL_COLUMNS,
-    Protocol,
-    Reading,
-    Sample,
-    Settings,
-    stateless,
-)
+    GYRO_COLUMNS, LineSplitter, NUMBER, OPTIONAL_COLUMNS, Protocol, Reading, Sample, Settings,
+    stateless)
 
 _NUMBER = re.compile(NUMBER)
 _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
-_MISSING_VALUES = (b'', b'nan')
 
 
 def _check(settings: Settings) -> None:
@@ -71,7 +59,7 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
     known: list[float | None] = []
     for column in OPTIONAL_COLUMNS:
         text = fields.get(column, b'')
-        if text.lower() in _MISSING_VALUES:
+        if text.lower() in (b'', b'nan'):
             known.append(None)
         elif _NUMBER.fullmatch(text) and math.isfinite(value := float(text)):
             known.append(value)

@@ -27,22 +27,12 @@ Source: the public decoder ``riptide_gyro`` of Ohio State University; its sign e
 one count and was not adopted. No manual was seen. The sample rate is not known: 1000 Hz is assumed
 until samples come, so set ``sample_rate``. The sense of rotation is not verified: the maker's
 glossary calls a clockwise turn positive, without the direction of view.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 
 from gyro_calibration.driver.protocols.protocol import (
-    FrameSplitter,
-    Protocol,
-    Reading,
-    ROOM_TEMPERATURE,
-    Sample,
-    Settings,
-    to_signed_count,
-)
+    FrameSplitter, Protocol, Reading, ROOM_TEMPERATURE, Sample, Settings, to_signed_count)
 
 _HEADER = 0xDD
 _FULL_COUNT = 0x8000  # of a status value

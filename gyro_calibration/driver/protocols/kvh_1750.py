@@ -34,10 +34,7 @@ Source: KVH 1775 IMU interface control document, 56-0298 revision B: format A (t
 status (5-8), CRC (5-9), the example (5.2.1), data rates (8.8), senses (section 9). Not verified:
 models other than the 1775, and the 1000 Hz of a new unit, which public drivers expect. Not
 supported: formats B and C (headers ``FE 81 FF 56`` and ``57``), and temperatures in other units.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 import math
@@ -45,15 +42,8 @@ import struct
 import zlib
 
 from gyro_calibration.driver.protocols.protocol import (
-    FrameSplitter,
-    Protocol,
-    Reading,
-    ROOM_TEMPERATURE,
-    Sample,
-    Settings,
-    stateless,
-    to_signed_count,
-)
+    FrameSplitter, Protocol, Reading, ROOM_TEMPERATURE, Sample, Settings, stateless,
+    to_signed_count)
 from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _HEADER = b'\xfe\x81\xff\x55'

@@ -25,22 +25,14 @@ states 115200 baud and a message of 32 bits, most significant byte first: bit 31
 synchronization, 28 and 27 type (0 rate, 1 increment, 2 integrated angle), 26 odd parity, 25 to 0
 the value, 60 micro-deg/s a count for rates. Section 3.1.4 defines the two bits of synchronization,
 without which the first byte of a message cannot be identified; no public copy of it was found.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    LineSplitter,
-    Protocol,
-    Reading,
-    Settings,
-    stateless,
-)
+    LineSplitter, Protocol, Reading, Settings, stateless)
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
 

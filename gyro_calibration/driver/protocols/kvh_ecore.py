@@ -20,23 +20,13 @@ a frame, so that a frame after other bytes counts only if another one follows di
 rotation were inferred, not read in a manual: check sign and scale on your unit.
 
 ``8A 40 00 00 00 00 07 68`` is a count of 1000, which is 1.83 deg/s.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 import math
 
 from gyro_calibration.driver.protocols.protocol import (
-    FrameSplitter,
-    Protocol,
-    Reading,
-    Sample,
-    Settings,
-    stateless,
-    to_signed_count,
-)
+    FrameSplitter, Protocol, Reading, Sample, Settings, stateless, to_signed_count)
 
 
 def _unpack_content(frame: bytes) -> bytes:

@@ -18,24 +18,14 @@ firmware. The parameter ``axis`` selects x, y or z. One count is 0.07 deg/s in t
 ``1.527e-4`` (data sheet of the L3G4200D, typical). No temperature is sent.
 
 ``!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9`` is -7 deg/s about z.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    LineSplitter,
-    Protocol,
-    Reading,
-    Sample,
-    Settings,
-    stateless,
-    to_signed_count,
-)
+    LineSplitter, Protocol, Reading, Sample, Settings, stateless, to_signed_count)
 
 _LINE = re.compile(rb'!ANG:[-+.0-9]+,[-+.0-9]+,[-+.0-9]+,AN:(-?[0-9]{1,5}(?:,-?[0-9]{1,5}){8}) *')
 

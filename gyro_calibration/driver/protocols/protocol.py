@@ -14,7 +14,6 @@ Common parts of wire formats: records, decoder from bytes to samples, and splitt
 A format is a `Protocol`: a splitter that finds frames in a stream of bytes, a parser from a frame
 to a `Reading`, and a writer. A reading is in the unit of the device; sign, sensitivity and full
 scale are applied here for all formats, as are the counts of discarded, refused and lost data.
-
 """
 
 from __future__ import annotations
@@ -45,7 +44,6 @@ ASSUMED_FORCE_NOISE = 0.1
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
 _PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
-_MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
 
 
 @dataclass(frozen=True)
@@ -215,8 +213,8 @@ class Protocol:
 
     def sample_rate_warning(self, settings: Settings, period: float) -> str:
         """Return a warning if angles come at another period, s, than that of the sample rate."""
-        rate = self.nominal_rate(settings)
-        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MAX_RATE_DEVIATION:
+        rate = self.nominal_rate(settings)  # the clocks of gyros are 2 to 3 % off
+        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= 0.05:
             return ''
         return (f'the gyro sends {1.0 / period:.0f} samples per second, but angles are converted '
                 f'to rates by {rate:g}: set sample_rate')
@@ -251,7 +249,6 @@ class Decoder:
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
     The counts are those of `ConnectionCounts`.
-
     """
 
     def __init__(self, protocol: Protocol, settings: Settings):
@@ -312,7 +309,6 @@ class Decoder:
 #: A finite number in text: `float` also takes nan, inf and 1_0.
 NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
 
-_LINE_END = re.compile(rb'[\r\n]')
 _MAX_LINE = 1024  # bytes; a longer line is discarded, so that an endless one fills no memory
 
 
@@ -322,7 +318,6 @@ class LineSplitter(Splitter):
 
     A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
     first line is discarded, unless it begins with bytes with which only complete lines begin.
-
     """
 
     def __init__(self, line_starts: tuple[bytes, ...] = ()):
@@ -331,8 +326,7 @@ class LineSplitter(Splitter):
         self._has_line_start = self._is_too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the lines that these bytes complete."""
-        first, *rest = _LINE_END.split(data)  # the tail was searched for line ends when it came
+        first, *rest = re.split(rb'[\r\n]', data)  # the tail has no line end
         *lines, tail = self._tail + first, *rest
         whole = []
         for line in lines:
@@ -350,7 +344,6 @@ class LineSplitter(Splitter):
         return whole
 
     def reset(self) -> None:
-        """Discard an incomplete line."""
         super().reset()
         self._has_line_start = self._is_too_long = False
 
@@ -362,7 +355,6 @@ class FrameSplitter(Splitter):
     In the pattern, a regular expression, ``.`` is any byte; the length is in bytes. If other bytes
     often pass the check, which is then weak, a frame after other bytes counts only if another one
     follows directly.
-
     """
 
     def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool],
@@ -372,7 +364,6 @@ class FrameSplitter(Splitter):
         self._length, self._is_intact, self._is_weak = length, is_intact, is_weak
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that these bytes complete."""
         data, position, end, frames = self._tail + data, 0, 0, []
         while match := self._pattern.search(data, position):
             position = match.start() + 1

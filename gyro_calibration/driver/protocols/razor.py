@@ -25,24 +25,14 @@ counter-clockwise from above, and 9.81 m/s² up.
 Source: the comments of the firmware and the driver in ``razor_imu_9dof`` 1.3.0 (file
 Razor_AHRS.ino, on axes and serial commands; node imu_node.py). For older firmware that sends
 counts set ``sensitivity``.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    LineSplitter,
-    NUMBER,
-    Protocol,
-    Reading,
-    Sample,
-    Settings,
-    stateless,
-)
+    LineSplitter, NUMBER, Protocol, Reading, Sample, Settings, stateless)
 from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')

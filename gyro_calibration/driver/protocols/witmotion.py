@@ -23,25 +23,15 @@ Source: WT901 data sheet v20-0702, sections 5.1.2 and 5.1.3. Older modules (BWT6
 v20-0630) send the temperature as count/340 + 36.53 degC. The frames do not identify the module, so
 the temperature of older modules is wrong. Not verified: whether a module that lies flat reports
 +1 g.
-
 """
-
-from __future__ import annotations
 
 from functools import partial
 import math
 import struct
 
 from gyro_calibration.driver.protocols.protocol import (
-    FrameSplitter,
-    Protocol,
-    Reading,
-    ROOM_TEMPERATURE,
-    Sample,
-    Settings,
-    stateless,
-    to_signed_count,
-)
+    FrameSplitter, Protocol, Reading, ROOM_TEMPERATURE, Sample, Settings, stateless,
+    to_signed_count)
 from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _FORCE_PER_COUNT = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
