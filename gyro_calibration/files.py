@@ -40,6 +40,8 @@ MAX_MAGNITUDE = 1e20
 MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
 #: Largest depth of nested lists, names and messages, which the stack of Python holds.
 MAX_DEPTH = 10
+#: Longest wait for a program to write to a pipe, ms.
+_PIPE_TIMEOUT_MS = 900
 
 #: File type, other than a regular file -> its name.
 _FILE_TYPE_NAMES = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
@@ -135,10 +137,10 @@ def _require_regular_file(path: str | Path, mode: int, allow_pipes: bool = False
 
 
 def _has_writer(handle: int) -> bool:
-    """Tell whether a pipe has a writer, or gets one within 0.9 s."""
+    """Tell whether a pipe has a writer, or gets one within the timeout."""
     waiting = select.poll()
     waiting.register(handle, select.POLLIN)
-    if waiting.poll(900):
+    if waiting.poll(_PIPE_TIMEOUT_MS):
         return True
     try:
         os.read(handle, 1)

@@ -32,11 +32,16 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
 
+#: Least decrease of -2 ln likelihood for a further term. For white noise alone no further term is
+#: then found in 95 of 100 records.
+_TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALTERNATIVE_LIMIT = 6.0
 #: A combination that is likelier by this in -2 ln likelihood, but has too many terms, widens the
 #: bounds. At 0 those of the angle random walk are 6 to 35 % wider, and hold the truth as often.
 _WIDENING_LIMIT = 1.0
+#: Least p-value of the residuals of an accepted fit.
+_MIN_P_VALUE = 0.05
 #: Relative differences between the Allan deviations and the sum of the terms that are tried; the
 #: smallest sufficient one is used.
 _MISFIT_SHARES = (0.0, *np.geomspace(0.01, 0.32, 11).tolist())
@@ -141,18 +146,17 @@ class CombinationFit:
 
     def penalized_deviance(self) -> float:
         """Return -2 ln likelihood plus a penalty for each term."""
-        # At 10 a term, no further one is found in 95 of 100 records of white noise alone. The
-        # penalty of a ramp is larger, since in a single record a random walk looks like one. A
+        # The penalty of a ramp is larger, since in a single record a random walk looks like one. A
         # Gauss-Markov process counts as two terms.
         return (self.deviance
-                + 10.0 * (len(self.active_terms) + (_PROCESS in self.active_terms))
+                + _TERM_PENALTY * (len(self.active_terms) + (_PROCESS in self.active_terms))
                 + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
 
     def is_likely(self) -> bool:
-        """Return whether the p-value of the residuals is above 5 %."""
+        """Return whether the residuals are within chance."""
         normal, _ = self._normal_scores()
         freedom = len(normal) - len(self.active_terms) - (_PROCESS in self.active_terms)
-        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > 0.05
+        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _MIN_P_VALUE
 
     def estimate_squares(self, indices: Sequence[int]) -> tuple[Array, Array]:
         """Return the squared coefficients by least squares, of any sign, and their deviations."""

@@ -442,8 +442,12 @@ class Decimator:
             return
         stamps, samples = zip(*group, strict=True)
         begin = stamps[0]  # sums of seconds since 1970 would lose digits
-        known = ([value for sample in samples if (value := getattr(sample, name)) is not None]
-                 for name in ('output', 'temperature', 'specific_force'))
-        output, temperature, force = (fmean(values) if values else None for values in known)
+        output, *others = (_known_mean([getattr(sample, name) for sample in samples])
+                           for name in ('output', 'temperature', 'specific_force'))
         yield SampleMean(begin + fmean(stamp - begin for stamp in stamps),
-                         Sample(output or 0.0, temperature, specific_force=force), len(group))
+                         Sample(output or 0.0, others[0], specific_force=others[1]), len(group))
+
+
+def _known_mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None

@@ -30,6 +30,8 @@ import tty
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 
 _POLL_INTERVAL = 0.05  # s; interval of checks for a reader or a stop
+_SETTLING_DELAY = 0.2  # s; delay after a reader has opened the port, which then discards its input
+_LINGER_DURATION = 1.0  # s; delay before closing, which discards data that were not read
 
 
 class Emulator:
@@ -69,15 +71,8 @@ class Emulator:
         os.close(slave)
         os.set_blocking(self._master, False)
         self._reader_poll.register(self._master, select.POLLIN)
-        if self.link is None:
-            return
         try:
-            if self.link.exists() and not self.link.is_symlink():
-                raise FileExistsError(f'{self.link} is no link, so it is not replaced: give '
-                                      'another path for the link')
-            temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
-            os.symlink(self.path, temporary)
-            os.replace(temporary, self.link)
+            self._make_link()
         except OSError:
             self.close()
             raise
@@ -87,7 +82,7 @@ class Emulator:
         if self._wait_for_reader:
             while not self.has_reader() and not self._stop.wait(_POLL_INTERVAL):
                 pass
-            self._stop.wait(0.2)  # s; a program that has opened the port discards its input
+            self._stop.wait(_SETTLING_DELAY)
         self._send(self._protocol.preamble)
         encode, start, begin = self._protocol.encoder(self._settings), time.monotonic(), None
         for number, sample in enumerate(self._samples):
@@ -100,7 +95,7 @@ class Emulator:
             self._send(encode(sample if sample.sequence is not None
                               else replace(sample, sequence=number)))
         if self.has_reader():
-            self._stop.wait(1.0)  # s; closing discards what was not read
+            self._stop.wait(_LINGER_DURATION)
 
     def has_reader(self) -> bool:
         """Return whether a program has the port open; discard its output."""
@@ -132,6 +127,16 @@ class Emulator:
         self.stop()
         self._thread.join()
         self.close()
+
+    def _make_link(self) -> None:
+        if self.link is None:
+            return
+        if self.link.exists() and not self.link.is_symlink():
+            raise FileExistsError(f'{self.link} is no link, so it is not replaced: give another '
+                                  'path for the link')
+        temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
+        os.symlink(self.path, temporary)
+        os.replace(temporary, self.link)
 
     def _send(self, data: bytes) -> None:
         while data and not self._stop.is_set():

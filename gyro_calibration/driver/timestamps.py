@@ -86,6 +86,16 @@ class LowerLine:
             self.points[-1] = (x, y)
         else:
             return
+        self._fit()
+
+    def shift(self, start: float, offset: float) -> None:
+        """Shift the points from a height on along x, and drop points that they overtake."""
+        moved = [(x + offset, y) for x, y in self.points if y >= start]
+        first = moved[0][0] if moved else math.inf
+        kept = [(x, y) for x, y in self.points if y < start and x < first]
+        self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
+
+    def _fit(self) -> None:
         # the edge of the lower hull over the mean; of a single point the given slope remains
         hull = _lower_hull(self.points)
         middle = sum(x for x, _ in self.points) / len(self.points)
@@ -94,13 +104,6 @@ class LowerLine:
         self._anchor = left
         if right is not None and right[1] > left[1]:
             self.slope = (right[1] - left[1]) / (right[0] - left[0])
-
-    def shift(self, start: float, offset: float) -> None:
-        """Shift the points from a height on along x, and drop points that they overtake."""
-        moved = [(x + offset, y) for x, y in self.points if y >= start]
-        first = moved[0][0] if moved else math.inf
-        kept = [(x, y) for x, y in self.points if y < start and x < first]
-        self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
 
 def _lower_hull(points: Iterable[_Point]) -> list[_Point]:

@@ -179,6 +179,11 @@ def noise_before_rounding(variance: Array) -> Array:
     return np.interp(variance, noise + 1.0 / 12.0 - rounding_product(noise, np.zeros(1)), noise)
 
 
+#: Least share of the changes of an encoder heading that are not collinear with the two before; in
+#: a calculated motion, rates are constant or change evenly.
+_MIN_IRREGULAR_SHARE = 0.1
+
+
 def encoder_step(heading: Array) -> float:
     """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
     known = heading[np.isfinite(heading)]
@@ -186,8 +191,7 @@ def encoder_step(heading: Array) -> float:
     change = np.diff(known)
     changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
                           for each in (change, np.diff(change, 2)))
-    # a calculated motion has constant or evenly changing rates
-    return step if step and differing > 0.1 * changes else 0.0
+    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
 
 
 def find_runs(mask: Mask) -> list[slice]:

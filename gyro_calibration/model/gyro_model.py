@@ -30,6 +30,11 @@ _PLAUSIBLE_TEMPERATURES = (-100.0, 200.0)
 #: The response is inverted where the slope of the output over the rate is at least this, 1: noise
 #: is amplified up to ten times.
 _MIN_OUTPUT_SLOPE = 0.1
+#: Python floats need no error state of numpy; setting one for each sample would cost time.
+_NO_ERROR_STATE = nullcontext()
+#: Largest last step of a converged iteration, relative to 1 rad/s plus the rate; the error is much
+#: smaller.
+_STEP_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -376,11 +381,11 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
     """
     low, high = domain
     many = isinstance(output, np.ndarray)
-    # Python floats need no error state of numpy; setting one for each sample would cost time
-    with np.errstate(all='ignore') if many else nullcontext():
+    with np.errstate(all='ignore') if many else _NO_ERROR_STATE:
         # a single sample may leave the domain by at most 1 rad/s during the iteration
         rate, step = _iterate_secant(lambda x: output - error_at(x), start, low - 1.0, high + 1.0)
-        solved = (low <= rate) & (rate <= high) & (abs(step) <= 1e-10 * (1.0 + abs(rate)))
+        solved = ((low <= rate) & (rate <= high)
+                  & (abs(step) <= _STEP_TOLERANCE * (1.0 + abs(rate))))
     if solved.all() if many else solved:
         return rate, False
     with np.errstate(all='ignore'):

@@ -125,9 +125,7 @@ class CompensationNode(Node):
                      lambda message: self._pipeline.add_temperature(
                          _stamp_ns(message.header), message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
-        subscribe_to(self, Odometry, 'odom', lambda message: self._pipeline.add_odometry(
-            _stamp_ns(message.header), quaternion_heading(message.pose.pose.orientation),
-            _to_velocity(message.twist.twist)))
+        subscribe_to(self, Odometry, 'odom', self._on_odometry)
         subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
         if self._pipeline.values.calibration_drive:
             self._offer_velocity()  # calibrate reports a failure
@@ -138,6 +136,11 @@ class CompensationNode(Node):
             self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response)))
 
     # Subscriptions
+
+    def _on_odometry(self, message: Odometry) -> None:
+        heading = quaternion_heading(message.pose.pose.orientation)
+        self._pipeline.add_odometry(_stamp_ns(message.header), heading,
+                                    _to_velocity(message.twist.twist))
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
         self._pipeline.add_command(

@@ -41,6 +41,9 @@ _MIN_REPEAT_DURATION = 0.25  # s; repeated values that last as long are a fault
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
 _MAX_DECELERATION = 20.0  # rad/s²; of a robot: six times the default of Nav2's controllers
+#: Height of a pulse, in medians of the steps before it, that no vibration has: 5 of 1.2 million
+#: samples of cars and turntables are higher.
+_MIN_PULSE_RATIO = 10.0
 #: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
 #: path may vibrate for some time.
 _DECIDING_STRETCHES = 3
@@ -183,8 +186,7 @@ class PulseDetector:
         if self._steps and not 0.0 <= time - self._median_time < 0.05 * RECENT_DURATION:
             self._median_time = time
             self._median_step = float(np.median([size for _, size in self._steps]))
-        # 5 of 1.2 million samples of cars and turntables are above ten median steps
-        is_jump = abs(step) > _MAX_DECELERATION * interval + 10.0 * self._median_step
+        is_jump = abs(step) > _MAX_DECELERATION * interval + _MIN_PULSE_RATIO * self._median_step
         found = 0.0, 0
         if self._pulse and not 0.0 <= time - self._pulse[1] <= _MIN_REPEAT_DURATION:
             self._pulse = None

@@ -279,6 +279,7 @@ class Pipeline:
 
     @property
     def odometry_fault(self) -> str:
+        """Return why odometry does not show standstill; ''."""
         if self._clock.steady() - self._contradiction_time > 600.0:  # s
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
@@ -286,6 +287,7 @@ class Pipeline:
 
     @property
     def turn_fault(self) -> str:
+        """Return that the turns by the gyro and by odometry or commands do not agree; ''."""
         turns = self._turns
         return (f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check the '
                 f'unit and the sense of rotation of the gyro, and those of {turns.source}'
@@ -293,12 +295,14 @@ class Pipeline:
 
     @property
     def alternation_fault(self) -> str:
+        """Return that every other sample shows another turn; ''."""
         return ('every other sample on imu/data_raw shows another turn, as with two gyros on one '
                 'topic: give each gyro a topic of its own'
                 if self._alternate_turns.is_contradictory else '')
 
     @property
     def standstill_fault(self) -> str:
+        """Return that the gyro shows a turn while odometry shows standstill; ''."""
         return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
                 'the robot stands: unless others turn it, call calibrate_bias, or check odom'
                 if self._false_turn[1] else '')
@@ -391,6 +395,7 @@ class Pipeline:
 
     @property
     def frame_fault(self) -> str:
+        """Return that the samples are not in the frame of the first one; ''."""
         if self._frame == self._first_frame:
             return ''
         return to_printable(

@@ -41,7 +41,11 @@ AUTO = 'auto'  # name that stands for recognition by listening
 #: Bits per second, in order of the attempts: first the defaults of gyros, then others.
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 
+_MAX_BYTES = 8192  # number of last bytes that are used, which limits the cost
 _MIN_FRAMES = 3  # least number of frames; fewer may be chance
+_MIN_EXPLAINED_SHARE = 0.5  # least share of the bytes in frames; a line may damage the rest
+_MIN_IDENTICAL_SHARE = 0.95  # least share where all frames are equal: zeros may pass a weak check
+_AMBIGUITY_RATIO = 0.8  # the result is ambiguous if another format has this times the best share
 
 
 def find_protocol(name: str) -> Protocol:
@@ -69,14 +73,13 @@ def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recogni
     The settings may be incomplete for the recognized format. `csv` is recognized by the number of
     their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
     """
-    settings, data = settings or Settings(), data[-8192:]
+    settings, data = settings or Settings(), data[-_MAX_BYTES:]
     scores = [(*_explain(protocol, settings, data), protocol) for protocol in PROTOCOLS.values()]
     (share, frames, best), (next_share, _, second) = sorted(scores, key=lambda each: -each[0])[:2]
-    if next_share and next_share >= 0.8 * share:
+    if next_share and next_share >= _AMBIGUITY_RATIO * share:
         return Recognition(None, share, f'the bytes may be {best.name} or {second.name}: set '
                            'protocol')
-    # a line may damage half of the bytes; where all frames are equal, zeros may pass a weak check
-    least = 0.5 if len(set(frames)) >= _MIN_FRAMES else 0.95
+    least = _MIN_EXPLAINED_SHARE if len(set(frames)) >= _MIN_FRAMES else _MIN_IDENTICAL_SHARE
     if len(frames) >= _MIN_FRAMES and share >= least:
         following = f'; next is {second.name} with {next_share:.0%}' if next_share else ''
         return Recognition(best, share, f'{best.name} explains {share:.0%} of {len(data)} bytes, '

@@ -44,6 +44,7 @@ ASSUMED_FORCE_NOISE = 0.1
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
 _PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
+_MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
 
 
 @dataclass(frozen=True)
@@ -213,8 +214,8 @@ class Protocol:
 
     def sample_rate_warning(self, settings: Settings, period: float) -> str:
         """Return a warning if angles come at another period, s, than that of the sample rate."""
-        rate = self.nominal_rate(settings)  # the clocks of gyros are 2 to 3 % off
-        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= 0.05:
+        rate = self.nominal_rate(settings)
+        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MAX_RATE_DEVIATION:
             return ''
         return (f'the gyro sends {1.0 / period:.0f} samples per second, but angles are converted '
                 f'to rates by {rate:g}: set sample_rate')
