@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 import math
 from typing import Any
 
@@ -503,33 +502,33 @@ def _with_part_of_log(search: Search, causes: Causes) -> Causes:
     """
     Return causes with two steps of the bias that are significant together; nothing without them.
 
-    Where a bias differs in a part of a log, a random walk explains it about as well as one step.
+    Where a bias differs in a part of a log, a random walk explains it about as well as one step:
+    the steps are looked for in white noise too.
 
     """
-    steps = [each for each in search.candidates if each.cause == 'bias_step'][::2]
-    pairs = [pair for pair in combinations(range(len(steps)), 2)
-             if steps[pair[0]].log_index == steps[pair[1]].log_index]
     # without generic terms nothing tells a part from another structure in time
-    if not pairs or len(causes) + 2 > MAX_CAUSES or all(map(is_named, search.candidates)):
+    if ('bias_step' not in search.scanned_causes or len(causes) + 2 > MAX_CAUSES
+            or all(map(is_named, search.candidates))):
         return ()
-    fit = fit_causes(search.problem, causes)
-    columns = np.concatenate([candidate_transforms(each, fit.distorted) for each in steps])
-    evidence = column_evidence(fit, group_columns(
-        search.problem, columns / search.problem.deviation, pairs))
-    # with the best times, which are tried where the pair is likelier than chance
-    likely = 2.0 * math.log(MAX_STEP_TIMES)
-    least = likely - math.log(search.rate)
-    if evidence.max() < likely:
-        return ()
-    first, second = (replace(steps[place], penalty=math.log(MAX_STEP_TIMES))
-                     for place in pairs[int(evidence.argmax())])
-    for _ in range(2):
-        first = refine_shape(fit_causes(search.problem, [*causes, second]), first)[0]
-        second = refine_shape(fit_causes(search.problem, [*causes, first]), second)[0]
-    both = (*causes, first, second)
-    gain = fit_causes(search.problem, both).log_likelihood - fit.log_likelihood
-    left = eliminate_backward(search, refine_jointly(search, both))
-    return both if gain > least and len(left) == len(both) else ()
+    problem, score = search.problem, fit_causes(search.problem, causes).log_likelihood
+    white = replace(problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
+                    log_determinants=problem.log_determinants[:1])
+    for noise in (problem, white):
+        both = causes
+        for _ in range(2):
+            both = (*both, *(each for each, _ in find_steps(fit_causes(noise, both))))
+        if len(both) < len(causes) + 2:
+            continue
+        first, second = both[-2:]
+        for _ in range(2):
+            first = refine_shape(fit_causes(problem, [*causes, second]), first)[0]
+            second = refine_shape(fit_causes(problem, [*causes, first]), second)[0]
+        both = (*causes, first, second)
+        least = first.penalty + second.penalty - math.log(search.rate)
+        if (fit_causes(problem, both).log_likelihood - score > least and len(
+                eliminate_backward(search, refine_jointly(search, both))) == len(both)):
+            return both
+    return ()
 
 
 def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
