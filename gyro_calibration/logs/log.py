@@ -71,7 +71,7 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
-CACHE_BLOCK_SAMPLES = 1 << 14
+CACHE_BLOCK_SAMPLES = 1 << 15
 #: Rows in a block of a log.
 BLOCK_ROWS = 1 << 16
 #: Least interval between samples, s.
