@@ -228,7 +228,8 @@ def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
         stop = min(first + CACHE_BLOCK_SAMPLES, len(time))
         here, before = slice(first, stop), slice(first - 1, stop - 1)
         turned = rate[here] + rate[before]
-        turned *= 0.5 * (time[here] - time[before])
+        turned *= 0.5
+        turned *= time[here] - time[before]
         turned[0] += heading[first - 1]
         np.cumsum(turned, out=heading[here])
     return heading

@@ -25,7 +25,6 @@ heading also the earlier error of the heading.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -78,9 +77,9 @@ class RateIntegral:
 
     def with_sensitivity(self, sensitivity: Array) -> RateIntegral:
         """Return the integral with another sensitivity, (m,)."""
-        other = copy(self)
-        other.sensitivity = sensitivity
-        return other
+        return RateIntegral(
+            self.duration, self.angle, sensitivity, self.lost_variance, self.extra_noise_variance,
+            self.wander, self.block_count, self.block_square_sum, self.is_unobserved)
 
 
 @dataclass(frozen=True)
@@ -91,6 +90,13 @@ class Transition:
     retention: Array  # decay factor of each component, shape (n,)
     #: Covariance, shape (n, n); first row and column: of the integral of the rate, negated.
     process_noise: Array
+
+    @property
+    def matrix(self) -> Array:
+        """Return that of the state in motion, shape (n, n)."""
+        matrix = np.diag(self.retention)
+        matrix[HEADING_INDEX] -= self.observation
+        return matrix
 
 
 @dataclass(frozen=True)
@@ -123,10 +129,9 @@ class HeadingState:
     def propagate(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time in motion."""
         step = self.transition(rate_integral)
-        matrix = np.diag(step.retention)
-        matrix[HEADING_INDEX] -= step.observation
-        mean = step.retention * self.mean
-        mean[HEADING_INDEX] += rate_integral.angle - step.observation @ self.mean
+        matrix = step.matrix
+        mean = matrix @ self.mean
+        mean[HEADING_INDEX] += rate_integral.angle
         return HeadingState(self.noise, mean,
                             matrix @ self.covariance @ matrix.T + step.process_noise)
 
@@ -343,9 +348,7 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
         start, after, shared = state.measure_rest(rate_integral)
     else:
         step, start, after = state.transition(rate_integral), state, state.propagate(rate_integral)
-        transition = np.diag(step.retention)
-        transition[HEADING_INDEX] -= step.observation
-        shared = state.covariance @ transition.T
+        shared = state.covariance @ step.matrix.T
     # the pseudo-inverse of correlations, as variances may be zero and of any size
     size = np.sqrt(np.diagonal(after.covariance))
     size = np.where(size > 0.0, size, 1.0)

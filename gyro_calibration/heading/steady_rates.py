@@ -55,6 +55,12 @@ class _SteadyRate:
     turn: RateIntegral
     end_time: float  # s
     step_count: int  # a single step does not tell whether its rate is steady
+    is_possible: bool  # within the prior of the bias; else it is certainly a turn
+
+    @property
+    def is_candidate(self) -> bool:
+        """Tell whether it may be that of a rest."""
+        return self.step_count > 1 and self.is_possible
 
 
 class SteadyRates:
@@ -80,18 +86,21 @@ class SteadyRates:
         row = turn.sensitivity / turn.duration
         prior = float(row @ self._covariance @ row)
         last, freedom = self._last, turn.block_count - 1
-        if (prior < white or rate ** 2 > sigmas ** 2 * (prior + white / turn.duration)
+        if (prior < white
                 or not is_rest and freedom > 0 and turn.block_square_sum - turn.angle * rate
                 > white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas)))):
             self.end()
             return False
+        count = 1 + is_rest
         if last is not None and (rate - last.turn.angle / last.turn.duration) ** 2 < (
                 sigmas ** 2 * white * (1.0 / turn.duration + 1.0 / last.turn.duration)):
-            self._last = _SteadyRate(last.turn + turn, time, last.step_count + 1 + is_rest)
+            turn, count = last.turn + turn, last.step_count + count
         else:
             self.end()
-            self._last = _SteadyRate(turn, time, 1 + is_rest)
-        return self._last.step_count > 1
+        # of the whole: parts of one rate at the limit would confirm each other
+        self._last = _SteadyRate(turn, time, count, turn.angle ** 2 < sigmas ** 2 * turn.duration
+                                 * (prior * turn.duration + white))
+        return self._last.is_candidate
 
     def remove(self, turn: RateIntegral) -> None:
         """Remove the end of the last steady rate, which was no rest."""
@@ -103,13 +112,13 @@ class SteadyRates:
 
     def end(self) -> None:
         """End the last steady rate."""
-        if self._last is not None and self._last.step_count > 1:
+        if self._last is not None and self._last.is_candidate:
             self._ended.append(self._last)
         self._last = None
 
     def compare(self, state: HeadingState, sigmas: float) -> tuple[float, float] | None:
         """Update `variance`; return the change to a likelier bias, rad/s, and its variance."""
-        rates = [*self._ended, *([self._last] if self._last and self._last.step_count > 1 else [])]
+        rates = [*self._ended, *([self._last] if self._last and self._last.is_candidate else [])]
         noise, count = state.noise, len(rates)
         if count < 2:
             return None

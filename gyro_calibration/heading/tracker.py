@@ -99,6 +99,8 @@ NOISE_TOLERANCE = 1.25
 _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
 #: Last blocks of a rest in memory, among which its end is located.
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
+#: Last blocks in motion that may be held for a rest.
+_MAX_WINDOW_BLOCKS = round(WINDOW_DURATION / BLOCK_DURATION) + 2
 #: States of a rest in memory.
 _MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 1
 
@@ -505,13 +507,15 @@ class HeadingTracker:
         whole = RateIntegral(
             float(durations.sum()), float(angles.sum()), rows.sum(axis=0), block_count=passed,
             block_square_sum=float(squares.sum()))
-        blocks = [RateIntegral(duration, angle, row, block_count=1, block_square_sum=square)
-                  for duration, angle, row, square in zip(
-                      durations.tolist(), angles.tolist(), rows, squares.tolist())]
+        last = slice(-_MAX_WINDOW_BLOCKS if not self.is_resting else None, None)
+        (self._rest_blocks if self.is_resting else self._recent_blocks).extend(
+            RateIntegral(duration, angle, row, block_count=1, block_square_sum=square)
+            for duration, angle, row, square in zip(
+                durations[last].tolist(), angles[last].tolist(), rows[last],
+                squares[last].tolist()))
         turned = self._corrected_angle(whole)
         if self.is_resting:
             self.deleted_heading += turned
-            self._rest_blocks.extend(blocks)
         else:
             decayed = float(piece.block_retentions[here].prod())
             self.heading += turned + self._pending_correction * (1.0 - decayed)
@@ -523,7 +527,6 @@ class HeadingTracker:
                 self._unbiased_sensitivity(until, turn.sensitivity + np.cumsum(rows, axis=0),
                                            None if piece.still is None else piece.still[ends])))
             self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
-            self._hold_blocks(*blocks)
         self._open_integral += whole
         self._open_variance = None
         end = piece.block_stops[number + passed - 1] - 1
@@ -720,7 +723,7 @@ class HeadingTracker:
         if wheels:
             # a constant turn has the energy of a rest: no blocks are held while wheels move
             self._enter_motion(WINDOW_DURATION)
-        self._hold_blocks(part)
+        self._hold_block(part)
         beyond = self._open_integral.duration - self._held_integral.duration
         if beyond >= _STEP_DURATION - TIME_TOLERANCE:
             self._advance_state(self._held_integral)
@@ -743,9 +746,9 @@ class HeadingTracker:
         self._open_variance = None
         return part
 
-    def _hold_blocks(self, *parts: RateIntegral) -> None:
+    def _hold_block(self, part: RateIntegral) -> None:
         """Hold the last blocks, which may be the begin of a rest."""
-        self._recent_blocks.extend(parts)
+        self._recent_blocks.append(part)
         held = sum(each.duration for each in self._recent_blocks)
         least = self._quiet_duration - TIME_TOLERANCE
         while (len(self._recent_blocks) > 2
@@ -788,11 +791,13 @@ class HeadingTracker:
         suspected, held = self._suspected_turn, self._with_still_sensitivity(self._held_integral)
         if suspected is None:
             return False
+        if suspected.rate_integral.duration + held.duration < _SLOW_TURN_DECISION_TIME:
+            suspected.rate_integral += held
+            return False
         start = suspected.snapshot.state.with_added_variance(WALK_INDEX, suspected.rate ** 2)
         moved = start.advance_at_rest(self._with_still_sensitivity(suspected.rate_integral))
-        most = self._sigmas[self._quiet_duration]
-        if (suspected.rate_integral.duration + held.duration < _SLOW_TURN_DECISION_TIME
-                or abs(self._normalized_innovation(moved, held)) > most):
+        if (abs(self._normalized_innovation(moved, held))
+                > self._sigmas[self._quiet_duration]):
             suspected.rate_integral += held
             return False
         if self._keeps_steps:

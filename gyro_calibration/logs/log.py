@@ -52,7 +52,7 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
-CACHE_BLOCK_SAMPLES = 1 << 14
+CACHE_BLOCK_SAMPLES = 1 << 15
 BLOCK_ROWS = 1 << 16  # rows in a block of a log
 MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
 #: Largest number of characters of a line; and of notes and header, of a block of lines, or of a

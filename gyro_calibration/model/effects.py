@@ -180,11 +180,11 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     def scale_inputs(channels: Channels, output_centre: float, output_scale: float,
                      temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
         output = channels.output - output_centre
-        output /= output_scale
+        output *= 1.0 / output_scale
         if not temperature_order:  # the temperature may be unknown
             return output, 0.0 * output
         temperature = channels.temperature - temperature_centre
-        temperature /= temperature_scale
+        temperature *= 1.0 / temperature_scale
         return output, temperature
 
     def columns(channels: Channels, *shapes: float) -> Sequence[Number]:

@@ -80,6 +80,12 @@ def test_rests_alone_leave_no_ambiguity():
     assert deviation.max() < 1.0
 
 
+def test_a_turn_at_the_limit_of_the_prior_counts_once():
+    """With the bias it is at 6.1 sigma, which its steps cross: parts would confirm each other."""
+    error, deviation = followed([(10, 0), (60, -2.854), (20, 9.0), (20, -7.0)])
+    assert np.abs(error).max() < 2.0 and (np.abs(error) <= 3.0 * deviation).all()
+
+
 def estimator():
     model = GyroModel(noise=NOISE)
     return HeadingEstimator(model, BiasTable(model), ASSUMED, Settings(), 1.7e9)
