@@ -33,6 +33,7 @@ from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_outpu
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import (
+    compare_headings,
     compare_output,
     fit_line,
     identify_unit_factor,
@@ -40,6 +41,7 @@ from gyro_calibration.diagnosis.gates import (
     LineFit,
     model_scale_factor,
     OutputComparison,
+    reference_angle,
     reference_rate,
     resample_reference,
     select_reference,
@@ -445,7 +447,7 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         own = 1.0 if model is None else model_scale_factor(model, rate)
         ratio, deviation = line.factor / own, line.deviation / abs(own)
         name = identify_unit_factor(ratio, deviation)
-        if name is not None:
+        if name is not None and not _is_refuted_by_spans(log, UNIT_FACTORS[name]):
             factor = 1.0 / UNIT_FACTORS[name]
             units = [_sized_finding(
                 'unit_error', ratio, NORMAL_QUANTILE_975 * deviation,
@@ -461,6 +463,20 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     found = DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
                         heading_step=_reference_step(log))
     return _check_samples(found, compare_output(output * factor, expected), model, log)
+
+
+def _is_refuted_by_spans(log: Log, factor: float) -> bool:
+    """
+    Tell whether the headings over spans agree with 1 rather than with a factor of the output.
+
+    Of a motion that is late, a rate shows less than its turns do.
+
+    """
+    spans = [] if log.time is None else compare_headings(log, reference_angle(log))
+    best = max(spans, key=lambda each: each.coherence, default=None)
+    return best is not None and (
+        abs(best.factor - 1.0) < abs(best.factor - 1.0 / factor)
+        and abs(best.factor - 1.0 / factor) > 5.0 * best.deviation)
 
 
 def _follow_corners(log: Log, rate: Array, line: LineFit) -> Array:
