@@ -19,7 +19,6 @@ says where it is missing) and plain numpy on cumulative sums. Times are medians 
 taken in turn. With --study, N, B, K, Q and R are fitted to simulated records of 200 000 samples;
 the table states how often each is detected and how often its 95 % bounds hold. Prints tables in
 Markdown.
-
 """
 
 from __future__ import annotations

@@ -18,7 +18,6 @@ flipped. The gyro turns at one rate, so each other rate is wrong. Formats with a
 rate, those with a sum few, and lines of text any that still reads as a number; there a full scale
 that fits the robot, here 1.5 rad/s, rejects the largest. Needs neither port nor ROS; takes a
 minute.
-
 """
 
 from collections.abc import Iterator

@@ -20,7 +20,6 @@ deviation of 0.03 deg/s/K (by default), constant over temperature (linear) or a 
 50 degC (cubic). 2 % of the rests are outliers, off by 0.1 to 1 deg/s. The table is evaluated at
 the start of each run, and in its middle up to 8 K away from the temperature there. Prints two
 tables in Markdown, in percent and deg/s. Each row has noise of its own.
-
 """
 
 from __future__ import annotations
@@ -87,7 +86,6 @@ def simulate(generator, curve, runs=6, rests=30, turn_on=None, outliers=0.02, ju
     Each begins between 10 and 25 degC and warms up by 3 to 20 K. Flicker, random walk and ageing
     go on between the runs; the bias turns on anew each day. An outlier is off by 0.1 to 1 deg/s.
     A jump comes early in the middle run, and stays.
-
     """
     prior = prior or Prior()
     turn_on = prior.turn_on if turn_on is None else turn_on

@@ -15,7 +15,6 @@ A Kalman filter and smoother is given the exact times of rest. It takes what the
 scale factor, bias and flicker from the calibration and from the rests. So it bounds the accuracy
 of a program that must detect the rests by itself. It shares nothing with the package but the
 noise figures.
-
 """
 
 from __future__ import annotations
@@ -74,7 +73,6 @@ def prior(noise: Noise, scale: float, bias: float) -> tuple[Array, Array]:
     Return mean and covariance of a state before anything is known.
 
     It is the correction of the heading, rad, scale factor error, bias, rad/s, and flicker.
-
     """
     flicker = noise.bias_instability ** 2 * math.log(RATIO) / math.pi
     return np.zeros(3 + len(CONSTANTS)), np.diag(

@@ -21,7 +21,6 @@ table of the means of the dwells. The noise of a sample is a multiple of the ste
 kind and noise, the share of biases b and scale factor errors s within their 95 % intervals, of
 `fit` with all that it chooses and of these effects alone, how many are more than 5 standard
 deviations off, and how often another effect of the rate is taken.
-
 """
 
 from __future__ import annotations

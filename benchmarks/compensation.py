@@ -19,7 +19,6 @@ on blocks that fit the cache, with nothing else done. All take turns in one run,
 several times counts, to which other programs add least.
 Then follows the cost of a sample for logs of 1e4 to 1e7, and of single samples, as on the robot.
 Prints tables in Markdown.
-
 """
 
 from __future__ import annotations

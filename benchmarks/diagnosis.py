@@ -43,7 +43,6 @@ prints each failed one. Parts:
     A scale factor error of the gyro and one of the reference are the same in any log, and count as
     one. The diagnosis is given no model, except for effects that show only against one: bias,
     scale factor, and noise; that model is right but for what is hidden.
-
 """
 
 from __future__ import annotations

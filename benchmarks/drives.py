@@ -144,7 +144,6 @@ def begun_any_time(way: Path, generator: np.random.Generator) -> Path:
     Return a path that begins up to `GRID` later.
 
     So corners are not at the edges of blocks of samples, where a robot would not put them.
-
     """
     late = int(generator.integers(round(GRID / STEP)))
     rate, moving = (np.append(np.append(np.zeros(late), each[:len(each) - 1 - late]), 0.0)

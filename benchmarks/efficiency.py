@@ -32,7 +32,6 @@ estimator that uses the steps may be better than both.
 
 With `methods`, the three methods of self-calibration are compared on simulated runs of the Epson
 XV-3500: the rms errors of docs/explanation/self_calibration.md.
-
 """
 
 from __future__ import annotations
@@ -91,7 +90,6 @@ def bound(step: float, noise: float, rests: bool) -> Array:
     The encoder has one error for each rest, or one for each sample. The integral of the rate by
     the trapezoid rule has the noise of a random walk, except that each sample counts half at
     either side.
-
     """
     half = np.eye(len(TIME)) + np.eye(len(TIME), k=-1)
     half[0] = 0.0

@@ -27,7 +27,6 @@ of 2 to 20 s; b is compared with its mean. The simulator shares nothing with the
 With `smoothings`, 30 s of swings of one frequency (0.05 to 0.6 Hz) and of a robot, beside a
 reference with noise of 0.003 deg that was delayed or smoothed before, or an encoder of such a
 shaft.
-
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ lost time.
 An error is the root mean square over all drives and all minutes of a drive. Its growth is paired
 with the clean run of the same drive; its 95 % interval is by bootstrap over the drives. The added
 error is the root mean square of the difference from the clean run.
-
 """
 
 import argparse

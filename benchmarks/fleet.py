@@ -14,7 +14,6 @@ A fleet: predicted drives, variances, alarms, smallest effects, slow effects, sc
     python benchmarks/fleet.py drives FOLDER [OUT]    # rc_car_*.csv.gz of the wheeled drives
     python benchmarks/fleet.py first FOLDER [OUT]     # 20 s of each, with and without a prior
     python benchmarks/fleet.py variances slopes alarms smallest slow scale prior
-
 """
 
 from __future__ import annotations
@@ -31,20 +30,10 @@ from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.fleet.logs import find_logs, fit_slow_effects, LogTask, process_log
 from gyro_calibration.fleet.pooling import (
-    DRIVES,
-    Observations,
-    PooledValue,
-    POWER_ONS,
-    SLOPES,
-    UNITS,
-)
+    DRIVES, Observations, PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models,
-    count_effects,
-    find_missing_effects,
-    summarize_types,
-)
+    build_models, count_effects, find_missing_effects, summarize_types)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, read_log, select_rows
@@ -154,7 +143,6 @@ def first(folder: str, out: str = '') -> Iterator[str]:
 
     The model of the type is that of the other units. The heading by the model that comes out is
     compared with the course over the next 60 s.
-
     """
     records = _processed(folder, out)
     error: dict[str, list[float]] = {}

@@ -20,7 +20,6 @@ sum of four sines, or a random rate of bandwidth 0.1 Hz. Logs have 4 to 13 min a
 gyro has s of 0.3 %, b of 0.1 deg/s, white noise of 0.0004 to 0.04 deg/s/√Hz and no other effect;
 every log is diagnosed with and without a random walk that exceeds that noise after 0.5 to 20 s.
 Prints, for each, the errors of s in standard deviations and the causes that are not there.
-
 """
 
 import collections

@@ -19,7 +19,6 @@ before it to 1 s after it; the model always states the noise of the XV3500. The 
 its number. Each robot has a delay of 0 to 1 s, a first-order lag of 0 to 0.2 s, a wobble from the
 turn of its wheels (0 to 0.1 deg at 0.5 to 2 Hz while it turns) and a shake (0 to 0.5 deg/s at 5 to
 30 Hz). Prints tables in Markdown.
-
 """
 
 from __future__ import annotations
@@ -33,11 +32,7 @@ from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    constant_rate_motion,
-    Motion,
-    motion_from_rates,
-)
+    CALIBRATION_MOTION, constant_rate_motion, Motion, motion_from_rates)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np

@@ -22,7 +22,6 @@ whose input is printed in hex. The exit code is 1 if there is a fault.
 
 The share of lines is that of a target's files reached by the inputs that were kept, when they are
 run once more.
-
 """
 
 from __future__ import annotations

@@ -30,7 +30,6 @@ at its end.
 
 `--only` selects the rows whose names match a regular expression, `--courses` courses alike. The
 row of a missing package says so. Prints tables in Markdown.
-
 """
 
 from __future__ import annotations
@@ -45,10 +44,7 @@ import re
 import bounds
 from drives import Course, COURSES, Drive, GYROS, simulate, slow_path
 from gyro_calibration.calibration.self_calibration import (
-    fit_heading,
-    self_calibrate,
-    to_model_record,
-)
+    fit_heading, self_calibrate, to_model_record)
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.heading.log_compensation import smooth_track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings

@@ -25,7 +25,6 @@ with its standard error by the scatter between drives, in which looks are not in
 share of the oracle shows by how much such a sample of drives differs from 95 % by chance. z is the
 rms error at the end of a drive over the stated standard deviation.
 The oracle of drives without rests has the calibration alone.
-
 """
 
 from __future__ import annotations

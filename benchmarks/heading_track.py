@@ -45,7 +45,6 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     The compensated rates, rad/s, have shape (n,), their sensitivity to the values of the
     calibration (m, n); wheels state whether something moves the robot. All else is as in
     `HeadingTracker`.
-
     """
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
     found = tracker.follow(time, rate, np.ascontiguousarray(sensitivity.T), wheels, still)

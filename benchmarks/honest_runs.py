@@ -21,7 +21,6 @@ within their 95 % intervals, the median standard deviations, and how many were a
 standard deviations off. The bias is compared with its mean over the rest after
 the profile. A run is checked by the rest after it, as the command line does; of the kinds named
 so, the log ends 0.5 s after the profile.
-
 """
 
 from __future__ import annotations
@@ -32,11 +31,7 @@ import math
 import sys
 
 from gyro_calibration.calibration.self_calibration import (
-    check_end,
-    check_rest,
-    find_rest_after,
-    self_calibrate,
-)
+    check_end, check_rest, find_rest_after, self_calibrate)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.motion import motion_from_headings, motion_from_rates
 from gyro_calibration.model.noise import Noise

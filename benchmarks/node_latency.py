@@ -22,7 +22,6 @@ sample, each with a subscriber. The relay computes nothing.
 
 Then the driver reads an emulated DSP-3000 on a pseudo-terminal. It takes 80 s in all and needs two
 idle cores; nothing leaves the machine.
-
 """
 
 from collections.abc import Iterator

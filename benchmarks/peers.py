@@ -15,7 +15,6 @@ Install them by ``pip install vqf imufusion``. None of them knows a scale factor
 the rates after the calibration, and its uncertainty of the bias; and also the raw rates, from
 which they estimate the bias by themselves. The gyro's axis is vertical, and the accelerometer has
 no error. The settings are the published ones, and the best that `tuned` finds.
-
 """
 
 from __future__ import annotations
@@ -85,7 +84,6 @@ def _yaw(quaternions: Array) -> Array:
 
     The programs take each rate for that of the interval before it. The mean of two headings is
     that of the trapezoid rule, which removes their delay of half an interval.
-
     """
     after = np.unwrap(2.0 * np.arctan2(quaternions[:, 3], quaternions[:, 0]))
     before = np.concatenate([after[:1], after[:-1]])
@@ -129,7 +127,6 @@ def bias_average(drive: Drive, rate: Array, deviation: float | None,
 
     A rate counts if it differs little from the average and from the one before. So does the
     complementary filter of imu_tools, as long as the accelerometer shows gravity alone.
-
     """
     threshold, change, gain = (settings['threshold'] * DEGREE, settings['change'] * DEGREE,
                                settings['gain'])

@@ -24,7 +24,6 @@ unknown to the fit.
 
 Prints a table in Markdown; n runs determine a standard deviation to 1 / sqrt(2 n), 200 runs to 5
 %, and a mean heading error to about 5 %.
-
 """
 
 from __future__ import annotations
@@ -36,18 +35,10 @@ import sys
 
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.motion_design import (
-    CalibrationForecast,
-    find_best_motion,
-    plain_motion,
-    RobotLimits,
-)
+    CalibrationForecast, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    constant_rate_motion,
-    Motion,
-    ROBOT_MOTION,
-)
+    CALIBRATION_MOTION, constant_rate_motion, Motion, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np

@@ -74,7 +74,6 @@ def calibrate(number: int) -> tuple[float, int, float]:
     Return the bias of a simulated log by least squares: a task of a fleet; below 0 it is killed.
 
     Also returned are the number of the process, and the time that it has computed for, s.
-
     """
     if number < 0:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -38,7 +38,6 @@ established causes of `diagnose`; below them, for each axis, chi-squared of the 
 of all logs against their weighted mean, and of the biases against the means of the output at rest,
 where these are known. For cars and halves, each half is fitted and tested on the other one, as in
 `wild.py`.
-
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ deg/s, tested at 30 to 50 degC and up to 100 deg/s. Prints the root mean square 
 rate beside weighted least squares of bias, scale factor, its slope over temperature and a sine,
 and the root mean square of z, the mean error of a sweep over the mean stated standard deviation: 1
 where the statement is true.
-
 """
 
 from __future__ import annotations
@@ -44,20 +43,10 @@ from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.compensation import (
-    compensate,
-    quadratic_form,
-    rate_sensitivity,
-    uncertainty_covariance,
-)
+    compensate, quadratic_form, rate_sensitivity, uncertainty_covariance)
 from gyro_calibration.model.effects import (
-    BIAS,
-    CUBIC_NONLINEARITY,
-    Effect,
-    rate_temperature_polynomial,
-    SCALE_FACTOR_ERROR,
-    SCALE_FACTOR_TEMPERATURE,
-    SINE_RESPONSE,
-)
+    BIAS, CUBIC_NONLINEARITY, Effect, rate_temperature_polynomial, SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy.optimize import least_squares

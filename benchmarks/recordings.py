@@ -28,7 +28,6 @@ the calibration, and the noise of the same kind of gyro at rest.
 The second one compares no calibration, plain least squares on increments over 0.5 s (delay on a
 grid), and the verb `fit` (`calibrate_encoder`): rms of the error about its mean, the delay being
 the one that fits best; also with refusals as nothing, and how often an answer is worse than none.
-
 """
 
 from __future__ import annotations

@@ -19,7 +19,6 @@ effect, the second one gyro with several effects for each kind of scatter. Print
 Markdown: the share of the runs (400, or as given) with the truth of each value inside its
 interval, the mean over the values of a gyro and the lowest and highest of them, and the same for
 the compensated rates over the whole range.
-
 """
 
 from __future__ import annotations
@@ -32,24 +31,11 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import (
-    compensate,
-    quadratic_form,
-    rate_sensitivity,
-    uncertainty_covariance,
-)
+    compensate, quadratic_form, rate_sensitivity, uncertainty_covariance)
 from gyro_calibration.model.effects import (
-    BIAS,
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    Channels,
-    CUBIC_NONLINEARITY,
-    polynomial_from_matrix,
-    QUADRATIC_NONLINEARITY,
-    SCALE_FACTOR_ASYMMETRY,
-    SCALE_FACTOR_ERROR,
-    SCALE_FACTOR_TEMPERATURE,
-    SINE_RESPONSE,
-)
+    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, Channels, CUBIC_NONLINEARITY,
+    polynomial_from_matrix, QUADRATIC_NONLINEARITY, SCALE_FACTOR_ASYMMETRY, SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 import numpy as np
 

@@ -19,7 +19,6 @@ happens. A row states the turn of the robot since, the time until the last comma
 followed by a zero, the error of the heading and its stated standard deviation, the worst
 diagnostics since the fault and the answer of the service. All faults take 6 min; nothing leaves
 the machine.
-
 """
 
 import argparse
@@ -103,7 +102,6 @@ class RosRobot:
     those that came, with their times, `headings` the true ones by the stamp, ns, and `moments` by
     the steady clock. A fault sets that `clock_stands`, with the stamps; `also` is called with each
     Imu message: a second driver.
-
     """
 
     def __init__(self, node, robot, speed=None):

@@ -25,7 +25,6 @@ second tenth, for the first one is the warm-up.
 At the full line rate the baud rate determines the number of samples. A driver that gets more than
 1 kHz publishes means of several samples; the heading at the end, compared with the angle that the
 emulated gyro has turned, shows that none of them was lost on the way.
-
 """
 
 import argparse

@@ -17,7 +17,6 @@ Each log has 15 min of 1 s means, and one effect with its true shape is the only
 size is a multiple of 4.8 standard deviations of an estimate with known noise, of which 97.6 % are
 found at 1.2 times. The evidence is that of the search, averaged over its grid of noises. The
 columns `level` are the false alarms without the effect over the nominal rate of one cause.
-
 """
 
 import argparse

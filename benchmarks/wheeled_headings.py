@@ -24,7 +24,6 @@ is the median of the first 20 s of the course. The table has the median and the 
 the error over the drive, the median over the last 20 s, and for this program the share of the
 course inside of the stated 95 %, where the course has an error of its own: 1 deg for cars, 3 deg
 for RC cars, plus what is turned in 0.2 s, for side slip and smoothing.
-
 """
 
 from __future__ import annotations

@@ -26,7 +26,6 @@ The simulated car follows a bicycle model with side slip, its course comes at 10
 some tenths of a second, late or early, with noise that is correlated over a second, gaps below a
 walking speed and under bridges. The gyro has bias, scale factor error, white noise and a wandering
 bias. None of it is code of the package.
-
 """
 
 from __future__ import annotations
@@ -168,7 +167,6 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
 
     A car in town (little turning, stops, bursts of bad fixes, bias near zero) or a small quick one
     (turns all the time, a consumer gyro, another delay each drive).
-
     """
     count = 240 * RATE
     time = np.arange(count) / RATE

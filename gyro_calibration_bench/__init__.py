@@ -18,5 +18,4 @@ A public bench for methods that name the causes of a gyro's error in a log with 
 imports that package; all else needs NumPy, SciPy and tqdm.
 
 Reading order: `hidden` (the generator), `cases`, `scores`, `methods`.
-
 """

@@ -13,7 +13,6 @@ Cases of the bench: hidden effects, noise and reference of each.
 
 A case has a name, such as ``effects/warm_up/2/mixed/rate/0``; its random numbers depend on the
 name and a seed alone.
-
 """
 
 from __future__ import annotations
@@ -24,14 +23,7 @@ import math
 import zlib
 
 from gyro_calibration_bench.hidden import (
-    FORMS,
-    HiddenLog,
-    hide,
-    hide_look_alike,
-    LOOK_ALIKES,
-    OUTSIDE_CATALOGUE,
-    record_separating,
-)
+    FORMS, HiddenLog, hide, hide_look_alike, LOOK_ALIKES, OUTSIDE_CATALOGUE, record_separating)
 from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 import numpy as np

@@ -16,7 +16,6 @@ that it names and whether there is unexplained structure.
 The two baselines use the formulas of the generator, on means over half a second, and assume white
 noise. They have no columns for faults of samples, noise figures, saturation, quantization, slips,
 tones, and a wrong unit.
-
 """
 
 from __future__ import annotations

@@ -94,7 +94,6 @@ def interval_holds(causes: Iterable[Cause], findings: Sequence[NamedCause],
     The size of a wave has no sign if it has a phase. Counted faults have no interval, a wrong unit
     has no size, and flicker in addition to a Gauss-Markov process has none that an Allan deviation
     determines.
-
     """
     by_name = {each.effect: each for each in findings}
     holds = {}

@@ -18,7 +18,6 @@ There is one file for each source; `finding` holds the common records. Published
 units of their source. Each file has a function ``reproduce(generator, runs, progress)``: the
 generator of the noise; the number of simulated drives or turntable runs (a twentieth of it for
 calibrations on a rate table); and a display of the progress.
-
 """
 
 from gyro_calibration_reproduction import bot_thoughts, hong_park, ojeda_chung_borenstein

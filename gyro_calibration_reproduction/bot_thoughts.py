@@ -12,7 +12,6 @@
 Bot Thoughts (blog): gyro calibration on a turntable and on a turntable with an encoder.
 
 Counts, deg/s and per cent are as in the source; rates are computed in SI and converted.
-
 """
 
 from __future__ import annotations
@@ -23,18 +22,10 @@ from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_rate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE, Progress
-from gyro_calibration.model.motion import (
-    constant_rate_motion,
-    Motion,
-    motion_from_headings,
-)
+from gyro_calibration.model.motion import constant_rate_motion, Motion, motion_from_headings
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
-    Comparison,
-    Contradiction,
-    from_own_figures,
-    Reproduction,
-)
+    Comparison, Contradiction, from_own_figures, Reproduction)
 from gyro_calibration_reproduction.hong_park import solve_equation_7
 import numpy as np
 from scipy.stats import linregress
@@ -162,7 +153,6 @@ def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
     squares of the encoder's gradient on the gyro; the same by likelihood; of the scale of the
     reverse regression; the largest of the heading after the method of the solver, rad; scale and
     offset by least squares of headings.
-
     """
     time, rate, motion = encoder_log(generator)
     gradient, likely = fit_rate(time, rate, motion), fit_likelihood(time, rate, motion, 0.1)

@@ -13,7 +13,6 @@ Hong and Park (2008), heading of indoor mobile robots by a MEMS gyro.
 
 Source: "Minimal-drift heading measurement using a MEMS gyro for indoor mobile robots", Sensors 8.
 Published numbers are in their units; numbers here are computed in SI and converted.
-
 """
 
 from __future__ import annotations
@@ -26,19 +25,11 @@ from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate,
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.logs.log import Array, DEGREE, Progress
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    Motion,
-    motion_from_rates,
-    ROBOT_MOTION,
-)
+    CALIBRATION_MOTION, Motion, motion_from_rates, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.finding import (
-    Comparison,
-    Contradiction,
-    from_own_figures,
-    Reproduction,
-)
+    Comparison, Contradiction, from_own_figures, Reproduction)
 import numpy as np
 
 TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile '
@@ -87,7 +78,6 @@ def measured_figures(generator: np.random.Generator) -> tuple[float, ...]:
 
     Return the angle random walk, deg/√h, and the bias instability, deg/h, by an hour at rest; the
     scale factor error, %, by 22 rates of 10 s each; and the peak-to-peak noise of 1 s, deg/s.
-
     """
     interval = 1.0 / GYRO_SAMPLE_RATE
     rest = simulate_noise(XV3500.noise, 3600 * round(GYRO_SAMPLE_RATE), interval, generator)
@@ -155,7 +145,6 @@ def published_motion() -> Motion:
 
     Its length makes that of s, its speed that of b. The corners are at samples, so that the
     trapezoid rule is exact.
-
     """
     durations = np.arange(60, 120) / REFERENCE_SAMPLE_RATE
     duration = min(durations,
@@ -302,7 +291,6 @@ def drive_errors(generator: np.random.Generator) -> Array:
     Return the absolute heading errors of a simulated drive, deg, by each of `METHODS`.
 
     They are means and standard deviations over the drive, shape (2, methods).
-
     """
     time, output = noisy_output(FULL_MOTION, XV3500.noise, generator)
     run = time <= CALIBRATION_MOTION.duration

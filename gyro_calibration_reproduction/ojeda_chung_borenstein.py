@@ -13,7 +13,6 @@ Ojeda, Chung and Borenstein (2000), rate-table calibration of fibre-optic gyros.
 
 Source: "Precision calibration of fiber-optics gyroscopes for mobile robot navigation", ICRA.
 Published numbers are in their units; numbers here are computed in SI and converted.
-
 """
 
 from __future__ import annotations
@@ -25,22 +24,12 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import fit_effects, Scatter
 from gyro_calibration.logs.log import Array, DEGREE, Progress
 from gyro_calibration.model.effects import (
-    BIAS,
-    BIAS_TEMPERATURE,
-    Effect,
-    rate_temperature_polynomial,
-    SCALE_FACTOR_ERROR,
-    SCALE_FACTOR_TEMPERATURE,
-    SINE_RESPONSE,
-)
+    BIAS, BIAS_TEMPERATURE, Effect, rate_temperature_polynomial, SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
-    Comparison,
-    Contradiction,
-    from_own_figures,
-    Reproduction,
-)
+    Comparison, Contradiction, from_own_figures, Reproduction)
 import numpy as np
 
 TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for '
@@ -131,7 +120,6 @@ def calibrate_and_turn(generator: np.random.Generator) -> Array:
 
     Return the rms error of the rate, rad/s, and the largest error of a turn, rad, without a model
     and with each, shape (1 + campaigns, 2).
-
     """
     gyro = rd2100()
     tables = (simulate_rate_table(gyro, full_range_rates(rates),
@@ -270,7 +258,6 @@ def regressor_error(deviation: float, averaged: int, generator: np.random.Genera
 
     The deviation is that of a sample, rad/s; `averaged` samples are a data set, `samples` are
     taken at each rate.
-
     """
     rates = np.repeat(full_range_rates(21), samples // averaged)
     clean = rd2100().output(rates, MIN_TEMPERATURE)

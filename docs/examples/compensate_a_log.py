@@ -15,7 +15,6 @@ Compensate a log by a model, and integrate the heading with its standard deviati
 
 The log is simulated here, so that the truth is known. With files of your own:
 ``compensate(read_log('drive.csv'), read_model('model.yaml'))``.
-
 """
 
 import sys

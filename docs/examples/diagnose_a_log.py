@@ -15,7 +15,6 @@ Diagnose a log of a gyro with a hidden effect, and compensate another log by the
 
 The logs are simulated here, so that the truth is known. With files of your own:
 ``diagnose(read_log('drive.csv'), model=read_model('model.yaml'))``.
-
 """
 
 import sys

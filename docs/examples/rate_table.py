@@ -15,7 +15,6 @@ Calibrate a gyro on a rate table over temperature, and predict sweeps that were 
 
 The table is simulated here, so that the truth is known. With one of your own:
 ``fit(read_log('table.csv'))``.
-
 """
 
 import sys

@@ -15,7 +15,6 @@ Find scale factor error and bias from 20 s of known motion, and write them into 
 
 The log is simulated here, so that the truth is known. With files of your own:
 ``self_calibrate(read_log('run.csv'), 'profile.csv', read_model('noise.yaml'))``.
-
 """
 
 import sys

@@ -15,7 +15,6 @@ Find scale factor error and bias on a record player with three speeds, and with 
 
 Both logs are simulated here, so that the truth is known. With a log of your own:
 ``fit(read_log('turntable.csv'))``.
-
 """
 
 from gyro_calibration import fit, Log, read_model, simulate

@@ -15,7 +15,6 @@ Write a gyro model from the matrix C of Ojeda, Chung and Borenstein (2000), eq. 
 
 The matrix is in deg/s and degC, highest powers first. The numbers are made up: put those of your
 own gyro in their place. Single effects are written with their names: {'bias': {'bias': 0.002}}.
-
 """
 
 import math

@@ -14,5 +14,4 @@ Logs to a model: self-calibration, whole turns, rate table, encoder, course over
 Reading order: `noise_grid`, `likelihood`, `run_faults`, `self_calibration`, `whole_turns`,
 `motion_design`, `dwells`, `scatter`, `rate_table`, `selection`, `own_instants`,
 `reference_noise`, `heading_regression`, `encoder`.
-
 """

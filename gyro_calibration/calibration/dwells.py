@@ -14,7 +14,6 @@ Dwells: stretches of constant rate, each one row of means, to which a calibratio
 They are the rows of a rate table without time, or found in a log in time: there the reference
 heading, or the integral of the reference rate, is a straight line but for the steps of an encoder.
 Ramps, the settling of the gyro after them, outliers and repeated samples are left out.
-
 """
 
 from __future__ import annotations
@@ -26,21 +25,12 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.run_faults import (
-    fit_scale,
-    MAX_UNEXPLAINED_SHARE,
-    refuse_unit_error,
-)
+    fit_scale, MAX_UNEXPLAINED_SHARE, refuse_unit_error)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
-    find_runs,
-    mark_rows,
-    mask_outliers,
-    mask_repeated_samples,
-    noise_before_rounding,
-    quantization_step,
-    rounding_product,
-)
+    find_runs, mark_rows, mask_outliers, mask_repeated_samples, noise_before_rounding,
+    quantization_step, rounding_product)
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
@@ -145,7 +135,6 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
     Return the dwells of several logs as one, with separate sweeps.
 
     They are without temperature where one of the logs has none.
-
     """
     if not parts:
         raise DataRefused('no dwells were given; give at least one log')
@@ -232,7 +221,6 @@ def _table_step(output: Array, rate: Array) -> float:
     It is the largest step that all differences are multiples of: that of the gyro where its
     samples are all alike, or of the digits that were written. Where the rates explain it, as those
     of a gyro without errors, it is at most 1 deg/s.
-
     """
     step = _largest_divisor(output - output[0])
     return (_largest_divisor(np.append(output - output[0], DEGREE))
@@ -259,7 +247,6 @@ def number_sweeps(rate: Array) -> Numbers:
     The rates of a sweep increase or decrease, or their absolute values do with changing sign, with
     or without a rest between them. Where the order shows no sweeps, that is where the median of
     them has less than four dwells, nine blocks of consecutive dwells are taken as sweeps.
-
     """
     turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
     for used in (np.full(len(rate), True), turning) if turning.any() else ():
@@ -279,7 +266,6 @@ def _number_passes(value: Array) -> Numbers:
     Assign numbers to passes through values; a pass begins where the direction reverses.
 
     Values that are repeated where passes turn belong to both in equal parts.
-
     """
     change = np.diff(value)
     # Mean rates of opposite sign differ slightly in absolute value.
@@ -336,7 +322,6 @@ class _Samples(NamedTuple):
 
     `heading` is that of the reference, or the integral of its `rate`; `step` is that of an
     encoder, rad, and `scale` the approximate ratio of output to reference.
-
     """
 
     time: Array
@@ -362,7 +347,6 @@ class _Samples(NamedTuple):
 
         It is the slope of a straight line through a heading, whose errors are those of single
         samples, and the difference of both ends over the duration where a rate was integrated.
-
         """
         time = self.time[rows]
         return (fit_scale(angle, time)[1] if self.rate is None
@@ -529,7 +513,6 @@ def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
 
     On a ramp the deviation of the heading is proportional to the square of time, so the ratio of
     two deviations gives its beginning; a short ramp began later.
-
     """
     if len(deviation) <= _RAMP_BLOCKS:
         return 0
@@ -562,7 +545,6 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     over the dwells, which determines a response below the noise of one dwell: over all but the
     shortest ones, and over the longest ones, which show a slower response. It is settled where it
     is within four standard deviations of its last half; below 20 ppm it always is.
-
     """
     return max((_settling_of_longer(time, error, dwells, rate_change, share)
                 for share in ((0.25, 0.75) if len(dwells) else ())), default=0.0)
@@ -641,7 +623,6 @@ def _average(samples: _Samples,
     batches of at least 0.75 s, in which a vibration of the table and the response of the gyro's
     filter average out; nan where it is not known. The rounding of the output adds its own, and is
     returned, too.
-
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
     batches = np.clip(durations / 0.75, 4, 12).astype(int)
@@ -676,7 +657,6 @@ def _find_rounding(output: Array, dwells: Sequence[Numbers]) -> Array:
     Up to a quarter of a squared step, the variance of the samples depends on the place in the
     step, so such dwells have one noise. Where most dwells are on one step each, their steps may be
     those of their rates; then the whole output shows it.
-
     """
     is_noisy = np.median([np.ptp(output[rows]) for rows in dwells]) > 0.0
     step = (quantization_step(output[np.concatenate(dwells)]) if is_noisy
@@ -699,7 +679,6 @@ def rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
     mean product of their errors is `rounding_product`. Of two dwells, v is the mean, with half of
     the variance of the distance: of the bias between dwells of nearly one rate, beyond the steps,
     and of the scale, by the rounding of the fastest rate.
-
     """
     place, wander = _place_in_steps(rate, output, rounding)
     noise, apart = (rounding[:, 1] / rounding[:, 0]) ** 2, place[:, None] - place
@@ -733,7 +712,6 @@ def _independent_rounding(rate: Array, output: Array, rounding: Array) -> Array:
     Return deviations of independent errors as large as those by the steps, rad/s, shape (n,).
 
     Of n dwells with the same error, each has n times its variance.
-
     """
     if not len(rounding):
         return np.zeros(len(rate))
@@ -747,7 +725,6 @@ def _encoder_deviation(heading: Array, step: float, duration: float) -> float:
     Over M steps it is about 0.35 step / (M duration), and below one step 0.6 step / duration (by
     simulation). Each step is observed late by up to a sample, which adds the square root of M over
     the number of samples. A heading that stays on one step for the whole dwell is taken as a rest.
-
     """
     if np.ptp(heading) <= 0.5 * step or step == 0.0:
         return 0.0
@@ -764,7 +741,6 @@ def _shrink_variances(variance: Array, dof: Array) -> Array:
     random, and the smallest variances would dominate the fit. Empirical Bayes: the logarithms are
     shrunk by the part of their scatter that the degrees of freedom explain (Smyth 2004, section
     6.2).
-
     """
     known = variance > 0.0  # 0 where it is not known
     if known.sum() < 3:

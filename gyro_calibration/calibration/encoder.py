@@ -21,7 +21,6 @@ rests too much weight: with 0.088 deg and a gyro of low noise the variance of th
 times the Cramer-Rao bound. The interval of the scale is the scatter between pieces of the log,
 since the error that repeats in each period of a swing is no noise of the fit, and at least that
 between places of the shaft; that of the bias is its wander between pieces.
-
 """
 
 from __future__ import annotations
@@ -32,75 +31,31 @@ import math
 from pathlib import Path
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
-    extract_dwells,
-    FEW_DWELLS_SHARE,
-    few_values_remedy,
-    format_list,
-    interpolate_reference,
-    join_dwells,
-    MIN_DWELL_SHARE,
-    NothingSteady,
-)
+    Dwells, extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, format_list,
+    interpolate_reference, join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT,
-    fit_course,
-    is_noisy,
-    MAX_ENCODER_OFFSET,
-    MAX_FOLLOWED_RESIDUAL,
-    TECHNOLOGY_PRIORS,
-    WANDER_COSINES,
-)
+    COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
+    TECHNOLOGY_PRIORS, WANDER_COSINES)
 from gyro_calibration.calibration.likelihood import (
-    fit_likelihood,
-    MAX_BLOCK_DURATION,
-    MISALIGNMENT_REMEDY,
-    oblique_angle,
-    ScaleBiasFit,
-)
+    fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle, ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
-    BandedNoise,
-    bias_wander_columns,
-    difference_covariance,
-    fit_noise_grid,
-    HierarchicalPrior,
-    TridiagonalMatrix,
-)
+    BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, HierarchicalPrior,
+    TridiagonalMatrix)
 from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings,
-    is_course,
-    rate_noise_share,
-)
+    drop_repeated_headings, is_course, rate_noise_share)
 from gyro_calibration.calibration.run_faults import fit_profile, refuse_unit_error, split_run
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, select_effects, Selection
 from gyro_calibration.calibration.self_calibration import (
-    DRIVE_DURATION,
-    fit_rate,
-    refuse_one_speed,
-    refuse_scale,
-    RunLimits,
-)
+    DRIVE_DURATION, fit_rate, refuse_one_speed, refuse_scale, RunLimits)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
-    Array,
-    DataRefused,
-    DEGREE,
-    Log,
-    NORMAL_QUANTILE_975,
-    refuse_wrapped,
-)
+    Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    cross_rotation,
-    encoder_step,
-    find_holes,
-    quantization_step,
-    refuse_dead,
-    white_noise_deviation,
-)
+    bridge_gaps, cross_rotation, encoder_step, find_holes, quantization_step, refuse_dead,
+    white_noise_deviation)
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -302,7 +257,6 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
     1975). Two in a row, there and back, are a wrong value, which is left out; else they are a
     motion that the gyro does not measure.
-
     """
     if log.time is None or log.output is None or log.reference_heading is None:
         return log, []
@@ -497,7 +451,6 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
 
     What repeats itself with the motion is not noise of the fit, and what is slower than a piece
     shows in part only. What repeats itself at a place of the shaft shows between the places.
-
     """
     scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence)
     slope = scatter[0, 1] / scatter[1, 1]
@@ -599,7 +552,6 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
 
     The options are those of `api.fit`. A log in time whose only reference is a heading is
     calibrated by it, and so is one with a reference rate that is seldom steady.
-
     """
     for log in logs.values():
         _refuse_own_reference(log)

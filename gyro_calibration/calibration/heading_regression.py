@@ -34,7 +34,6 @@ slip. It is smoothed, late or early against the gyro, lost below some speed, and
 seconds several times less accurate. Where a drive does not determine scale factor error and bias,
 a prior does: normal about zero, with a standard deviation that is not known, but limited by the
 technology of the gyro.
-
 """
 
 from __future__ import annotations
@@ -48,46 +47,17 @@ from typing import Any, NamedTuple
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
-    bias_wander_columns,
-    carried_shares,
-    fit_noise_grid,
-    GridFit,
-    heading_noise,
-    HierarchicalPrior,
-    SharedNoise,
-)
+    bias_wander_columns, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior,
+    SharedNoise)
 from gyro_calibration.calibration.own_instants import (
-    is_slow,
-    keep_own_instants,
-    MAX_ROUNDING_STEP,
-    OwnInstants,
-)
+    is_slow, keep_own_instants, MAX_ROUNDING_STEP, OwnInstants)
 from gyro_calibration.calibration.reference_noise import (
-    find_rests,
-    heading_difference,
-    MIN_COURSE_NOISE,
-    rate_noise_share,
-)
+    find_rests, heading_difference, MIN_COURSE_NOISE, rate_noise_share)
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
-from gyro_calibration.logs.log import (
-    Array,
-    DataRefused,
-    DEGREE,
-    Log,
-    Mask,
-    NORMAL_QUANTILE_975,
-)
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    cross_rotation,
-    encoder_step,
-    find_holes,
-    mark_rows,
-    MISALIGNMENT_DEVIATION,
-    quantization_step,
-    robust_deviation,
-    white_noise_deviation,
-)
+    bridge_gaps, cross_rotation, encoder_step, find_holes, mark_rows, MISALIGNMENT_DEVIATION,
+    quantization_step, robust_deviation, white_noise_deviation)
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
@@ -259,7 +229,6 @@ class Spans:
 
         If a motion repeats synchronously with the samples, the errors of an encoder repeat too.
         Stretches in time would count them as independent.
-
         """
         middle = self.point_means(np.asarray(self.channels.heading))
         sector = np.floor(0.5 * (middle[1:] + middle[:-1]) / (10.0 * DEGREE))
@@ -353,7 +322,6 @@ class Spans:
 
         The changes of the rate from point to point, in which a delay shows, are mostly white noise
         in a slow motion; as a column it would pass for information.
-
         """
         rate = np.asarray(self.channels.rate)
         cosines = dct(rate, norm='ortho')
@@ -417,7 +385,6 @@ class Spans:
 
         The causes are those that depend on the rate. The delay and the clock rate are added to
         those of the spans.
-
         """
         assert self.log.output is not None and self.log.time is not None
         errors, clock_rate = values[1], self.clock_rate
@@ -451,7 +418,6 @@ class Spans:
         Columns computed from it are not correlated with the noise of the observations; those of
         the reference alone are, which matters where it errs by degrees, and those of the gyro
         alone, which matters if two columns are nearly the same.
-
         """
         if not self.treatment.errs_as_heading:
             return heading_change / (1.0 + self.reference_noise_ratio ** 2)
@@ -508,7 +474,6 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
     gyro is known. The instants are those of the known values of a slow reference, by
     `keep_own_instants`.
-
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
@@ -643,7 +608,6 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     A scale factor error that is determined by fewer than `MIN_STRETCHES` stretches cannot be
     separated from errors of the reference; its interval is that of the prior. Rests that the
     motion contradicts are left out where no causes are given.
-
     """
     given, causes = causes, spans.all_causes(causes)
     free = spans.prior_deviations(causes)
@@ -813,7 +777,6 @@ def _reference_walk(spans: Spans,
     They do not add up, grow in proportion to the time in motion, or to the angle turned by many
     small slips, or a slip is a share of a whole turn, from a reversal to the next: whichever is
     the likeliest. The spans of a turn may slip alike, so that the errors of whole turns count too.
-
     """
     angles, independent = np.abs(spans.angles), np.zeros(len(spans.time) - 1)
     number = np.cumsum(np.diff(spans.angles > 0.0, prepend=spans.angles[0] > 0.0))
@@ -844,7 +807,6 @@ def _cluster_robust_covariance(data: WhitenedRegression,
     errors.
 
     Also the effective number of stretches that determine each value, and the degrees of freedom.
-
     """
     count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
@@ -895,7 +857,6 @@ class WhitenedRegression:
 
     The m priors of the values and of the wandering bias are rows after those of the observations.
     Each of them is a separate cluster.
-
     """
 
     observed: Array  # shape (n + r + m,)
@@ -919,7 +880,6 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
 
     The noise may be of another fit, and its random walk the upper 95 % limit, as slow bias wander
     may pass for a cause otherwise.
-
     """
     spans, noise = fit.spans, (noise_fit or fit).fit
     waves, shared = spans.bias_wander()
@@ -999,7 +959,6 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     stands. Either may change steadily with time, and what depends on the rate is not of the
     reference. None without such rests, or where both agree (Welch's test, at 1 %), as a whole or
     in the ways from rest to rest, each compared with the rests around it: the bias may wander.
-
     """
     spans = lay_out_spans(log)
     rests = spans.rests[spans.stands]
@@ -1057,7 +1016,6 @@ def is_noisy(log: Log) -> bool:
     Tell whether a heading errs like a course.
 
     It has no steps, is no attitude, and is as noisy from span to span; or it drifts in motion.
-
     """
     assert log.reference_heading is not None
     if find_drift(log) is not None:

@@ -18,7 +18,6 @@ Errors within a block (vibration, backlash, an eccentric encoder) are no random 
 covariance of the increments is a banded matrix with one unknown ratio, which is solved exactly for
 each ratio of a grid. A bias may wander by a random walk, of sizes of a grid too. Blocks are
 shorter where the heading swings so fast that means over 0.5 s would attenuate it.
-
 """
 
 from __future__ import annotations
@@ -147,7 +146,6 @@ class _ReferencePoints:
     The variances are known up to one factor. Errors that several points share have columns, shape
     (n, k), and prior standard deviations, shape (k,), times one row of the factors
     `prior_factors`, shape (m, k).
-
     """
 
     time: Array
@@ -222,7 +220,6 @@ class _RunAlignment:
 
         The time constant of the lag has the square 2 `lag`. The output of such a lag plus its rate
         times the constant is the input, but for a delay.
-
         """
         points, constant = self._points, math.sqrt(2.0 * lag)
         gyro_time = points.time + offset - constant
@@ -291,7 +288,6 @@ class _RunAlignment:
         Return rate, acceleration and integral of the rate, linear between the samples.
 
         The lag is taken off the rate and the integral.
-
         """
         base = self._smoothing_time
         integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
@@ -316,7 +312,6 @@ class _RunAlignment:
 
         A slip affects only the blocks that contain it. A periodic motion fits about equally well
         at several offsets: the smallest of these is returned.
-
         """
         # a profile is smoother than measured headings
         step = 0.02 if self.is_measured else 0.04
@@ -462,7 +457,6 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
 
     A constant reading has a constant error of up to half a step; where it changes by one step, the
     heading is the edge between the two, but for the turn between the samples.
-
     """
     change = np.abs(np.diff(motion.heading))
     index = np.flatnonzero(change > 0.5 * step)
@@ -494,7 +488,6 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
 
     All samples of a constant reading count as one. At the first and the last the gyro rests if
     they last much longer than the readings next to them; then their samples share one error.
-
     """
     run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
     begins = np.flatnonzero(np.diff(run, prepend=-1))
@@ -521,7 +514,6 @@ def _random_walk_covariance(time: Array, weight: Array,
     The random walk has unit variance a second, the increments are between weighted means of
     blocks. With A the weights summed up to each point, the mean of a block is its last value less
     the sum of A times the steps, and its first value plus the sum of (1 - A) times the steps.
-
     """
     interval = np.diff(time, append=time[-1])
     until = np.cumsum(weight)
@@ -585,7 +577,6 @@ class _Estimate:
         Return the effect of the noise of each block on (s, b), shape (n, 2).
 
         A bias that wanders is part of the noise.
-
         """
         wander = data.columns.shape[1] - data.wander_count
         noise = self.residual + data.columns[:, wander:] @ self.values[wander:]
@@ -665,7 +656,6 @@ def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
     by the gyro over a base, and reference headings of the variance r the covariance 2 r / base²
     with one by the reference. In a mean with weights inverse to them both cancel. Otherwise the
     noise passes for a lag, and with that, in a swing of one frequency, for a scale factor error.
-
     """
     columns = data.columns.copy()
     if len(data.accelerations):
@@ -687,7 +677,6 @@ def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
     window, or by a fifth of its square less, of a mean over a time, or by its square more, of a
     filter of first order, which has the lag `offset` ** 2 / 2. Else the lag is 0, as in a swing of
     one frequency, and what it may do to the scale is uncertain.
-
     """
     of_first_order = 0.5 * offset ** 2
     possible = max(possible, of_first_order)
@@ -826,7 +815,6 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     A measured heading, or the gyro, may be late since it was smoothed. Half the variance of the
     times by which it is late is from 0, of a delay, to half the square of their mean, of a
     first-order lag, which is a standard deviation of the prior.
-
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
@@ -874,7 +862,6 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
 
     It is relative to the reference's first heading. The expected noise of the first block's
     heading, given all that follows, is subtracted, and then the gyro's turn before that block.
-
     """
     heading, elapsed, shared, gyro_angle = (data.start_offsets[0], data.start_offsets[1],
                                             data.start_offsets[2:-1], data.start_offsets[-1])
@@ -924,7 +911,6 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
 
     The values are fitted together with the excess turn of each stretch, so that they do not absorb
     a slip. The standard deviation of the noise is that of a robust fit.
-
     """
     noise, interval = estimate.noise, data.columns[:, 1]
     shared = data.columns[:, 4:] @ estimate.values[4:]

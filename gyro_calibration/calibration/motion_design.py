@@ -20,7 +20,6 @@ random walk of the bias, which the fit does not weigh, are propagated through it
 A motion that returns has no net turn, so that the estimates of s and b are independent. The
 deviation of the bias depends on the white noise N, the time T, N / √T, and the rest, but not on
 the motion; that of s depends on the motion.
-
 """
 
 from __future__ import annotations
@@ -29,18 +28,9 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.likelihood import (
-    block_duration,
-    DELAY_DEVIATION,
-    LAG_DEVIATION,
-    MAX_BLOCK_DURATION,
-    tracking_error_columns,
-)
+    block_duration, DELAY_DEVIATION, LAG_DEVIATION, MAX_BLOCK_DURATION, tracking_error_columns)
 from gyro_calibration.calibration.self_calibration import (
-    combine_with_rest,
-    rest_variance,
-    RunLimits,
-    SETTLING_TIME,
-)
+    combine_with_rest, rest_variance, RunLimits, SETTLING_TIME)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Number
 from gyro_calibration.model.motion import Motion, motion_from_rates
 from gyro_calibration.model.noise import increment_covariance, Noise
@@ -152,7 +142,6 @@ class CalibrationForecast:
         improves the bias by 0.3 %. A search with these blocks would prefer fast motions for it, at
         the cost of the scale; with the allowance for a difference between the senses of turning it
         would prefer slow ones.
-
         """
         blocks = math.ceil(self._duration / min(MAX_BLOCK_DURATION, self._duration / 40.0))
         return self._predict(motion, blocks, False).heading_error
@@ -183,7 +172,6 @@ class CalibrationForecast:
         Return the weights of (s, b) on increments of the gyro's integral and the rest, (2, n).
 
         Then their covariance by errors of gyro and robot that the fit does not determine, (2, 2).
-
         """
         count = blocks * _CELLS_PER_BLOCK ** 2
         point = (np.arange(count) + 0.5) * self._duration / count
@@ -222,7 +210,6 @@ class _NoiseCovariances:
 
     The n observations are the increments between the blocks of the run, rad, and the mean rate of
     the rest, rad/s, if there is one.
-
     """
 
     white_precision: Array  # of the covariance of the increments by white noise, rad⁻²
@@ -309,7 +296,6 @@ class _MotionFamily:
     The axes: number of turns, sense of the first one, fractions of the headings above and below 0
     that are used, rates of one pair of turns and of the next, and fraction of the time that is
     rest between turns. Angles are stretched up to the duration or the limits of the heading.
-
     """
 
     axes = 7
@@ -435,7 +421,6 @@ def plain_motion(robot: RobotLimits, duration: float) -> Motion:
 
     It turns at half of the robot's fastest rate, as far as time and place allow, to the wider
     side.
-
     """
     _refuse_impossible(robot, duration)
     place, half = max(robot.highest, -robot.lowest), 0.5 * duration - robot.rest

@@ -56,7 +56,6 @@ between the points of span ``k``. The differences of observations and columns ::
 
 have tridiagonal covariances again (Cochrane and Orcutt 1949), and as their matrix has the
 determinant 1, likelihoods of different correlations can be compared (`carried_shares`).
-
 """
 
 from __future__ import annotations
@@ -112,7 +111,6 @@ class HierarchicalPrior:
 
     A value that the data determine weakly is drawn towards the mean of its prior, a value that
     they determine well is not.
-
     """
 
     name: str  # of the size
@@ -439,7 +437,6 @@ def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float,
 
     Where they are likely at an end of the old axis, it goes on beyond that: the likeliest point of
     a coarse grid is not always next to the likeliest size.
-
     """
     if len(axis) == 1:
         return axis

@@ -87,7 +87,6 @@ def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> f
     Return the usual interval of instants, s, some of which may be hidden; None if uneven.
 
     In a motion that is calculated, of steady rates and ramps, only every second gap is the usual.
-
     """
     if len(gaps) < _MIN_INSTANTS or np.quantile(gaps, 0.1) < 1.5 * sample:
         return None
@@ -169,7 +168,6 @@ def is_command(log: Log, held: Array) -> bool:
     Tell whether the gyro is later than a held rate, as a robot that follows its command.
 
     A rate that was measured, and held, is later than the motion.
-
     """
     assert log.time is not None and log.output is not None
     known, output = np.isfinite(held), bridge_gaps(log.output)

@@ -15,7 +15,6 @@ The errors are also those of full turns of 360 degrees (Ojeda et al., section 4)
 rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion to the duration
 of the turn. Two errors are compared: with the bias of a rest before the mission only, and with a
 model and then the bias that remains at rest.
-
 """
 
 from __future__ import annotations
@@ -27,29 +26,13 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
-    MIN_TEMPERATURE_SPREAD,
-    Numbers,
-    select_dwells,
-)
+    Dwells, MIN_TEMPERATURE_SPREAD, Numbers, select_dwells)
 from gyro_calibration.calibration.scatter import (
-    cross_validation_parts,
-    estimate_scatter,
-    estimate_tolerance,
-    rms,
-    Scatter,
-    sum_by_part,
-    Uncertainty,
-    Whitener,
-)
+    cross_validation_parts, estimate_scatter, estimate_tolerance, rms, Scatter, sum_by_part,
+    Uncertainty, Whitener)
 from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
-from gyro_calibration.model.effects import (
-    Channels,
-    CUBIC_NONLINEARITY,
-    Effect,
-    SINE_RESPONSE,
-)
+from gyro_calibration.model.effects import Channels, CUBIC_NONLINEARITY, Effect, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -222,7 +205,6 @@ class Calibration:
         Return what errors of the given model's values do to the fitted dwells, rad/s.
 
         Each of one standard deviation, and independent, shape (n, k); none where they are unknown.
-
         """
         known, covariance = static_terms(self.given), self.given.covariance
         if covariance is None:
@@ -246,7 +228,6 @@ class Calibration:
         Return the slowest rate of the range, rad/s, at which the output no longer grows with it.
 
         None where the output always grows with the rate.
-
         """
         # also between the rates of the dwells, where a fast sine would hide
         rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
@@ -275,7 +256,6 @@ class Calibration:
         Return the rate of each dwell by a fit without its sweep, rad/s, shape (n,).
 
         It is not finite at outlying dwells and where the other sweeps do not determine the model.
-
         """
         slope = GyroModel(self.terms).output_slope(channels_of(self.dwells))
         return np.asarray(self.dwells.rate + self.left_out_residual / slope)
@@ -399,7 +379,6 @@ def _linearize_output(dwells: Dwells, terms: Sequence[Term],
     the likelihood would prefer a large scatter of their scale: the Jacobian of output against
     error is missing there. Columns and residual are therefore those at the expected output:
     ``Δoutput = Δerror / (1 - g)`` with ``g`` the slope of the error over the output.
-
     """
     model, channels = GyroModel(tuple(terms)), channels_of(dwells)
     if not model.uses_channel('output'):
@@ -483,7 +462,6 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
 
     They are those of a fit with an error of its own for each dwell of the part. Where the part is
     not a whole sweep, the others of its sweep show the bias and scale that they share.
-
     """
     left_out = np.full(len(whitened), math.inf)
     for part in range(parts.max() + 1):

@@ -17,21 +17,13 @@ import math
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.own_instants import (
-    find_own_instants,
-    is_command,
-    keep_own_instants,
-)
+    find_own_instants, is_command, keep_own_instants)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    cross_rotation,
-    find_runs,
-    quantization_step,
-    robust_deviation,
-    white_noise_deviation,
-)
+    bridge_gaps, cross_rotation, find_runs, quantization_step, robust_deviation,
+    white_noise_deviation)
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -73,7 +65,6 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
 
     The gyro is quiet, and the reference is lost, or stands: it is known and does not change. Where
     it stands and the gyro is not quiet all the time, something moves, and there is no rest.
-
     """
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
@@ -99,7 +90,6 @@ def step_evenness(log: Log, step: float) -> float:
 
     Rounding errors are independent from sample to sample if the rate varies. At a constant rate
     they are a sawtooth, which passes for tones, and at rest they are constant.
-
     """
     assert log.time is not None and log.output is not None
     interval = float(np.median(np.diff(log.time)))
@@ -137,7 +127,6 @@ def heading_difference(log: Log) -> HeadingDifference:
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
     a lag, a scale factor and a misalignment of the axis are fitted. An error that was smoothed
     shows at lags beyond its time constant.
-
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     output = bridge_gaps(log.output)
@@ -176,7 +165,6 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     updates of a held one. White noise is detected by third differences of alternating sign, other
     noise by changes from sample to sample that the gyro does not show, unless the rate is known to
     be commanded: a robot need not follow those.
-
     """
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
@@ -238,7 +226,6 @@ def is_course(log: Log) -> bool:
     Tell whether a heading is lost at times, as a course at low speed, and errs like one.
 
     A direction of travel has no rotation about other axes, so an attitude is none.
-
     """
     log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
@@ -266,7 +253,6 @@ def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> 
     They are the standard deviations of its second difference over halves of the span, which is
     that of the end of a random walk, and of its change beyond the bias, by their medians; 0 where
     no span is known.
-
     """
     starts = np.linspace(time[0], time[-1] - span, _USUAL_SPANS)
     first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
@@ -287,7 +273,6 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     that. The reference must then jump rather by what the gyro turned than not at all: a bias may
     drift in a rest. The random walk is that of the difference to the reference elsewhere, or the
     scatter of that difference over as long a time, if it is larger, as that of a wandering bias.
-
     """
     heading = log.reference_heading
     known = np.flatnonzero(np.isfinite([] if heading is None else heading))

@@ -13,7 +13,6 @@ Faults of a run that deviates from its profile: a name, a test and a remedy for 
 
 The fault is the motion that explains the run best: the profile with one deviating stretch, driven
 faster or slower, at limited rates, begun late, or ended early.
-
 """
 
 from __future__ import annotations

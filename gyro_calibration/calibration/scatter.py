@@ -23,7 +23,6 @@ The covariance of the values states how well the dwells determine them, if the m
 and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
 change by as much as from sweep to sweep, and outside of the calibrated temperatures and rates,
 effects that were not fitted add errors.
-
 """
 
 from __future__ import annotations
@@ -33,13 +32,7 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
-    MIN_TEMPERATURE_SPREAD,
-    Numbers,
-    OUTLIER_THRESHOLD,
-    rounding_covariance,
-    select_dwells,
-)
+    Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD, rounding_covariance, select_dwells)
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
@@ -67,7 +60,6 @@ class Scatter:
 
     The surface is as smooth as the number of dwells allows. The scatter does not depend on the
     effects that are fitted: one found with too few of them would include what they leave.
-
     """
 
     dwell_bias: float  # of a dwell, beyond its own deviation, rad/s
@@ -82,7 +74,6 @@ class Scatter:
         Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,).
 
         A deviation of its own that is not known is the rms of the others.
-
         """
         known = np.isfinite(dwells.deviation)
         typical = rms(dwells.deviation[known]) if known.any() else 0.0
@@ -115,7 +106,6 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
     It is the sweep, since errors that its dwells have in common do not predict other sweeps. Fewer
     than four sweeps do not determine a model without one of them, nor do two temperatures the
     slope between them: then parts are about 60 blocks of time within sweeps, or the dwells.
-
     """
     sweeps, count = sweep_numbers(dwells), min(len(dwells), 60)
     if sweeps.max() + 1 >= MIN_SWEEPS:
@@ -219,7 +209,6 @@ def find_inliers(dwells: Dwells) -> Mask:
     Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
     dwells of a sweep whose scale differs are not outlying. Nor is what the deviation of a dwell of
     its own explains, such as that by the steps of the output where rests are all on one step.
-
     """
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
@@ -241,7 +230,6 @@ def _smooth_surface(dwells: Dwells) -> Array:
     Return orthonormal columns of a smooth surface over rate and temperature, shape (n, m).
 
     There is at most one column for three dwells.
-
     """
     if len(dwells) < 2:
         raise DataRefused('a single dwell shows no effect: '
@@ -315,7 +303,6 @@ class Uncertainty:
     variance: without it, the intervals of sweeps that do not differ would be too wide. The maximum
     of the likelihood alone would be at zero in about half of the cases, and its intervals would be
     too narrow.
-
     """
 
     weights: Array  # of possible scatters, shape (k,)

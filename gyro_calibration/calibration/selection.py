@@ -16,7 +16,6 @@ them: the slopes where the dwells determine them better than a data sheet does. 
 taken where it reduces the error of left-out sweeps and is significant, given the number of effects
 tried. Sine response and cubic nonlinearity explain nearly the same; where the data do not
 distinguish them, the one by the physics of the instrument is taken, if the instrument is known.
-
 """
 
 from __future__ import annotations
@@ -27,24 +26,12 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import (
-    Calibration,
-    channels_of,
-    CONFOUNDERS,
-    fit_effects,
-)
+    Calibration, channels_of, CONFOUNDERS, fit_effects)
 from gyro_calibration.calibration.scatter import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
-    BIAS,
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    CUBIC_NONLINEARITY,
-    Effect,
-    SCALE_FACTOR_ERROR,
-    SCALE_FACTOR_TEMPERATURE,
-    SINE_RESPONSE,
-    STATIC_EFFECTS,
-)
+    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, Effect,
+    SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
@@ -154,7 +141,6 @@ def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
 
     The best one is added until none is supported, then those that later ones made superfluous are
     removed. With a given model they are changes of it. The effects of a `base` are in the fit.
-
     """
     best = base = base or _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
@@ -193,7 +179,6 @@ def _is_supported(smaller: Calibration, larger: Calibration, significance: float
     Return whether more effects predict left-out sweeps better, and each is significant.
 
     A response that no longer grows with the rate at some dwells cannot be undone there.
-
     """
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.cross_validation_misfit() < smaller.cross_validation_misfit()
@@ -231,7 +216,6 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
     The one that fits better is taken, but for the one by the physics of the technology if the data
     do not distinguish them, and without a technology for a `bounded_effect`, whose error stays
     bounded beyond the rates that were seen, if the data do not prefer the other one.
-
     """
     effect = next((each for each in CONFOUNDERS if each in fit.effects), None)
     if effect is None:
@@ -266,7 +250,6 @@ def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
 
     Their outputs are then to differ by one standard deviation more than is needed. None if that is
     more than three times the fastest rate.
-
     """
     fastest = float(np.abs(fit.dwells.rate).max())
     for rate in fastest * np.arange(1.05, 3.0, 0.05):

@@ -14,7 +14,6 @@ Scale factor error and bias from about 20 s of known motion, with the reasons to
 The model is ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three methods:
 the two of the paper, unchanged, and a likelihood fit, which has no error by the rectangle rule and
 estimates the time offset between gyro and motion.
-
 """
 
 from __future__ import annotations
@@ -23,33 +22,15 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.likelihood import (
-    ASYMMETRY_DEVIATION,
-    EXCESS_RATE_DEVIATION,
-    fit_likelihood,
-    GoodnessOfFit,
-    MAX_NOISE_SIGMAS,
-    MAX_TRACKING_LAG,
-    MIN_FIT_PROBABILITY,
-    ScaleBiasFit,
-)
+    ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_NOISE_SIGMAS,
+    MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile,
-    format_slip,
-    MAX_UNEXPLAINED_SHARE,
-    refuse_other_motion,
-    refuse_unit_error,
-    RunPieces,
-    split_run,
-)
+    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
+    RunPieces, split_run)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.logs.quality import (
-    noise_before_rounding,
-    quantization_step,
-    refuse_dead,
-    refuse_saturated,
-    rounding_product,
-    white_noise_deviation,
-)
+    noise_before_rounding, quantization_step, refuse_dead, refuse_saturated, rounding_product,
+    white_noise_deviation)
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion, motion_from_rates
@@ -258,7 +239,6 @@ def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
     the absolute value of the rate. The part of it that is proportional to the rate, or constant,
     is indistinguishable from scale factor error and bias. In a swing without rests, the mean
     absolute rate is indistinguishable from a bias.
-
     """
     columns = np.column_stack([rate, np.ones(len(rate))])
     absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
@@ -346,7 +326,6 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     Refuse by the first cause found; causes that spoil later checks come first.
 
     `white_noise` is that of the samples, rad/√s.
-
     """
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual

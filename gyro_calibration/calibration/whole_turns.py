@@ -13,7 +13,6 @@ Scale factor error and bias from whole turns between two rests on one mark.
 
 The robot rests on the mark, turns at any rates, and rests on the mark again. The mark is the only
 reference. The rests give the bias, and the remaining angle over the turns gives the scale.
-
 """
 
 from __future__ import annotations

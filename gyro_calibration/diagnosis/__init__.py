@@ -21,5 +21,4 @@ and findings for people), `residuals` (their noise and curves), `extended_model`
 what was held out), `noisy_reference` (where the reference limits what is known), `reference_lag`
 (of a motion that follows its reference), `rate_table` (the diagnosis of a rate table), `pipeline`
 (of a diagnosis, in order), `report` (the page).
-
 """

@@ -14,7 +14,6 @@ Candidate causes and their columns on a replayed log, for the shapes that are tr
 Also generic terms, which are structure without a name: families of functions of each variable, of
 two variables, and of time. They compete with the causes. If a generic term is clearly better than
 every cause, the structure is reported as unexplained.
-
 """
 
 from __future__ import annotations
@@ -194,7 +193,6 @@ def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
     Give the lasting causes that some channels may show, linear in size, with first shapes.
 
     They are those of the record of the effect, unless they depend on the log.
-
     """
     middle = float(temperature.mean())
     of_log: dict[str, list[tuple[float, ...]]] = {

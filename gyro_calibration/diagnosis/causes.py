@@ -13,7 +13,6 @@ Every cause that a diagnosis can name: effects of the gyro, faults of reference 
 
 The formulas and units of effects are in `effects`, with the variable along which each shows, and
 the experiment that distinguishes it from similar causes.
-
 """
 
 from __future__ import annotations
@@ -254,7 +253,6 @@ def next_experiment(name: str, alternatives: Sequence[tuple[str, float]],
     The alternatives are names with their deficits in log-likelihood, half the square of the sigmas
     by which these logs distinguish them; similar logs together do by the root of their number
     more.
-
     """
     found: dict[str, list[str]] = {}
     for other, lack in alternatives:

@@ -19,7 +19,6 @@ and the samples concerned are not used; no fault is fitted.
 The false-alarm rate for a log without faults is at most 1e-3: each of the five tests (lost
 samples, repeated samples, outliers, a limit on either side) has a level of 2e-4. Quantization and
 units are reported if they are large enough to matter.
-
 """
 
 from __future__ import annotations
@@ -33,30 +32,12 @@ from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_outpu
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import (
-    compare_headings,
-    compare_output,
-    fit_line,
-    identify_unit_factor,
-    is_implausible_factor,
-    LineFit,
-    model_scale_factor,
-    OutputComparison,
-    reference_angle,
-    reference_rate,
-    resample_reference,
-    select_reference,
-    spline_rate,
-    UNIT_FACTORS,
-)
+    compare_headings, compare_output, fit_line, identify_unit_factor, is_implausible_factor,
+    LineFit, model_scale_factor, OutputComparison, reference_angle, reference_rate,
+    resample_reference, select_reference, spline_rate, UNIT_FACTORS)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    encoder_step,
-    find_codes,
-    find_runs,
-    QuantizationCodes,
-    robust_deviation,
-)
+    bridge_gaps, encoder_step, find_codes, find_runs, QuantizationCodes, robust_deviation)
 from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -99,7 +80,6 @@ def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
 
     Steps grow with the values of 32-bit floats and of decimals with a number of significant
     digits.
-
     """
     steps = np.full(len(output), max(
         codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0))
@@ -183,7 +163,6 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
     An extreme code is a limit if it is larger than the output at rest; if it is more frequent than
     its neighbours, which are more frequent without a limit; and if the expected output is beyond
     it, which is not so for a coarse code at a constant rate.
-
     """
     chances, (low, high) = {}, codes.values[[0, -1]].tolist()
     deviation, noise = comparison.deviation, comparison.noise_deviation
@@ -276,7 +255,6 @@ def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) ->
 
     That of a change by less than a step for the scatter of changes of similar expectation, and no
     less than the share of changes by one code or two, each way.
-
     """
     chances, classes = np.ones(len(change)), motion_classes(np.abs(expected))
     for each in np.unique(classes):
@@ -470,7 +448,6 @@ def _is_refuted_by_spans(log: Log, factor: float) -> bool:
     Tell whether the headings over spans agree with 1 rather than with a factor of the output.
 
     Of a motion that is late, a rate shows less than its turns do.
-
     """
     spans = [] if log.time is None else compare_headings(log, reference_angle(log))
     best = max(spans, key=lambda each: each.coherence, default=None)
@@ -485,7 +462,6 @@ def _follow_corners(log: Log, rate: Array, line: LineFit) -> Array:
 
     The smooth one errs at the ends of a log and at corners of the motion, and that by splines by
     the noise of the heading.
-
     """
     assert log.time is not None
     heading = resample_reference(log).reference_heading

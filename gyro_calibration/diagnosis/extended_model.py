@@ -13,7 +13,6 @@ The model extended by the findings, and its gain on parts of the logs that are h
 
 The model gets effects, limits, values, covariance, noise and origin. The held-out parts take no
 part in the selection and fit of the causes that predict them.
-
 """
 
 from __future__ import annotations
@@ -26,23 +25,13 @@ from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Change, Finding, Gain, HeadingCurve
-from gyro_calibration.diagnosis.regression import (
-    fit_causes,
-    is_single_event,
-    RegressionFit,
-)
+from gyro_calibration.diagnosis.regression import fit_causes, is_single_event, RegressionFit
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.residuals import NOISE_NAMES
 from gyro_calibration.diagnosis.search import restrict_search, Search, search_causes
 from gyro_calibration.logs.log import Array, Mask
 from gyro_calibration.model.effects import (
-    BIAS,
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    CATALOGUE,
-    Effect,
-    SCALE_FACTOR_ERROR,
-)
+    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, Effect, SCALE_FACTOR_ERROR)
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -68,7 +57,6 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
 
     The fit contains the causes that can be merged with the given model, None for an ideal gyro. Of
     its noise, only the figures with a finding are replaced. The bias has a deviation, rad/s.
-
     """
     given = model or GyroModel()
     names = {name for each in findings for name in (each.effect, *each.ambiguous_with)}
@@ -176,7 +164,6 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
 
     If the gyro hardly turns, noise of the reference passes for motion that the gyro does not
     measure.
-
     """
     scale = fit.scale_factor_error
     return _has_motion(fit) and (scale.value < -SCALE_FACTOR_LIMITS.max_scale_factor_error
@@ -284,7 +271,6 @@ def _extended_covariance(model: GyroModel, new: Sequence[Term],
     Return the covariance of all fitted values of a model with new terms; None if unknown before.
 
     New values, with a covariance of their own, are independent of those of the model.
-
     """
     if model.terms and model.covariance is None:
         return None
@@ -331,7 +317,6 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
 
     The error before is that of the model, or of the best bias and scale factor without one. None
     if the logs are too short, or too few of their samples are used.
-
     """
     replays = search.problem.replays
     length = min(HEADING_WINDOW, max(each.duration for each in replays) / 6.0)
@@ -424,7 +409,6 @@ def heading_contributions(fit: RegressionFit, log_index: int,
     Return the contributions to the change of heading of a log, rad, and its times, s.
 
     The fit of the bias and scale factor of the simulation is subtracted, if these were fitted.
-
     """
     each = fit.problem.replays[log_index]
     parts = {**fit.contributions(each, log_index),
@@ -445,7 +429,6 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     The part of a cause that is proportional to a bias or a scale factor error is counted as these,
     because their refit would absorb it. A log has the contributions of causes and of what is
     'left' to the change of heading, rad, shape (n,), between times, s, shape (n + 1,).
-
     """
     window_errors: dict[str, list[Array]] = {name: [] for parts, _ in logs for name in parts}
     for parts, time in logs:
@@ -485,7 +468,6 @@ def jackknife_change(square_sums: Array, counts: Array) -> Change:
 
     Bootstrap intervals are too narrow for few parts, so the jackknife is used (Tukey 1958): each
     part is left out in turn, and the change has Student's distribution.
-
     """
     before, after = np.sqrt(square_sums.sum(axis=0) / counts.sum())
     parts = len(counts)

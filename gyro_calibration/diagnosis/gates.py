@@ -17,7 +17,6 @@ time, at the lag of the best agreement. A factor far from 1 indicates a unit, a 
 time; a low coherence over all lengths of span, or over long ones, indicates another motion, or an
 axis that tilts. A gate that fails is the only finding. The kind of the reference, and whether its
 errors exceed those of the gyro, decide how a log is diagnosed.
-
 """
 
 from __future__ import annotations
@@ -28,44 +27,20 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
-    few_values_remedy,
-    find_lost_reference,
-    require_output,
-)
+    few_values_remedy, find_lost_reference, require_output)
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.own_instants import (
-    interpolate_by_splines,
-    is_slow,
-    MAX_ROUNDING_STEP,
-)
+    interpolate_by_splines, is_slow, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
-    heading_difference,
-    is_course,
-    MAX_ROUNDING_RATIO,
-    rate_noise_share,
-    step_evenness,
-)
+    heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
-    Array,
-    DataRefused,
-    DEGREE,
-    Log,
-    MAX_PLAUSIBLE_FACTOR,
-    NORMAL_QUANTILE_975,
-    refuse_wrapped,
-)
+    Array, DataRefused, DEGREE, Log, MAX_PLAUSIBLE_FACTOR, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    cross_rotation,
-    encoder_step,
-    find_codes,
-    robust_deviation,
-    white_noise_deviation,
-)
+    bridge_gaps, cross_rotation, encoder_step, find_codes, robust_deviation, white_noise_deviation)
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
@@ -97,7 +72,6 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     Far from 1, no gyro has such a scale factor, and a scale factor error of up to a tenth is
     allowed in addition to a confusion. Near 1, the factor must agree within two standard
     deviations, and its standard deviation must be below a fiftieth of its distance from 1.
-
     """
     matches = []
     for name, value in UNIT_FACTORS.items():
@@ -309,7 +283,6 @@ def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
 
     The reference rate is dropped if it has less than half as many samples as the heading. A rate
     that consists of noise alone is replaced by that of a rest.
-
     """
     if log.time is None:
         return log, ()

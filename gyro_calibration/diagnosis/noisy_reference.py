@@ -17,7 +17,6 @@ effective number of stretches less one as the degrees of freedom. The p-value of
 is that of a single one times their number; single events are counted separately. A cause is
 established if it is also selected without each fold, and predicts the stretches of the folds
 better than no cause; otherwise it is suspected.
-
 """
 
 from __future__ import annotations
@@ -29,66 +28,24 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import (
-    BASE_VALUES,
-    CauseTerm,
-    design_matrix,
-    effective_clusters,
-    fit_spans,
-    HEADING_TREATMENT,
-    lay_out_spans,
-    MIN_STRETCHES,
-    MISALIGNMENT_TERM,
-    SpanFit,
-    Spans,
-    whiten_regression,
-    WhitenedRegression,
-)
+    BASE_VALUES, CauseTerm, design_matrix, effective_clusters, fit_spans, HEADING_TREATMENT,
+    lay_out_spans, MIN_STRETCHES, MISALIGNMENT_TERM, SpanFit, Spans, whiten_regression,
+    WhitenedRegression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.own_instants import OwnInstants
 from gyro_calibration.diagnosis.candidates import (
-    lasting_shapes,
-    MAX_STEP_TIME_LACK,
-    MIN_CHANNEL_RANGE,
-)
+    lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies,
-    Cause,
-    CAUSES,
-    make_finding,
-    mark_parts_of_log,
-    mark_suspected,
-    SINGLE_EVENT_REMEDY,
-    untestable_causes,
-)
+    add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected,
+    SINGLE_EVENT_REMEDY, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    add_terms,
-    gain_from_squares,
-    heading_curve,
-    heading_error_shares,
-    HEADING_WINDOW,
-    MAX_WINDOW_SHARE,
-    previous_origins,
-    window_changes,
-)
+    add_terms, gain_from_squares, heading_curve, heading_error_shares, HEADING_WINDOW,
+    MAX_WINDOW_SHARE, previous_origins, window_changes)
 from gyro_calibration.diagnosis.findings import (
-    Curve,
-    Diagnosis,
-    Estimate,
-    Finding,
-    Gain,
-    MIN_PROBABILITY,
-    NOT_OFFERED,
-    OnProgress,
-    probabilities,
-    Reference,
-    RULED_OUT_DEFICIT,
-    SEARCH_ALARM_SHARE,
-    SUSPECTED_RATE_FACTOR,
-    TIME_LIMIT_REMARK,
-    Trace,
-    VALUE_ALARM_SHARE,
-)
+    Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
+    probabilities, Reference, RULED_OUT_DEFICIT, SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR,
+    TIME_LIMIT_REMARK, Trace, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
@@ -144,7 +101,6 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     Diagnose a log with a reference whose errors are larger than those of the gyro.
 
     The instants are those of a slow reference, by `keep_own_instants`.
-
     """
     on_progress(None, 'data quality')
     if reference.kind != 'rate_command' and log.reference_heading is not None:
@@ -373,7 +329,6 @@ def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
     Return the k of a sine response of amplitude 1, and its derivative by the fitted amplitude.
 
     The effect, ``sin(k w) / k - w``, is proportional to k² to first order.
-
     """
     root = math.sqrt(max(amplitude, 0.0))
     return term.shapes[0] * root, 0.5 * term.shapes[0] / max(root, 1e-3)
@@ -567,7 +522,6 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
 
     Where too few stretches turn, none that follows the rate can be told from the scale factor
     error.
-
     """
     log, fine, time = fit.spans.log, fit.spans.treatment.is_fine, fit.spans.time
     has = {name for name, least in MIN_CHANNEL_RANGE.items()
@@ -668,7 +622,6 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
     is fitted again with the steps, so that a random walk that they had caused does not hide them,
     and one that the log has is not a step. Of three steps those that are not significant are
     removed, the weakest first.
-
     """
     times = fit.spans.time[2:-2]
     every = max(len(times) // 200, 1)
@@ -866,7 +819,6 @@ def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice]
 
     Return the gain in log-likelihood over its standard deviation by the scatter of stretches, the
     gain, and the share of the folds in which one of the equivalent causes was selected.
-
     """
     gains: list[float] = []
     same_choices = 0

@@ -23,107 +23,36 @@ from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInst
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
-    Candidate,
-    common_channels,
-    constant_channels,
-    is_named,
-    observed_range,
-    PART_OF_LOG,
-    RESPONSE,
-    unnamed_variable,
-)
+    Candidate, common_channels, constant_channels, is_named, observed_range, PART_OF_LOG, RESPONSE,
+    unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies,
-    Cause,
-    CAUSES,
-    make_finding,
-    mark_parts_of_log,
-    mark_suspected,
-    next_experiment,
-    REFERENCES,
-    SINGLE_EVENT_REMEDY,
-    untestable_causes,
-)
+    add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected, next_experiment,
+    REFERENCES, SINGLE_EVENT_REMEDY, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
-    add_causes,
-    add_origin_notes,
-    drop_samples,
-    extend_model,
-    heading_contributions,
-    heading_error_shares,
-    is_scale_implausible,
-    measure_gain,
-    merge_self_calibration,
-    unmergeable_causes,
-)
+    add_causes, add_origin_notes, drop_samples, extend_model, heading_contributions,
+    heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
+    unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
-    Diagnosis,
-    Estimate,
-    Finding,
-    Gain,
-    Gate,
-    MIN_PROBABILITY,
-    NOT_OFFERED,
-    OnProgress,
-    probabilities,
-    Reference,
-    SEARCH_ALARM_SHARE,
-    TIME_LIMIT_REMARK,
-    Unexplained,
-    VALUE_ALARM_SHARE,
-)
+    Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
+    probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
+    VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.gates import (
-    check_gates,
-    check_model_units,
-    classify_reference,
-    identify_sample_offset,
-    is_at_rest,
-    is_reference_limiting,
-    mismatch_finding,
-    refuse_unusable,
-)
+    check_gates, check_model_units, classify_reference, identify_sample_offset, is_at_rest,
+    is_reference_limiting, mismatch_finding, refuse_unusable)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
-    follow_reference,
-    FollowedReference,
-    follows_rate,
-    HIDDEN_CAUSES,
-    is_late,
-)
+    follow_reference, FollowedReference, follows_rate, HIDDEN_CAUSES, is_late)
 from gyro_calibration.diagnosis.regression import (
-    average_filtered_noise,
-    build_problem,
-    fit_causes,
-    forget_fits,
-    is_single_event,
-    RegressionFit,
-    SMOOTHED_RATIO,
-    Value,
-)
+    average_filtered_noise, build_problem, fit_causes, forget_fits, is_single_event, RegressionFit,
+    SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
-    allan_curves,
-    find_changed_figures,
-    fit_noise_parameters,
-    heading_error_curve,
-    model_residuals,
-    NOISE_NAMES,
-    residual_curves,
-)
+    allan_curves, find_changed_figures, fit_noise_parameters, heading_error_curve, model_residuals,
+    NOISE_NAMES, residual_curves)
 from gyro_calibration.diagnosis.search import (
-    complexity_penalty,
-    confirm_causes,
-    evidence_for,
-    evidence_threshold,
-    p_value,
-    refine_jointly,
-    Scored,
-    Search,
-    search_causes,
-    Selection,
-    start_search,
-)
+    complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
+    Scored, Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
@@ -396,7 +325,6 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     stretch by stretch (Mann and Whitney). Unless the response of the motion is among the causes,
     they have to be twice as large between dwells. Dwells of less than half the range of rates,
     such as rests alone, do not show what the motion does.
-
     """
     try:
         dwells = find_dwells(log)

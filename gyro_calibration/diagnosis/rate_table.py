@@ -14,7 +14,6 @@ The diagnosis of a rate table, a log without time whose rows are dwells.
 Effects of a model that are not refitted are subtracted from the output first. A polynomial of the
 output is not refitted: together with effects of the rate it would explain the dwells by itself,
 because output less rate is the error to be explained.
-
 """
 
 from __future__ import annotations
@@ -25,74 +24,26 @@ from itertools import product
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
-    dwells_from_table,
-    format_list,
-    MIN_TEMPERATURE_SPREAD,
-    select_dwells,
-)
+    Dwells, dwells_from_table, format_list, MIN_TEMPERATURE_SPREAD, select_dwells)
 from gyro_calibration.calibration.rate_table import (
-    Calibration,
-    channels_of,
-    CONFOUNDERS,
-    equal_bins,
-    fit_effects,
-    replaced_term,
-    sensitivity_columns,
-    static_terms,
-    value_owners,
-)
+    Calibration, channels_of, CONFOUNDERS, equal_bins, fit_effects, replaced_term,
+    sensitivity_columns, static_terms, value_owners)
 from gyro_calibration.calibration.scatter import cross_validation_parts, MIN_SWEEPS, surface_dof
 from gyro_calibration.calibration.selection import (
-    BASIC_EFFECTS,
-    distinguishing_rate,
-    FALSE_ALARM_RATE,
-    find_supported_effects,
-    MIN_DISTINGUISHING_SIGMAS,
-    resolve_confounders,
-    TECHNOLOGY_EFFECTS,
-    try_fit,
-    try_replace,
-)
+    BASIC_EFFECTS, distinguishing_rate, FALSE_ALARM_RATE, find_supported_effects,
+    MIN_DISTINGUISHING_SIGMAS, resolve_confounders, TECHNOLOGY_EFFECTS, try_fit, try_replace)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies,
-    Cause,
-    CAUSES,
-    make_finding,
-    REFERENCES,
-    untestable_causes,
-)
+    add_remedies, Cause, CAUSES, make_finding, REFERENCES, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
-    gain_from_squares,
-    HEADING_WINDOW,
-    origin_notes,
-    previous_origins,
-    widen_range,
-)
+    gain_from_squares, HEADING_WINDOW, origin_notes, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
-    Curve,
-    Diagnosis,
-    Estimate,
-    Finding,
-    Gain,
-    OnProgress,
-    Unexplained,
-)
+    Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
-    BIAS,
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    CATALOGUE,
-    CUBIC_NONLINEARITY,
-    Effect,
-    SCALE_FACTOR_ERROR,
-    SCALE_FACTOR_TEMPERATURE,
-    SINE_RESPONSE,
-    STATIC_EFFECTS,
-)
+    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, CUBIC_NONLINEARITY, Effect,
+    SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -248,7 +199,6 @@ class NamedCauses:
 
         Of the false-alarm rate, 65 % is for causes other than bias and scale factor, and 10 % for
         a bias and a scale factor that differ from the model's.
-
         """
         share = 0.1 if effect in BASIC_EFFECTS else 0.65
         return share * self.false_alarm_rate / self.tested_count(effect)
@@ -459,7 +409,6 @@ def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
     Return the size of an effect that is found with 95 %, in the unit of its first value.
 
     That of a sine response is by the cubic: a small one equals -k² w³ / 6.
-
     """
     fit, fitted = named.fit, CUBIC_NONLINEARITY if effect is SINE_RESPONSE else effect
     by_cubic = fit if fitted is effect else try_replace(fit, effect, fitted)

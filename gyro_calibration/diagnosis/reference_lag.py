@@ -15,7 +15,6 @@ Its delay, lag and overshoot are those of the drives, not of the gyro. They are 
 response of any shape, and the log is then diagnosed against the motion that follows, without what
 any other such response would explain. A delay, a lag or a clock rate of the gyro cannot be known
 then, and neither can a slip.
-
 """
 
 from __future__ import annotations
@@ -32,19 +31,9 @@ from gyro_calibration.diagnosis.extended_model import drop_samples
 from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
 from gyro_calibration.diagnosis.noisy_reference import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.regression import (
-    build_problem,
-    fit_causes,
-    likelihood_with,
-    RegressionFit,
-)
+    build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (
-    cosine_transform,
-    kernel_lags,
-    LEAD,
-    LONGEST_LAG,
-    Replay,
-    response_kernels,
-)
+    cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.stats import norm
@@ -90,7 +79,6 @@ def is_late(fit: RegressionFit) -> bool:
 
     By the likelihood under the noises of the logs: a random walk of the bias turns the output by
     far more than a delay does.
-
     """
     def likelihood(*lags: float) -> float:
         return max(likelihood_with(fit, effect_candidate('time_offset', each)) for each in lags)
@@ -123,7 +111,6 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
 
     It is fitted with effects of the gyro along the motion, and with the noise that a first
     response leaves.
-
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
     longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]
@@ -174,7 +161,6 @@ def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
     exponentially with the lag: the response gets smooth and fades (the stable spline of order 1 of
     Pillonetto, Chiuso and De Nicolao, Automatica 47, 2011). Its time constant and size are the
     likeliest. The scale factor error has a prior too.
-
     """
     reduced = np.asarray(np.linalg.qr(transforms.T, mode='r'))
     count = transforms.shape[1] - own_count

@@ -19,7 +19,6 @@ over the noises, at the most likely value of the cause (a flat prior, scaled so 
 noise the evidence is n² / 2 for a value of n standard deviations).
 
 Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candidates.
-
 """
 
 from __future__ import annotations
@@ -30,22 +29,10 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 from gyro_calibration.diagnosis.candidates import (
-    Candidate,
-    candidate_transforms,
-    fitted_shape_indices,
-    MAX_STEP_TIME_LACK,
-    MAX_STEP_TIMES,
-    smooth_shapes,
-    with_shape,
-)
+    Candidate, candidate_transforms, fitted_shape_indices, MAX_STEP_TIME_LACK, MAX_STEP_TIMES,
+    smooth_shapes, with_shape)
 from gyro_calibration.diagnosis.replay import (
-    band_starts,
-    coefficient_angles,
-    inverse_cosine_transform,
-    noise_grid,
-    NoiseShape,
-    Replay,
-)
+    band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay)
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
@@ -208,7 +195,6 @@ class RegressionFit:
 
         This is the restricted likelihood without its dependence on the units of the columns: see
         `column_evidence`.
-
         """
         best = self.best_noise
         _, logarithm = np.linalg.slogdet(self.information[best])
@@ -610,7 +596,6 @@ def _changed_likelihood(fit: RegressionFit, added: int, squares: Array,
 
     Given are the squares that they leave, and the logarithm of the factor of the determinant of
     the information, shape (g,).
-
     """
     freedom = fit.degrees_of_freedom
     likelihood = fit.noise_log_likelihood + 0.5 * (
@@ -681,7 +666,6 @@ def average_filtered_noise(fit: RegressionFit,
     frequencies, so that small errors of motion and reference would have too much weight there. It
     shows in the residual of the causes, as motion that is delayed or filtered would pass for
     noise.
-
     """
     while any(is_filtered := [
             _high_frequency_power_ratio(part) < max_ratio

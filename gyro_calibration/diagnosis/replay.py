@@ -16,7 +16,6 @@ are exact eigenvectors of white noise and of a rate random walk with any start, 
 ones of a Gauss-Markov process. The coefficient of order 0 is the bias and is left out. The
 rounding of an encoder is white noise of the heading; differentiation by cubic splines multiplies
 its variance by ``(3 sin / (2 + cos))²``.
-
 """
 
 from __future__ import annotations
@@ -28,13 +27,8 @@ import math
 
 from gyro_calibration.calibration.heading_regression import SPECTRUM_BINS
 from gyro_calibration.diagnosis.gates import (
-    heading_spline,
-    MIN_SAMPLES,
-    MIN_VALID_SHARE,
-    resample_reference,
-    select_reference,
-    spline_rate,
-)
+    heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
+    spline_rate)
 from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
 from gyro_calibration.logs.quality import find_runs, white_noise_deviation
@@ -121,7 +115,6 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     replace, has a correlation time between some samples and this duration. Combinations in which
     one of them is small beside the other at all frequencies are left out. The variance of a walk
     alone is known the better, the more coefficients it dominates.
-
     """
     small, lowest = _SMALL_NOISE_SHARE, (math.pi / duration) ** 2
     highest, alone = 1.0 / interval ** 2, [small * lowest]
@@ -231,7 +224,6 @@ class Replay:
         It is the one that predicts the samples best, less a line along the rate: in white noise a
         sixteenth of the log, which repeats its noise in 16 coefficients only; in a random walk
         fewer.
-
         """
         longest = len(self.grid_index) // 16
         rate, left = ((each - each.mean())[self.valid] for each in (
@@ -285,7 +277,6 @@ class Replay:
 
         Their transforms, weighted by the noise and not, shape (k, points - 1), with products 1;
         their kernels, shape (k, lags); and their variance by the prior over that by the noise.
-
         """
         columns = np.array([self._transform(each) for each in self.delayed_commands(
             self.responses)])
@@ -327,7 +318,6 @@ def response_kernels(interval: float) -> Array:
 
     Together they are any response that is linear between lags, of which each is later by a
     sample or `_LAG_RATIO`, whichever is more: what is slow in a motion is smooth.
-
     """
     lags = [-_leading_lags(interval), 1 - _leading_lags(interval)]
     while lags[-1] * interval < LONGEST_LAG:
@@ -350,7 +340,6 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
 
     Gaps are filled with noise of the generator. Steps are those of `DataQuality`; no
     model is an ideal gyro. Raises `DataRefused` if too few samples can be used.
-
     """
     assert log.time is not None and log.output is not None
     time = _even_time(log.time)
@@ -427,7 +416,6 @@ def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> 
     If the steps are not small compared with the noise, it depends on the rate, and would pass for
     structure along the rate. It is the Fourier series of a sawtooth, smoothed by the noise before
     the rounding (Widrow, Kollar and Liu 1996).
-
     """
     scale, bias = (np.polyfit(rate[valid], output[valid], 1) if np.ptp(rate[valid]) > 0.0
                    else (1.0, float(output[valid].mean())))
@@ -517,7 +505,6 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     a 72nd of the sixth difference, which passes for a dead zone or a slip. That of a smooth
     motion is small at any acceleration; where a noisy reference has bends everywhere, none are
     excluded.
-
     """
     bend = np.abs(np.diff(np.pad(rate, 3, mode='edge'), 6)) / 72.0
     white = white_noise_deviation((output - rate)[valid])
@@ -532,7 +519,6 @@ def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
 
     Each frequency is weighted by the share of its power above that of the rounding, so that fast
     motion remains.
-
     """
     coefficients = dct(rate, norm='ortho')
     rounding = ((step / interval) ** 2 / 12.0

@@ -13,7 +13,6 @@ A diagnosis as one page that needs nothing else: no network, no other files.
 
 All text in an element is escaped, so that no text can become an element. Charts are SVG drawn by
 matplotlib, each with the table of its values, which is there alone without matplotlib.
-
 """
 
 from __future__ import annotations
@@ -32,28 +31,10 @@ import warnings
 
 import gyro_calibration
 from gyro_calibration.diagnosis.findings import (
-    Curve,
-    Diagnosis,
-    Estimate,
-    HeadingCurve,
-    NoiseCurve,
-    Trace,
-)
+    Curve, Diagnosis, Estimate, HeadingCurve, NoiseCurve, Trace)
 from gyro_calibration.diagnosis.words import (
-    as_sentence,
-    cause_paragraphs,
-    cause_title,
-    display_unit,
-    format_amount,
-    format_number,
-    format_quantity,
-    headline,
-    is_model_extended,
-    lists,
-    noise_rows,
-    readable_name,
-    verdict_phrase,
-)
+    as_sentence, cause_paragraphs, cause_title, display_unit, format_amount, format_number,
+    format_quantity, headline, is_model_extended, lists, noise_rows, readable_name, verdict_phrase)
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import Array, DEGREE, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.model_file import format_model

@@ -12,7 +12,6 @@
 Residuals of logs: noise parameters of IEEE Std 952 compared with those of the model, and curves.
 
 The curves are along each variable, of the given and of the extended simulation.
-
 """
 
 from __future__ import annotations
@@ -26,20 +25,10 @@ from typing import TypeAlias
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
-from gyro_calibration.diagnosis.findings import (
-    Curve,
-    HeadingCurve,
-    NoiseCurve,
-    RULED_OUT_DEFICIT,
-)
+from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve, RULED_OUT_DEFICIT
 from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
-    coefficient_angles,
-    cosine_transform,
-    NoiseShape,
-    Replay,
-    spline_derivative_gain,
-)
+    coefficient_angles, cosine_transform, NoiseShape, Replay, spline_derivative_gain)
 from gyro_calibration.diagnosis.search import VALUE_PENALTY
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
@@ -137,7 +126,6 @@ def fit_noise_parameters(fit: RegressionFit, is_rounding_modelled: bool = False)
     Frequencies with more power than the noise, such as those of a vibration, are left out. The
     angle random walk is without rounding noise if the model has quantization; otherwise it may
     include it.
-
     """
     bands = drop_tone_bands(_band_energies(fit))
     if not is_rounding_modelled:
@@ -159,7 +147,6 @@ def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
     or a Gauss-Markov process of any correlation time. The angle random walk may include the
     rounding of the output, unless the model has quantization. It is not compared with an encoder,
     whose steps hide it, and no figure is if the model has none.
-
     """
     expected = model.noise
     if not expected.angle_random_walk:
@@ -337,7 +324,6 @@ def _bin_variances(fit: RegressionFit, bins: Sequence[NDArray[np.intp]]) -> Arra
 
     Slow noise is correlated between samples; its cosine transform is not. Noise that averages out
     among the samples of one grid point is white.
-
     """
     problem, total = fit.problem, np.zeros(CURVE_BINS)
     relative = (fit.noise_probability * fit.residual_squares

@@ -15,7 +15,6 @@ Causes are added one by one, the strongest first. The shapes of the candidates a
 one is selected, so that a large effect of a slightly wrong shape leaves no residual that other
 causes would explain. A cause that is selected is confirmed if it predicts stretches of the logs
 that are held out, and if the interval of its size excludes 0.
-
 """
 
 from __future__ import annotations
@@ -27,48 +26,18 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
-    Candidate,
-    candidate_transforms,
-    depends_on_rate,
-    effect_candidate,
-    fitted_shape_indices,
-    gaussian_pulse,
-    generic_terms,
-    indices_by_cause,
-    is_discontinuous,
-    is_named,
-    MAX_STEP_TIMES,
-    propose_candidates,
-    unnamed_variable,
-    with_shape,
-)
+    Candidate, candidate_transforms, depends_on_rate, effect_candidate, fitted_shape_indices,
+    gaussian_pulse, generic_terms, indices_by_cause, is_discontinuous, is_named, MAX_STEP_TIMES,
+    propose_candidates, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
-    OnProgress,
-    RULED_OUT_DEFICIT,
-    SUSPECTED_RATE_FACTOR,
-)
+    OnProgress, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.diagnosis.regression import (
-    build_problem,
-    column_evidence,
-    ColumnGroups,
-    fit_causes,
-    free_amplitude,
-    group_columns,
-    Indices,
-    is_rate_distortion,
-    likelihood_with,
-    likelihood_without,
-    MIN_INDEPENDENT_SHARE,
-    RegressionFit,
-    RegressionProblem,
-)
+    build_problem, column_evidence, ColumnGroups, fit_causes, free_amplitude, group_columns,
+    Indices, is_rate_distortion, likelihood_with, likelihood_without, MIN_INDEPENDENT_SHARE,
+    RegressionFit, RegressionProblem)
 from gyro_calibration.diagnosis.replay import (
-    coefficient_angles,
-    cosine_transform,
-    inverse_cosine_transform,
-    Replay,
-)
+    coefficient_angles, cosine_transform, inverse_cosine_transform, Replay)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.fft import fft
@@ -124,7 +93,6 @@ def p_value(cause: str, evidence: float) -> float:
     cause is not larger, so that twice the evidence is at most chi-squared with one degree of
     freedom. That of a scanned cause, at the best of all places, is half a chi-squared with two
     degrees of freedom less the logarithm of their number.
-
     """
     evidence = max(evidence, 0.0)
     return math.exp(-evidence) if cause in MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
@@ -214,7 +182,6 @@ def find_strongest(search: Search, causes: Sequence[Candidate],
 
     Return the best cause, None if none is significant, and all that were refined with their
     log-likelihoods, the best first; if none is significant, those that are suspected.
-
     """
     key = tuple((each.cause, each.log_index, *each.shapes) for each in causes)
     if key in search.step_cache:
@@ -250,7 +217,6 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
     Return the best first shape of each cause with its evidence.
 
     Its penalty is the difference to the mean evidence over all first shapes of the cause.
-
     """
     found = search.candidate_evidence(fit)
     # A second cause of this kind would only correct the shape of the first.
@@ -306,7 +272,6 @@ def is_lasting(candidate: Candidate) -> bool:
     Tell whether a cause acts in all logs and has a free size: only such causes are suspected.
 
     A limit or a delay has no size apart from its shape, and its refinement would fit single peaks.
-
     """
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
@@ -369,7 +334,6 @@ def find_steps(fit: RegressionFit) -> list[Scored]:
     Return the clearest step of the bias at any time, under the likeliest noise.
 
     Beside a random walk that soon exceeds the white noise, a step shows for a short time only.
-
     """
     best, split_by_log = fit.best_noise, fit.problem.split_by_log
     covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
@@ -471,7 +435,6 @@ def search_causes(search: Search) -> Causes:
     If structure without a name is found, the search is repeated without generic terms, as the sum
     of several causes along one variable may resemble none of them, and the likelier result is
     used.
-
     """
     everything = _select_forward(search)
     if all(is_named(each) for each in everything):
@@ -504,7 +467,6 @@ def _with_part_of_log(search: Search, causes: Causes) -> Causes:
 
     Where a bias differs in a part of a log, a random walk explains it about as well as one step:
     the steps are looked for in white noise too.
-
     """
     # without generic terms nothing tells a part from another structure in time
     if ('bias_step' not in search.scanned_causes or len(causes) + 2 > MAX_CAUSES
@@ -564,7 +526,6 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
 
     Of two distortions of the rate, such as a delay and a lag, one may stand in for the other:
     without one, the shape of the other is refined.
-
     """
     fit = fit_causes(search.problem, causes)
     rest = (*causes[:cause_index], *causes[cause_index + 1:])
@@ -596,7 +557,6 @@ def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
 
     A name is withdrawn if structure without a name lies along the same variable, if there are many
     tones, or if a cause along a temperature differs between logs.
-
     """
     variables = {unnamed_variable(each)
                  for each in causes if not is_named(each)}
@@ -664,7 +624,6 @@ def _remove_unconfirmed(search: Search, causes: Causes,
 
     A cause whose shape the data do not determine may have any size: its simplest alternative,
     which has no such shape, is tested in its place.
-
     """
     removed: Causes = ()
     while causes:
@@ -694,7 +653,6 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
 
     Given the others, it is scaled to fit best without each stretch in turn. No other stretch
     shows a single event: slips, and a step of the bias that a random walk soon hides.
-
     """
     full, found = fit_causes(search.problem, causes), []
     left = full.whitened_series()
@@ -739,7 +697,6 @@ def choose_simplest(search: Search, named: Causes,
     Replace each cause by its simplest alternative.
 
     Return the causes, and for each itself and its alternatives, with deficits in log-likelihood.
-
     """
     sets = []
     for place in range(len(named)):

@@ -19,13 +19,7 @@ import textwrap
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
-    Change,
-    Diagnosis,
-    Estimate,
-    Finding,
-    MIN_PROBABILITY,
-    Unexplained,
-)
+    Change, Diagnosis, Estimate, Finding, MIN_PROBABILITY, Unexplained)
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects

@@ -13,5 +13,4 @@ Rates to heading: gaps, integration, standstill, bias, and the uncertainty of th
 
 Reading order: `integration`, `kalman`, `stationary`, `steady_rates`, `tracker`,
 `bias_table`, `heading_estimator`, `log_compensation`.
-
 """

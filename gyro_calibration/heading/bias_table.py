@@ -27,7 +27,6 @@ values.
 A tracker uses a copy of the table, and has an error of the temperature coefficient in its own
 state, in units of the uncertainty of the table. New entries are used when the tracker is
 restarted, at a rest more than 5 K away; both at once would compensate the bias twice.
-
 """
 
 from __future__ import annotations
@@ -150,7 +149,6 @@ class BiasTable:
         It is the mean of the rate after the model and before the self-calibration, rad/s, with its
         variance by white noise, (rad/s)²; the wander of the bias is added here. The temperature is
         in degC, the time in s since 1970.
-
         """
         given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
         if not _is_possible(given):
@@ -262,7 +260,6 @@ class BiasTable:
 
         The age is in s, the present time in s since 1970, and the present temperature in degC,
         None where it is not known; `this_run` tells that the calibration was made in this run.
-
         """
         assert calibration.covariance is not None
         (of_scale, shared), (_, own) = calibration.covariance
@@ -459,7 +456,6 @@ def read_bias_table(path: str | Path, model: GyroModel,
 
     A sentence says why it is empty although there is a file, which is kept under another name when
     a new one is written; else it is ''.
-
     """
     try:
         digest, entries, jumps = _read_file(Path(path))
@@ -483,7 +479,6 @@ def write_bias_table(path: str | Path, table: BiasTable,
 
     A file in its place that is unreadable or not of this model is kept under another name, in a
     sentence that is returned first, else ''. Raise `OSError` where the folder is not writable.
-
     """
     message = _keep_aside(Path(path), table.digest)
     entries = [{'temperature': round(each.temperature, 3), 'bias': _round_digits(each.bias),

@@ -14,7 +14,6 @@ The heading on a robot, sample by sample, by model, calibration, temperature and
 The computations are in `compensation`, `tracker` and `bias_table`. This module propagates a
 calibration to the present time and temperature, corrects the bias for the temperature while the
 robot drives, and adds the bias at rest to the table for the next run.
-
 """
 
 from __future__ import annotations
@@ -27,25 +26,13 @@ import math
 from typing import Any
 
 from gyro_calibration.heading.bias_table import (
-    AGE_TOLERANCE,
-    BiasTable,
-    OUTLIER_SIGMAS,
-    Prior,
-    REST_DURATION,
-    TemperatureCorrection,
-    YEAR,
-)
+    AGE_TOLERANCE, BiasTable, OUTLIER_SIGMAS, Prior, REST_DURATION, TemperatureCorrection, YEAR)
 from gyro_calibration.heading.integration import TIME_TOLERANCE
 from gyro_calibration.heading.stationary import BLOCK_DURATION
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MAX_TIME, Number
 from gyro_calibration.model.compensation import (
-    compensate,
-    CompensatedSamples,
-    quadratic_form,
-    rate_sensitivity,
-    uncertainty_covariance,
-)
+    compensate, CompensatedSamples, quadratic_form, rate_sensitivity, uncertainty_covariance)
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 import numpy as np
@@ -110,7 +97,6 @@ class HeadingEstimator:
     of the uncertain values of the current model. `rate` is the last one, rad/s, zero at rest, and
     `corrected_rate` that before the tracker. `temperature`, degC, is None before the first. The
     sum of `heading_before_resets` and the heading of the tracker, rad, is not changed by resets.
-
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
@@ -328,7 +314,6 @@ class HeadingEstimator:
         Stamp and present date are in s, the output in rad/s, the specific force in m/s² and the
         supply in V, where they came; `wheels` tells whether wheels or commands move the robot,
         None where unknown. Where the sample is refused, only `refused_count` grows.
-
         """
         if not self.is_plausible(time, output, force):
             self._refused_count += 1
@@ -424,7 +409,6 @@ class HeadingEstimator:
         s since 1970, and a temperature that did not come is nan. The result, shape (n, 8), has
         heading, its variance, rate, its variance, 1 at rest, the rate before the tracker, and 1
         where the temperature was clipped and where the output is beyond the range of the model.
-
         """
         found, place = np.empty((len(time), 8)), 0
         while place < len(time):

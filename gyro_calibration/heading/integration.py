@@ -21,7 +21,6 @@ d, it may have changed at any time in the gap of T, so that the integral has the
 T² d² / 12. It depends on the two samples at the ends alone, each with the noise N² / dt, so that
 the variance by noise is T² N² / (2 dt) instead of N² T. A vibration does not show at the ends: its
 variance is that of the rates of the last seconds, see `varied_variance`.
-
 """
 
 from __future__ import annotations
@@ -71,7 +70,6 @@ class Intervals:
         Take intervals, s, as `add` does one by one, and return two arrays of shape (n,).
 
         They are the usual interval after each, s, and the number of samples lost in it.
-
         """
         taken, usual, lost = 0, np.empty(len(intervals)), np.zeros(len(intervals), int)
         while taken < len(intervals):
@@ -92,7 +90,6 @@ class Intervals:
         Return how many samples are lost in an interval, s, and count them.
 
         Called alone for an interval that is not integrated, which is excluded from the usual one.
-
         """
         if interval > self._gap_limit:
             self._late_samples = max(round((interval - self._even_interval) / self.usual_interval),
@@ -127,7 +124,6 @@ def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[in
 
     The intervals are those before each sample; `elapsed` is the duration of the first block so
     far, s.
-
     """
     until, ends = np.cumsum(intervals).tolist(), list[int]()
     target, place = length - TIME_TOLERANCE - elapsed, 0
@@ -145,7 +141,6 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
 
     Given are the usual interval, s, the number of lost samples, and the interval, s, and the step
     of the rate, rad/s, between the samples around a gap.
-
     """
     ends = noise.angle_random_walk ** 2 / usual
     surplus = np.minimum(lost * usual, interval)
@@ -167,7 +162,6 @@ def varied_variance(noise: Noise, usual: float, interval: float, time: Array,
     The ends of a gap do not show a vibration. It is the mean square of the same error over all
     intervals of this length without the gap, less that by noise. Given are the usual interval, and
     that of the gap, s, and samples before it, s and rad/s, shape (n,).
-
     """
     ends = time[time >= time[0] + interval]
     if not len(ends):
@@ -267,7 +261,6 @@ class BlockIntegrator:
 
     The result is that of a `tracker.HeadingTracker` that does not detect rest. Over a gap longer
     than `MAX_GAP` nothing is integrated: the robot may have turned to any direction.
-
     """
 
     def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
@@ -284,7 +277,6 @@ class BlockIntegrator:
 
         Rates, rad/s, are those before the threshold filter, and the sensitivity, shape (m, n), as
         in `compensation`. Returned are filtered rates, heading and its deviation, rad.
-
         """
         if not len(time):
             return rate, rate, rate

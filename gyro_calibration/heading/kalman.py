@@ -20,7 +20,6 @@ compensated rate, less the part that the state explains::
 At rest the true turn is zero, and the same equation is a measurement (d of Hong and Park, eq. 11,
 with the noise figures of the model). It determines the bias, and through the correlation with the
 heading also the earlier error of the heading.
-
 """
 
 from __future__ import annotations
@@ -260,7 +259,6 @@ def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, varianc
     s, is that of a self-calibration, whose bias, the last value, is a mean over
     `BIAS_AVERAGING_TIME`; None without one. Its variance contains the floor of the Allan deviation
     for the flicker, which is replaced here by that of the flicker components.
-
     """
     constants, flicker_variances = noise.flicker_processes()
     first = _FLICKER_INDEX + len(constants)
@@ -287,7 +285,6 @@ def heading_variances(states: list[HeadingState], durations: Array, lost: Array,
 
     Of the integrals of rates, given are durations, s, and variances of what was lost and of its
     noise, rad², shape (k,), and the sensitivities, (k, m).
-
     """
     # flicker and random walk have the same parameters in all states
     seen, variances = _integrated_wander(states[0].noise, np.round(durations, 6))

@@ -12,7 +12,6 @@
 Compensation of a whole log, and its heading by filter or smoother.
 
 A model with history is evaluated over blocks of the log.
-
 """
 
 from __future__ import annotations
@@ -42,7 +41,6 @@ class LogCompensation:
     from the reference, interpolated between the values of the reference: before its first value
     the deviation is that at this value. Across the border of blocks the next value is not known,
     and the result differs slightly.
-
     """
 
     def __init__(self, model: GyroModel):

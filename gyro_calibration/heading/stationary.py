@@ -14,7 +14,6 @@ Detection of rest: energy of the rate against the known noise, and tests of mean
 Each test has its share of the false alarms per hour at rest. A detected rest may be a straight
 drive; its probability follows from the scatter of the means. The samples of a log are tested in
 whole blocks.
-
 """
 
 from __future__ import annotations
@@ -27,12 +26,7 @@ import math
 
 from gyro_calibration.heading.integration import block_ends, TIME_TOLERANCE
 from gyro_calibration.heading.kalman import (
-    HEADING_INDEX,
-    heading_variances,
-    HeadingState,
-    RateIntegral,
-    TrackStep,
-)
+    HEADING_INDEX, heading_variances, HeadingState, RateIntegral, TrackStep)
 from gyro_calibration.logs.log import Array, Mask, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -348,7 +342,6 @@ def update_scatter(state: Array, rate: float, noise: float, white: float) -> tup
     The scatter of means over 1 s is a process of first order, stationary at first. Given are the
     state before, (5, 1) or (5, k), the rate, rad/s, and the variances of its noise and of the
     white noise over 1 s, (rad/s)².
-
     """
     variance, shared = SCATTER_RATIOS * white, SCATTER_CORRELATIONS
     scatter, bias, own, joint, of_bias = state

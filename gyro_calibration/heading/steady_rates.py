@@ -18,7 +18,6 @@ of a rest and a straight drive. Their product is the probability of each. The bi
 of the first rest; the uncertainty of the heading contains all others, and the bias is changed when
 one of them is more probable than 95 %. Under another bias the rests until then were turns: the
 heading changes by the difference times the time since its begin.
-
 """
 
 from __future__ import annotations
@@ -28,13 +27,8 @@ from dataclasses import dataclass
 
 from gyro_calibration.heading.kalman import HeadingState, RateIntegral
 from gyro_calibration.heading.stationary import (
-    chi_squared_quantile,
-    MAX_SCATTER_RATIO,
-    MEAN_LAGS,
-    PRIOR_COUNTS,
-    SCATTER_RATIOS,
-    WINDOW_DURATION,
-)
+    chi_squared_quantile, MAX_SCATTER_RATIO, MEAN_LAGS, PRIOR_COUNTS, SCATTER_RATIOS,
+    WINDOW_DURATION)
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -80,7 +74,6 @@ class SteadyRates:
         Add an integral, which ends at a time, s; tell whether its rate is known to be steady.
 
         A rate that is off by so many standard deviations is another one.
-
         """
         rate, white = turn.angle / turn.duration, noise.angle_random_walk ** 2
         row = turn.sensitivity / turn.duration

@@ -14,7 +14,6 @@ The heading of a robot from compensated rates, with its variance, and the bias e
 At rest the bias is estimated, the rate is zero and the heading is constant. In motion the bias is
 constant, with a growing variance. A turn too slow to be detected at once is detected over a longer
 time; its rotation, which was attributed to the bias meanwhile, is then added to the heading.
-
 """
 
 from __future__ import annotations
@@ -26,54 +25,17 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.heading.integration import (
-    gap_variances,
-    Intervals,
-    MAX_GAP,
-    MAX_RATE,
-    RECENT_DURATION,
-    Threshold,
-    ThresholdFilter,
-    TIME_TOLERANCE,
-    varied_variance,
-)
+    gap_variances, Intervals, MAX_GAP, MAX_RATE, RECENT_DURATION, Threshold, ThresholdFilter,
+    TIME_TOLERANCE, varied_variance)
 from gyro_calibration.heading.kalman import (
-    HEADING_INDEX,
-    HeadingState,
-    initial_state,
-    RateIntegral,
-    STANDSTILL,
-    TrackStep,
-    WALK_INDEX,
-)
+    HEADING_INDEX, HeadingState, initial_state, RateIntegral, STANDSTILL, TrackStep, WALK_INDEX)
 from gyro_calibration.heading.stationary import (
-    Block,
-    BLOCK_DURATION,
-    BLOCK_RATIOS,
-    ENDING_RATES,
-    EnergyDetector,
-    Epoch,
-    EvenSamples,
-    MEAN_LAGS,
-    mean_threshold_sigmas,
-    median_ratio,
-    RestScatter,
-    Samples,
-    SETTLING_TIME,
-    SlowTurn,
-    Snapshot,
-    sum_ratios,
-    update_scatter,
-    WINDOW_DURATION,
-)
+    Block, BLOCK_DURATION, BLOCK_RATIOS, ENDING_RATES, EnergyDetector, Epoch, EvenSamples,
+    MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SETTLING_TIME, SlowTurn,
+    Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
 from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
-    Array,
-    CACHE_BLOCK_SAMPLES,
-    DEGREE,
-    Mask,
-    MIN_SAMPLE_INTERVAL,
-    Number,
-)
+    Array, CACHE_BLOCK_SAMPLES, DEGREE, Mask, MIN_SAMPLE_INTERVAL, Number)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +85,6 @@ class HeadingTracker:
     `deleted_heading` is that attributed to bias or noise at rest, or deleted by the threshold
     filter, rad. Samples beyond the largest rate are refused, those beyond the largest acceleration
     are outliers, and both count as lost; `rebuild_count` tells how often the state was not finite.
-
     """
 
     def __init__(self, noise: Noise, covariance: Array, settings: Settings,
@@ -137,7 +98,6 @@ class HeadingTracker:
         one. Steps are kept for `log_compensation.smooth_track`. The slope is the change of the
         sensitivity with the rate, shape (m,): the rates include the bias estimated at rest, on
         which a scale factor error does not act.
-
         """
         self._sensitivity_slope = sensitivity_slope
         self.steps, self._keeps_steps = list[TrackStep](), keeps_steps
@@ -224,7 +184,6 @@ class HeadingTracker:
 
         The heading does not jump. The estimate of the bias at rest is cleared, but the corrections
         of the heading by it remain.
-
         """
         heading = self.heading + self._pending_correction
         variance = self.variance - self._pending_correction ** 2
@@ -296,7 +255,6 @@ class HeadingTracker:
         that of the samples is used at rest too: their noise then acts as a scale factor error,
         which matters unless the scale factor is well known. `wheels` tells whether wheels or
         commands move the robot, or moved it since the last sample; None where that is not known.
-
         """
         if not -MAX_RATE < rate < MAX_RATE:
             self.refused_count += 1
@@ -393,7 +351,6 @@ class HeadingTracker:
 
         The sensitivity has shape (n, m), `still` too, or (m,). The result, shape (n, 5), has
         heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them.
-
         """
         given = Samples(time, rate, sensitivity, wheels, None if still is None
                         else np.broadcast_to(still, sensitivity.shape))

@@ -22,25 +22,13 @@ has no size; a figure of the noise changes until its spectrum is as far from the
 just detectable effect is from none.
 
 Reading order: `motion`, `noise`, `effects`, `size`, `log`, `conditions`.
-
 """
 
 from gyro_calibration_bench.hidden.conditions import (
-    hide_look_alike,
-    LOOK_ALIKES,
-    record_separating,
-)
+    hide_look_alike, LOOK_ALIKES, record_separating)
 from gyro_calibration_bench.hidden.effects import FORMS, OUTSIDE_CATALOGUE
 from gyro_calibration_bench.hidden.log import (
-    ALL,
-    Cause,
-    draw_gyro,
-    Gyro,
-    HiddenLog,
-    hide,
-    record,
-    Truth,
-)
+    ALL, Cause, draw_gyro, Gyro, HiddenLog, hide, record, Truth)
 from gyro_calibration_bench.hidden.motion import Session, session, session_from_motion
 from gyro_calibration_bench.hidden.noise import KINDS, NoiseFigures
 from gyro_calibration_bench.hidden.size import DETECTION_SIGMAS

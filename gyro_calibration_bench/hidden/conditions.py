@@ -20,7 +20,6 @@ with the rate and wanders over 3 s, is straight between fixes, and is late by -0
 kinds `held` and `lines` are headings with a value every so many s, held or on straight lines in
 between, `heldrate` and `linesrate` rates; `lost` is a heading that is repeated so many times for
 up to 2 s.
-
 """
 
 from __future__ import annotations

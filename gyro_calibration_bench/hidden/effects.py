@@ -16,7 +16,6 @@ Symbols: w rate, psi heading, t time since power-on, T temperature, y output. Ea
 state where in the chain they act: on the signal before all else ('signal'), added to it ('sum'),
 on the finished output ('output'), on the reference ('reference'), on single samples ('samples'),
 on the unit ('unit'), on the noise ('noise').
-
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ Logs with hidden effects, and the truth about them.
 The chain: the rate as the gyro senses it (time offset, clock, bandwidth); additions to it; noise;
 saturation; quantization; faults of samples; a wrong unit. Effects on the reference change the
 reference alone.
-
 """
 
 from __future__ import annotations
@@ -28,29 +27,12 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration_bench.hidden.effects import (
-    COUNTED_FAULTS,
-    effect_errors,
-    EffectForm,
-    FORMS,
-    OUTSIDE_CATALOGUE,
-    sensed_rate,
-    Shapes,
-    slip_angle,
-    STEP_EFFECTS,
-    top_rate,
-    UNIT_DELAYS,
-    UNIT_FACTORS,
-    WITHOUT_COLUMN,
-)
+    COUNTED_FAULTS, effect_errors, EffectForm, FORMS, OUTSIDE_CATALOGUE, sensed_rate, Shapes,
+    slip_angle, STEP_EFFECTS, top_rate, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN)
 from gyro_calibration_bench.hidden.motion import Session, session
 from gyro_calibration_bench.hidden.noise import draw_figures, generate_noise, NoiseFigures
 from gyro_calibration_bench.hidden.size import (
-    DETECTION_SIGMAS,
-    InformationMetric,
-    Likeness,
-    solve_noise,
-    solve_size,
-)
+    DETECTION_SIGMAS, InformationMetric, Likeness, solve_noise, solve_size)
 import numpy as np
 
 #: Recordings -> name of an effect -> what of it is not to be random.

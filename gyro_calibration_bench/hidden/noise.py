@@ -16,7 +16,6 @@ that never decays, and flicker is a ladder of stationary ones, whose time consta
 factors of four. The information on an effect is then exact and cheap: the precision matrix of all
 their states over all samples is banded, and so ``x' S^-1 y`` takes one banded Cholesky factor
 (`Whitening`).
-
 """
 
 from __future__ import annotations
@@ -62,7 +61,6 @@ def draw_figures(kind: str, generator: np.random.Generator) -> NoiseFigures:
 
     Flicker, random walk and Gauss-Markov process rise out of the white noise at random averaging
     times.
-
     """
     if kind not in KINDS:
         raise ValueError(f'no noise {kind!r}; wanted one of {", ".join(KINDS)}')
@@ -132,7 +130,6 @@ class Whitening:
     matrix, S^-1 = (1 - H C H' / v) / v with C = (P + H' H / v)^-1 and v the variance of the white
     noise. The steps of an encoder add a state for each sample, the error of the reference's
     heading, whose differences are in the residual.
-
     """
 
     def __init__(self, figures: NoiseFigures, count: int, interval: float,
@@ -210,7 +207,6 @@ def divergence(figures: NoiseFigures, expected: NoiseFigures, count: int,
 
     It is the root of twice the information that distinguishes them. For a small change of one
     figure it is the change over its standard deviation.
-
     """
     ratio = spectrum(figures, count, interval) / spectrum(expected, count, interval)
     return math.sqrt(float(np.sum(ratio - 1.0 - np.log(ratio))))

@@ -15,7 +15,6 @@ The minimum detectable effect, and the size at a multiple of it.
 Z, a bias of each recording and one scale; its standard deviation is 1 / sqrt(I), and
 `DETECTION_SIGMAS` of them are detected. A nonlinear effect has the size at which its whole finite
 error x has the norm `DETECTION_SIGMAS`: sqrt(x' S^-1 x - ...).
-
 """
 
 from __future__ import annotations
@@ -24,12 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 import math
 
 from gyro_calibration_bench.hidden.effects import (
-    effect_errors,
-    FORMS,
-    Shapes,
-    top_rate,
-    WITHOUT_COLUMN,
-)
+    effect_errors, FORMS, Shapes, top_rate, WITHOUT_COLUMN)
 from gyro_calibration_bench.hidden.motion import Session
 from gyro_calibration_bench.hidden.noise import divergence, NoiseFigures, Whitening
 import numpy as np
@@ -47,7 +41,6 @@ class InformationMetric:
 
     The encoder's step is in rad; `thin` samples are averaged to one first, which keeps what is
     slow. A nuisance known from a model ('bias', 'scale') can be left out.
-
     """
 
     def __init__(self, sessions: list[Session], figures: NoiseFigures, encoder_step: float = 0.0,
@@ -163,7 +156,6 @@ class Likeness:
     The columns of all effects of the catalogue in some recordings, over a grid of their shapes.
 
     The share of a column is counted in the covariance of the noise.
-
     """
 
     def __init__(self, sessions: list[Session], figures: NoiseFigures):

@@ -15,11 +15,7 @@ import math
 
 from chance import fewest, most, rms_bounds
 from gyro_calibration.calibration.dwells import (
-    dwells_from_table,
-    extract_dwells,
-    find_dwells,
-    join_dwells,
-)
+    dwells_from_table, extract_dwells, find_dwells, join_dwells)
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import Noise, simulate_noise

@@ -15,27 +15,14 @@ import json
 import math
 
 from gyro_calibration.calibration.motion_design import (
-    CalibrationForecast,
-    can_follow,
-    find_best_motion,
-    plain_motion,
-    RobotLimits,
-)
+    CalibrationForecast, can_follow, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.calibration.self_calibration import (
-    check_rest,
-    find_rest_after,
-    ReferenceErrors,
-    self_calibrate,
-)
+    check_rest, find_rest_after, ReferenceErrors, self_calibrate)
 from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model import presets
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    motion_from_rates,
-    read_motion,
-    ROBOT_MOTION,
-)
+    CALIBRATION_MOTION, motion_from_rates, read_motion, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest

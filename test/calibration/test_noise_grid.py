@@ -13,14 +13,8 @@
 import math
 
 from gyro_calibration.calibration.noise_grid import (
-    BandedNoise,
-    bias_wander_columns,
-    carried_shares,
-    difference_covariance,
-    fit_noise_grid,
-    heading_noise,
-    SharedNoise,
-)
+    BandedNoise, bias_wander_columns, carried_shares, difference_covariance, fit_noise_grid,
+    heading_noise, SharedNoise)
 import numpy as np
 import pytest
 

@@ -14,25 +14,13 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
-    dwells_from_table,
-    extract_dwells,
-    find_dwells,
-    select_dwells,
-)
+    Dwells, dwells_from_table, extract_dwells, find_dwells, select_dwells)
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
 from gyro_calibration.calibration.scatter import find_inliers
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.effects import (
-    BIAS,
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    rate_temperature_polynomial,
-    SCALE_FACTOR_ASYMMETRY,
-    SCALE_FACTOR_ERROR,
-    SINE_RESPONSE,
-    STATIC_EFFECTS,
-)
+    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, rate_temperature_polynomial,
+    SCALE_FACTOR_ASYMMETRY, SCALE_FACTOR_ERROR, SINE_RESPONSE, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 import pytest
@@ -62,7 +50,6 @@ def test_the_steps_of_a_coarse_output_are_in_the_intervals_of_bias_and_scale(noi
     Of steps of 0.5 deg/s, with noise in steps; the reference is exact.
 
     All rests are on one step, with one error, and no turn that is rounded is outlying.
-
     """
     step = 0.5 * DEGREE
     for seed in range(6):

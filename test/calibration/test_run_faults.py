@@ -12,7 +12,6 @@
 Self-calibration: bad runs are refused by name, good ones accepted, and rests check them.
 
 `benchmarks/fooled.py` does the first two with 200 runs of each kind at each noise level.
-
 """
 
 from functools import cache
@@ -26,25 +25,15 @@ from fooled import LEVELS, tried, WAYS
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY, ScaleBiasFit
 from gyro_calibration.calibration.run_faults import split_run
 from gyro_calibration.calibration.self_calibration import (
-    check_end,
-    check_rest,
-    describe_implausible_scale,
-    find_rest_after,
-    ReferenceErrors,
-    RunLimits,
-    self_calibrate,
-)
+    check_end, check_rest, describe_implausible_scale, find_rest_after, ReferenceErrors, RunLimits,
+    self_calibrate)
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    constant_rate_motion,
-    motion_from_headings,
-    motion_from_log,
-    motion_from_rates,
-)
+    CALIBRATION_MOTION, constant_rate_motion, motion_from_headings, motion_from_log,
+    motion_from_rates)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np

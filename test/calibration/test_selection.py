@@ -14,18 +14,10 @@ from dataclasses import replace
 
 from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, select_dwells
 from gyro_calibration.calibration.selection import (
-    FALSE_ALARM_RATE,
-    MIN_DISTINGUISHING_SIGMAS,
-    select_effects,
-    TECHNOLOGY_EFFECTS,
-)
+    FALSE_ALARM_RATE, MIN_DISTINGUISHING_SIGMAS, select_effects, TECHNOLOGY_EFFECTS)
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.effects import (
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    CUBIC_NONLINEARITY,
-    SINE_RESPONSE,
-)
+    BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 import pytest

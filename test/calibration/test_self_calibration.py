@@ -12,26 +12,16 @@
 Self-calibration: the paper's two methods, the likelihood fit, and refused data.
 
 The methods reproduce the paper's numbers, and the fit finds the truth with its stated deviation.
-
 """
 
 import contextlib
 
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.calibration.self_calibration import (
-    calibrate_bias,
-    fit_heading,
-    fit_likelihood,
-    fit_rate,
-    ReferenceErrors,
-    self_calibrate,
-)
+    calibrate_bias, fit_heading, fit_likelihood, fit_rate, ReferenceErrors, self_calibrate)
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION,
-    motion_from_headings,
-    motion_from_rates,
-)
+    CALIBRATION_MOTION, motion_from_headings, motion_from_rates)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from honest_runs import Gyro, GYROS, tried
 import numpy as np
@@ -105,7 +95,6 @@ def test_fits_are_unbiased_with_true_intervals_near_the_cramer_rao_bound(referen
 
     The blocks leave Student's t about 34 degrees of freedom. Few runs often hold the truth in all
     intervals: only many show intervals that are too wide.
-
     """
     errors, deviations = [], []
     for seed in range(runs):

@@ -11,10 +11,7 @@
 """The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
 from gyro_calibration.diagnosis.extended_model import (
-    heading_error_shares,
-    jackknife_change,
-    measure_gain,
-)
+    heading_error_shares, jackknife_change, measure_gain)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import start_search

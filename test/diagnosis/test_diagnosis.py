@@ -13,7 +13,6 @@ The diagnosis names hidden effects with their size, wins what is possible, and a
 
 The logs are made by `hidden`, which shares nothing with the package. The seeds of the fixed set
 are places in lists; those of the last test vary from run to run, and are printed.
-
 """
 
 from dataclasses import replace
@@ -34,16 +33,8 @@ from gyro_calibration.model.model_file import format_model, read_model
 from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration.model.noise import Noise
 from gyro_calibration_bench.hidden import (
-    draw_gyro,
-    FORMS,
-    hide,
-    KINDS,
-    NoiseFigures,
-    OUTSIDE_CATALOGUE,
-    record,
-    session,
-    session_from_motion,
-)
+    draw_gyro, FORMS, hide, KINDS, NoiseFigures, OUTSIDE_CATALOGUE, record, session,
+    session_from_motion)
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 import numpy as np
 import pytest
@@ -298,7 +289,6 @@ def in_fast_walk(crossing, seed, step_sigmas=0.0):
 
     The walk of the bias exceeds the white noise after a crossing time, s. One sigma of the step is
     that of the bias by the best filter: of a pair of such errors, before and after it.
-
     """
     generator, interval, count, white = np.random.default_rng(seed), 0.04, 7500, 4e-4
     walk, time = np.sqrt(3.0) * white / crossing, np.arange(count) * interval

@@ -15,10 +15,7 @@ from dataclasses import replace
 from diagnosed import log_of
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.extended_model import (
-    add_causes,
-    merge_self_calibration,
-    unmergeable_causes,
-)
+    add_causes, merge_self_calibration, unmergeable_causes)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay

@@ -14,7 +14,6 @@ What docs/findings.md says of measured recordings is what the program finds in t
 The tables of the document are read, and its commands are run. A size may differ a little, for
 noise that is drawn to fill lost samples differs between releases of numpy; an error by a quarter
 of the width of the interval of the improvement.
-
 """
 
 import json
@@ -58,7 +57,6 @@ def agree(written, found):
 
     Where the vibration of a stepper is left, the assumed noise moves a delay by 1 %, which is more
     than its interval.
-
     """
     (mine, form), (theirs, other) = numbers(written), numbers(found)
     half = max(0.5 * (mine[2] - mine[1]) if len(mine) == 3 else 0.0, 0.02 * abs(mine[0]))

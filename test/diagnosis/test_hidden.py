@@ -17,24 +17,12 @@ from pathlib import Path
 from chance import evidence, seeded
 import gyro_calibration_bench.hidden
 from gyro_calibration_bench.hidden import (
-    draw_gyro,
-    FORMS,
-    hide,
-    hide_look_alike,
-    KINDS,
-    LOOK_ALIKES,
-    NoiseFigures,
-    record_separating,
-    session,
-)
+    draw_gyro, FORMS, hide, hide_look_alike, KINDS, LOOK_ALIKES, NoiseFigures, record_separating,
+    session)
 from gyro_calibration_bench.hidden.effects import COUNTED_FAULTS, effect_errors, STEP_EFFECTS
 from gyro_calibration_bench.hidden.log import ALL
 from gyro_calibration_bench.hidden.noise import (
-    draw_figures,
-    generate_noise,
-    markov_processes,
-    Whitening,
-)
+    draw_figures, generate_noise, markov_processes, Whitening)
 from gyro_calibration_bench.hidden.size import InformationMetric
 import numpy as np
 import pytest

@@ -21,25 +21,11 @@ import subprocess
 from gyro_calibration.diagnosis import report
 from gyro_calibration.diagnosis.causes import mark_suspected
 from gyro_calibration.diagnosis.findings import (
-    Change,
-    Curve,
-    Diagnosis,
-    Estimate,
-    Finding,
-    Gain,
-    HeadingCurve,
-    NoiseCurve,
-    Reference,
-    Trace,
-    Unexplained,
-)
+    Change, Curve, Diagnosis, Estimate, Finding, Gain, HeadingCurve, NoiseCurve, Reference, Trace,
+    Unexplained)
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import (
-    format_probability,
-    format_quantity,
-    headline,
-    terminal_lines,
-)
+    format_probability, format_quantity, headline, terminal_lines)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term

@@ -15,28 +15,14 @@ import math
 
 from diagnosed import diagnosis_of, held
 from gyro_calibration.diagnosis.candidates import (
-    Candidate,
-    effect_candidate,
-    generic_terms,
-    is_named,
-    propose_candidates,
-)
+    Candidate, effect_candidate, generic_terms, is_named, propose_candidates)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import (
-    build_problem,
-    fit_causes,
-    likelihood_with,
-    likelihood_without,
-)
+    build_problem, fit_causes, likelihood_with, likelihood_without)
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
-    evidence_for,
-    held_out_sigmas,
-    MIN_PREDICTION_SIGMAS,
-    refine_jointly,
-    search_causes,
-    start_search,
-)
+    evidence_for, held_out_sigmas, MIN_PREDICTION_SIGMAS, refine_jointly, search_causes,
+    start_search)
 from gyro_calibration.logs.log import Log
 from gyro_calibration_bench.hidden import hide
 import numpy as np

@@ -14,29 +14,10 @@ from dataclasses import replace
 import math
 
 from bias_table import (
-    answers,
-    CALIBRATION,
-    carried_answers,
-    coverage,
-    cubic,
-    learn,
-    learned,
-    linear,
-    MODEL,
-    NOISE,
-    OWN,
-    simulate,
-    WHITE,
-)
+    answers, CALIBRATION, carried_answers, coverage, cubic, learn, learned, linear, MODEL, NOISE,
+    OWN, simulate, WHITE)
 from gyro_calibration.heading.bias_table import (
-    BiasTable,
-    Entry,
-    Jump,
-    MAX_ENTRIES,
-    model_digest,
-    read_bias_table,
-    write_bias_table,
-)
+    BiasTable, Entry, Jump, MAX_ENTRIES, model_digest, read_bias_table, write_bias_table)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term

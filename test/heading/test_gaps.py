@@ -13,7 +13,6 @@ Lost samples: how many, what they leave unknown of the heading, and rests across
 
 The stated variance of the heading is compared with the difference to the heading with all
 samples, over many drives.
-
 """
 
 import math

@@ -12,7 +12,6 @@
 The heading on a robot, sample by sample: rests, temperature, earlier runs, and stamp jumps.
 
 The gyro is simulated with the noise of the XV-3500 at 25 Hz.
-
 """
 
 from dataclasses import replace

@@ -13,19 +13,11 @@
 import math
 
 from gyro_calibration.heading.integration import (
-    BlockIntegrator,
-    filter_rates,
-    integrate,
-    Threshold,
-    ThresholdFilter,
-)
+    BlockIntegrator, filter_rates, integrate, Threshold, ThresholdFilter)
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import (
-    compensate,
-    rate_sensitivity,
-    uncertainty_covariance,
-)
+    compensate, rate_sensitivity, uncertainty_covariance)
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.motion import ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise

@@ -15,18 +15,9 @@ import math
 from chance import RARE, rms_bounds
 from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
 from gyro_calibration.heading.kalman import (
-    HEADING_INDEX,
-    HeadingState,
-    initial_state,
-    RateIntegral,
-    smooth_states,
-)
+    HEADING_INDEX, HeadingState, initial_state, RateIntegral, smooth_states)
 from gyro_calibration.heading.stationary import (
-    SCATTER_CORRELATIONS,
-    SCATTER_RATIOS,
-    sum_ratios,
-    update_scatter,
-)
+    SCATTER_CORRELATIONS, SCATTER_RATIOS, sum_ratios, update_scatter)
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
