@@ -490,7 +490,9 @@ def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Ar
         at = time[part][~lost[part]]
         if len(at) > 2 * _GAP_MARGIN_SAMPLES:
             rate[part] = heading_spline(at, heading[part][~lost[part]])(time[part], 1)
-    near = maximum_filter1d(lost, 3) | maximum_filter1d(long, 2 * _GAP_MARGIN_SAMPLES + 1)
+    # a spline errs at the ends of a log as it does at a gap
+    near = maximum_filter1d(lost, 3) | maximum_filter1d(
+        np.pad(long, 1, constant_values=True), 2 * _GAP_MARGIN_SAMPLES + 1)[1:-1]
     raw = np.where(near, np.nan, rate)
     if heading_step:
         rate = _filter_rounding(rate, heading_step, float(np.median(np.diff(time))))

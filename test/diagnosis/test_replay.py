@@ -124,6 +124,22 @@ def test_noise_stays_white_where_single_samples_are_lost(share):
     assert low.mean() / high.mean() == pytest.approx(1.0, abs=5.0 * np.sqrt(4.0 / 2000.0))
 
 
+@pytest.mark.parametrize('frequency', [20.0, 100.0])
+@pytest.mark.parametrize('seed', seeds(3))
+def test_the_ends_of_a_fine_encoder_are_no_slips_or_steps(frequency, seed):
+    generator = np.random.default_rng(400 + seed)
+    time = np.arange(int(120.0 * frequency)) / frequency
+    turns = list(zip(2.0 * np.pi * np.array([0.02, 0.05, 0.09, 0.15]), generator.uniform(0, 6, 4)))
+    rate = sum(0.4 * np.sin(pace * time + phase) for pace, phase in turns)
+    heading = -sum(0.4 / pace * np.cos(pace * time + phase) for pace, phase in turns)
+    step = 0.005 * DEGREE
+    noise = simulate_noise(Noise(angle_random_walk=3e-5), len(time), 1.0 / frequency, generator)
+    log = Log(time=time, output=1.01 * rate + noise,
+              reference_heading=step * np.round(heading / step))
+    found = diagnose([log], np.random.default_rng(0))
+    assert {cause.effect for cause in found.findings} == {'reference_quantization'}
+
+
 @pytest.mark.parametrize('seed', seeds(2))
 def test_single_lost_samples_neither_cost_nor_bias_a_scale_in_a_random_walk(seed):
     """The walk is as large as the white noise after a third of a second."""
