@@ -486,6 +486,11 @@ def _with_part_of_log(search: Search, causes: Causes) -> Causes:
             first = refine_shape(fit_causes(problem, [*causes, second]), first)[0]
             second = refine_shape(fit_causes(problem, [*causes, first]), second)[0]
         both = (*causes, first, second)
+        # a shorter part is a pulse, or a gap
+        if first.log_index == second.log_index and abs(
+                first.shapes[0] - second.shapes[0]) * (MAX_STEP_TIMES + 1) < problem.replays[
+                    first.log_index or 0].duration:
+            continue
         least = first.penalty + second.penalty - math.log(search.rate)
         if (fit_causes(problem, both).log_likelihood - score > least and len(
                 eliminate_backward(search, refine_jointly(search, both))) == len(both)):
