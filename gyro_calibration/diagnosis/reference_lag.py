@@ -119,13 +119,14 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
     moved = late = drop_samples(
         replace(replay, command=replay.channels.rate),
         replay.channels.time < replay.channels.time[0] + longest[len(kernels) - 1])
-    delayed = [cosine_transform(late.resample(each)) for each in late.delayed_commands(kernels)]
+    rate, *seen = [cosine_transform(late.resample(each)) for each in (
+        replay.channels.rate, *late.delayed_commands(kernels),
+        replay.channels.output - replay.reference)]
     others: list[Array] = []
     for _ in range(2):
-        own = [cosine_transform(late.resample(each)) for each in (replay.channels.rate, *others)]
-        left = cosine_transform(late.resample(replay.channels.output - replay.reference))
-        fitted = _fit_response(np.array([*own, *delayed, left])
-                               / np.sqrt(moved.response_variance()), len(own), kernels @ lags)
+        own = [rate, *(cosine_transform(late.resample(each)) for each in others)]
+        fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
+                               len(own), kernels @ lags)
         response = fitted.values @ kernels
         change = next(late.delayed_commands(response[None]))
         # effects along this motion would otherwise pass for a longer response
