@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 import math
 from typing import Any
 
@@ -338,18 +339,20 @@ def find_steps(fit: RegressionFit) -> list[Scored]:
     best, split_by_log = fit.best_noise, fit.problem.split_by_log
     covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
         fit.degrees_of_freedom)
+    # under that noise, as the factors are
+    residual = fit.rows[-1] - fit.inverse_information[best] @ fit.scores[best] @ fit.columns
     found, evidence = [], []
-    for run, (replay, factor, deviation, residual, *columns) in enumerate(zip(
+    for run, (replay, factor, deviation, *rows) in enumerate(zip(
             fit.problem.replays, fit.whitening_factors(), split_by_log(fit.problem.deviation),
-            fit.residual_transforms(), *map(split_by_log, fit.columns))):
+            *map(split_by_log, (residual, *fit.columns)))):
         count, interval = replay.point_count, replay.point_interval
         # products of a step at each point with the residual, the columns, and itself
         pull, *products = [
             np.cumsum(inverse_cosine_transform(factor ** 2 / deviation * each)[::-1])[::-1]
-            for each in (residual, *columns)]
+            for each in rows]
         power = (factor / deviation / np.sin(0.5 * coefficient_angles(count))) ** 2 / (2.0 * count)
         whole = 0.5 * (power.sum() - fft(np.append(0.0, power)).real)
-        crossing = np.reshape(products, (len(columns), count))
+        crossing = np.reshape(products, (len(products), count))
         left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
         shown = left > MIN_INDEPENDENT_SHARE * whole
         # as far from the ends as the first of equally spaced times
@@ -454,48 +457,69 @@ def _select_forward(search: Search) -> Causes:
         if search.on_progress(None, f'search for causes, {len(named)} found'):
             break
         one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
-        more = _with_part_of_log(search, named) if one_more is None else (*named, one_more)
+        more = _with_several(search, named) if one_more is None else (*named, one_more)
         if not more:
             break
         named = eliminate_backward(search, refine_jointly(search, more))
     return named
 
 
-def _with_part_of_log(search: Search, causes: Causes) -> Causes:
+def _with_several(search: Search, causes: Causes) -> Causes:
     """
-    Return causes with two steps of the bias that are significant together; nothing without them.
+    Return causes with several more, steps of the bias among them; nothing without them.
 
-    Where a bias differs in a part of a log, a random walk explains it about as well as one step:
-    the steps are looked for in white noise too.
+    A random walk explains several steps, or steps and a drift, about as well as any one of them:
+    they are looked for in white noise, and must be significant together. A drift replaces the
+    steps that follow it.
     """
     # without generic terms nothing tells a part from another structure in time
-    if ('bias_step' not in search.scanned_causes or len(causes) + 2 > MAX_CAUSES
-            or all(map(is_named, search.candidates))):
+    if 'bias_step' not in search.scanned_causes or all(map(is_named, search.candidates)):
         return ()
-    problem, score = search.problem, fit_causes(search.problem, causes).log_likelihood
-    white = replace(problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
-                    log_determinants=problem.log_determinants[:1])
-    for noise in (problem, white):
-        both = causes
-        for _ in range(2):
-            both = (*both, *(each for each, _ in find_steps(fit_causes(noise, both))))
-        if len(both) < len(causes) + 2:
-            continue
-        first, second = both[-2:]
-        for _ in range(2):
-            first = refine_shape(fit_causes(problem, [*causes, second]), first)[0]
-            second = refine_shape(fit_causes(problem, [*causes, first]), second)[0]
-        both = (*causes, first, second)
-        # a shorter part is a pulse, or a gap
-        if first.log_index == second.log_index and abs(
-                first.shapes[0] - second.shapes[0]) * (MAX_STEP_TIMES + 1) < problem.replays[
-                    first.log_index or 0].duration:
-            continue
-        least = first.penalty + second.penalty - math.log(search.rate)
-        if (fit_causes(problem, both).log_likelihood - score > least and len(
-                eliminate_backward(search, refine_jointly(search, both))) == len(both)):
-            return both
-    return ()
+    problem, grown, tried = search.problem, causes, []
+    white = replace(
+        search, columns_cache={}, step_cache={}, scanned_causes=frozenset(),
+        candidates=tuple(filter(is_lasting, search.candidates)), problem=replace(
+            problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
+            log_determinants=problem.log_determinants[:1]))
+    while len(grown) < MAX_CAUSES and (steps := find_steps(fit_causes(white.problem, grown))):
+        # the first of a pair may not be significant alone
+        if len(grown) > len(causes) + 1 and p_value(
+                'bias_step', steps[0][1] - steps[0][0].penalty) > search.rate:
+            break
+        grown = _refine_in_turn(white, (*grown, steps[0][0]), len(causes))
+        tried.append(grown)
+    for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
+                           key=lambda each: each[0].penalty - each[1])[:1]:
+        tried.append(eliminate_backward(
+            white, _refine_in_turn(white, (*grown, drift), len(causes))))
+    likelihood, best = max(((_penalized_likelihood(problem, each), each) for each in tried
+                            if _are_apart(problem, each)), default=(-math.inf, ()),
+                           key=lambda each: each[0])
+    if likelihood < _penalized_likelihood(problem, causes) - math.log(search.rate):
+        return ()
+    best = eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
+    return best if len(best) > len(causes) + 1 else ()
+
+
+def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
+    """Refine the shape of each cause from a first on, given the others, and then all together."""
+    for place in range(first, len(causes)):
+        fit = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
+        causes = (*causes[:place], refine_shape(fit, causes[place])[0], *causes[place + 1:])
+    return refine_jointly(search, causes)
+
+
+def _penalized_likelihood(problem: RegressionProblem, causes: Causes) -> float:
+    return fit_causes(problem, causes).log_likelihood - sum(map(complexity_penalty, causes))
+
+
+def _are_apart(problem: RegressionProblem, causes: Causes) -> bool:
+    """Tell whether no two steps of opposite signs are as near as the ends of a pulse, or a gap."""
+    steps = [each for each in causes if each.cause == 'bias_step']
+    return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
+               or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
+               >= problem.replays[one.log_index or 0].duration
+               for one, other in combinations(steps, 2))
 
 
 def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
