@@ -24,6 +24,7 @@ import math
 
 from gyro_calibration.calibration.likelihood import find_deviating_stretch
 from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.columns import RATE_UNITS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
@@ -37,9 +38,10 @@ MAX_UNEXPLAINED_SHARE = 0.1
 _SLIP_PENALTY = 1.5
 
 #: Units that are confused, in rad/s: the usual ones, and all, the usual ones last.
-_USUAL_UNITS = {'mdeg/s': 1e-3 * DEGREE, 'mrad/s': 1e-3, 'deg/s': DEGREE, 'rad/s': 1.0}
-_RATE_UNITS = {'revolutions/min': math.pi / 30.0, 'revolutions/s': 2.0 * math.pi,
-               'deg/h': DEGREE / 3600.0, **_USUAL_UNITS}
+_USUAL_UNITS = {'mdeg/s': 1e-3 * DEGREE,
+                **{unit: RATE_UNITS[unit] for unit in ('mrad/s', 'deg/s', 'rad/s')}}
+_ALL_UNITS = {'revolutions/min': math.pi / 30.0, 'revolutions/s': 2.0 * math.pi,
+              'deg/h': RATE_UNITS['deg/h'], **_USUAL_UNITS}
 
 
 def _name_confusions(units: dict[str, float]) -> dict[float, tuple[str, str]]:
@@ -56,7 +58,7 @@ _UNIT_CONFUSIONS = {
     **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
                 f'the profile was driven at {factor:g} times its rate')
        for base in (2.0, 4.0, 8.0, 10.0, 100.0) for factor in (base, 1.0 / base)},
-    **_name_confusions(_RATE_UNITS),
+    **_name_confusions(_ALL_UNITS),
     1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units',
           'the profile in thousands'),
     1e-3: ('the gyro is in thousands',

@@ -33,15 +33,17 @@ from gyro_calibration.model.settings_file import (
     InvalidValue, parse_number, read_settings, validate)
 import numpy as np
 
-#: Name of a limit in a file -> its name in `RobotLimits`, its unit, and the range of its numbers.
+#: Ranges of the numbers of a file; the largest stand for any.
+_POSITIVE, _NOT_NEGATIVE = (0.01, 1e9), (0.0, 1e9)
+#: Name of a limit in a file -> its name in `RobotLimits`, and the range of its numbers.
 LIMIT_FIELDS = {
-    'maximum_rate_dps': ('rate', DEGREE, 0.01, 1e5),
-    'maximum_acceleration_dps2': ('acceleration', DEGREE, 0.01, 1e6),
-    'maximum_jerk_dps3': ('jerk', DEGREE, 0.01, 1e9),
-    'minimum_rate_dps': ('slowest', DEGREE, 0.0, 1e5),
-    'minimum_heading_deg': ('lowest', DEGREE, -1e6, 0.0),
-    'maximum_heading_deg': ('highest', DEGREE, 0.0, 1e6),
-    'rest_s': ('rest', 1.0, 0.1, 100.0),
+    'maximum_rate_dps': ('rate', _POSITIVE),
+    'maximum_acceleration_dps2': ('acceleration', _POSITIVE),
+    'maximum_jerk_dps3': ('jerk', _POSITIVE),
+    'minimum_rate_dps': ('slowest', _NOT_NEGATIVE),
+    'minimum_heading_deg': ('lowest', (-1e9, 0.0)),
+    'maximum_heading_deg': ('highest', _NOT_NEGATIVE),
+    'rest_s': ('rest', (0.1, 100.0)),
 }
 #: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
 COMPARED_DURATIONS, MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
@@ -115,7 +117,7 @@ def read_limits(path: str) -> RobotLimits:
                if name not in given]
     if missing:
         raise InputError(f'{path}: {missing[0]} is missing; add the limit of the robot')
-    robot = RobotLimits(**{LIMIT_FIELDS[name][0]: value * LIMIT_FIELDS[name][1]
+    robot = RobotLimits(**{LIMIT_FIELDS[name][0]: value if name == 'rest_s' else value * DEGREE
                            for name, value in given.items()})
     if robot.slowest > robot.rate:
         raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
@@ -125,7 +127,7 @@ def read_limits(path: str) -> RobotLimits:
 
 def _check_limit(place: str, value: Any) -> float:
     name = place.rpartition('.')[2]
-    return parse_number(name, value, *LIMIT_FIELDS[name][2:])
+    return parse_number(name, value, *LIMIT_FIELDS[name][1])
 
 
 def write_motion(path: str, motion: Motion) -> None:

@@ -26,6 +26,8 @@ from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
 DEGREE = math.pi / 180.0
 STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
+#: Temperatures, degC, that a sensor in a gyro may have; others are taken for errors.
+PLAUSIBLE_TEMPERATURES = -100.0, 200.0
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
@@ -53,16 +55,16 @@ ATTITUDE = ('attitude_w', 'attitude_x', 'attitude_y', 'attitude_z')
 ROTATIONS = ('reference_heading', 'cross_axis_1', 'cross_axis_2')
 AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as gyro_x_dps
 
-_RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
-               'deg/h': DEGREE / 3600.0}
+RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
+              'deg/h': DEGREE / 3600.0}
 _ANGLE_UNITS = {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
-    'gyro': ('output', _RATE_UNITS),
+    'gyro': ('output', RATE_UNITS),
     'counts': ('counts', {'1': 1.0}),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
-    'rate': ('reference_rate', _RATE_UNITS),
+    'rate': ('reference_rate', RATE_UNITS),
     'heading': ('reference_heading', _ANGLE_UNITS),
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
                                         'mg': 1e-3 * STANDARD_GRAVITY}),

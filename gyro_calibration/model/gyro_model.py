@@ -19,14 +19,13 @@ from functools import cached_property
 import math
 from typing import Any
 
+from gyro_calibration.logs.columns import PLAUSIBLE_TEMPERATURES
 from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.channels import ChannelHistory
 from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: Plausible temperatures, degC, where no valid range is stated.
-_PLAUSIBLE_TEMPERATURES = (-100.0, 200.0)
 #: The response is inverted where the slope of the output over the rate is at least this, 1: noise
 #: is amplified up to ten times.
 _MIN_OUTPUT_SLOPE = 0.1
@@ -198,14 +197,14 @@ class GyroModel:
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
         """Return the plausible temperatures, degC: at least -100 to 200."""
-        (low, high), (coldest, hottest) = self.valid_temperatures, _PLAUSIBLE_TEMPERATURES
+        (low, high), (coldest, hottest) = self.valid_temperatures, PLAUSIBLE_TEMPERATURES
         return min(low, coldest), max(high, hottest)
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:
         """Return the calibrated temperatures, degC; the plausible ones where none are stated."""
         low, high = ((value if math.isfinite(value) else usual)
-                     for value, usual in zip(self.temperature_range, _PLAUSIBLE_TEMPERATURES))
+                     for value, usual in zip(self.temperature_range, PLAUSIBLE_TEMPERATURES))
         return low, max(low, high)
 
     @cached_property

@@ -25,7 +25,7 @@ import math
 import re
 from typing import NamedTuple, TypeVar
 
-from gyro_calibration.logs.columns import COLUMNS
+from gyro_calibration.logs.columns import COLUMNS, PLAUSIBLE_TEMPERATURES
 
 OutputT = TypeVar('OutputT')
 
@@ -43,7 +43,6 @@ ASSUMED_FORCE_NOISE = 0.1
 #: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
-_PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
 _MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
 
 
@@ -299,7 +298,7 @@ class Decoder:
         missing = (self._refused_frames + round(self._skipped_bytes / len(frame.data))
                    if self._has_sample else 0)
         self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True
-        temperature, (coldest, hottest) = reading.temperature, _PLAUSIBLE_TEMPERATURES
+        temperature, (coldest, hottest) = reading.temperature, PLAUSIBLE_TEMPERATURES
         if temperature is not None and not coldest <= temperature <= hottest:
             self.refused_temperatures += 1
             temperature = None
