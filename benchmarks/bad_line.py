@@ -31,7 +31,7 @@ from gyro_calibration.logs.log import DEGREE
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
-from fake_port import damaged, SETTINGS  # noqa: E402, I100, I202
+from fake_port import SETTINGS  # noqa: E402, I100, I202
 
 SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000
@@ -39,6 +39,17 @@ SENT = 0.5  # rad/s
 FULL_SCALE = 1.5  # rad/s
 CHECKS = {'kvh_1750': 'CRC-32', 'fizoptika': 'sum, 16 bits', 'kvh_ecore': 'sum, 7 bits',
           'witmotion': 'sum, 8 bits'}
+
+
+def damaged(data: bytes, generator: np.random.Generator, lost: float, doubled: float,
+            flipped: float) -> bytes:
+    """Return what arrives of bytes; each is lost, comes twice, or with one of its bits flipped."""
+    drawn = generator.random(len(data))
+    arrived = np.frombuffer(data, np.uint8).copy()
+    struck = (drawn >= lost + doubled) & (drawn < lost + doubled + flipped)
+    arrived[struck] ^= (1 << generator.integers(8, size=int(struck.sum()))).astype(np.uint8)
+    times = np.where(drawn < lost, 0, np.where(drawn < lost + doubled, 2, 1))
+    return np.repeat(arrived, times).tobytes()
 
 
 def arrived(name: str, share: float, full_scale: float | None) -> list[float]:

@@ -163,13 +163,3 @@ class Reading:
     def _on_change(self, state):
         self.states.append(state)
         self.times.append(self.world.now - BEGIN)
-
-
-def damaged(data, generator, lost=0.0, doubled=0.0, flipped=0.0):
-    """Return what arrives of bytes; each is lost, comes twice, or with one of its bits flipped."""
-    drawn = generator.random(len(data))
-    arrived = np.frombuffer(data, np.uint8).copy()
-    struck = (drawn >= lost + doubled) & (drawn < lost + doubled + flipped)
-    arrived[struck] ^= (1 << generator.integers(8, size=int(struck.sum()))).astype(np.uint8)
-    times = np.where(drawn < lost, 0, np.where(drawn < lost + doubled, 2, 1))
-    return np.repeat(arrived, times).tobytes()

@@ -248,10 +248,9 @@ class PooledValue:
 
     def _variances_at(self, points: Array) -> dict[str, Array]:
         """Return the variances at points: logarithms of variance plus a floor, and the share."""
-        found = {name: column if name == OWN_SHARE
-                 else np.maximum(np.exp(column) - math.exp(self._bounds[name][0]), 0.0)
-                 for name, column in zip(self.variance_names, points.T)}
-        return found or {POWER_ONS: np.zeros(len(points))}
+        return {name: column if name == OWN_SHARE
+                else np.maximum(np.exp(column) - math.exp(self._bounds[name][0]), 0.0)
+                for name, column in zip(self.variance_names, points.T)}
 
     def _log_likelihood(self, points: Array, prior: bool = False) -> Array:
         """Return the restricted log-likelihoods at points, or with the log-prior added."""
@@ -267,8 +266,6 @@ class PooledValue:
 
     def _find_best_point(self, excluded: str = '') -> Array:
         """Return the point of largest restricted likelihood, optionally without one variance."""
-        if not self.variance_names:
-            return np.empty(0)
         bounds = [(self._bounds[name][0],) * 2 if name == excluded else self._bounds[name]
                   for name in self.variance_names]
         point = np.array([low + 0.3 * (high - low) for low, high in bounds])
@@ -293,8 +290,6 @@ class PooledValue:
     def _sample_variances(self) -> tuple[Array, Array]:
         """Return points of the variances, shape (points, names), and their weights."""
         # Each coordinate is drawn by a slice through the likeliest point.
-        if not self.variance_names:
-            return np.empty((1, 0)), np.ones(1)
         uniform = qmc.Halton(len(self.variance_names), scramble=False).random(
             _SAMPLE_POINTS + 1)[1:]
         sample, log_density = np.empty_like(uniform), np.zeros(_SAMPLE_POINTS)

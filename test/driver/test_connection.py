@@ -20,7 +20,7 @@ import threading
 import time
 import tty
 
-from fake_port import BEGIN, damaged, Reading, SETTINGS, World
+from fake_port import Reading, SETTINGS, World
 from gyro_calibration.driver.connection import (
     Connection, Decimator, PortError, resolve_port, SerialPort)
 from gyro_calibration.driver.emulator import Emulator
@@ -235,27 +235,6 @@ def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps()
     assert reading.steps[5000:] == pytest.approx(1e-3 * np.diff(numbers)[5000:], abs=1e-6)
 
 
-@pytest.mark.parametrize('share', [0.001, 0.1])
-@pytest.mark.parametrize('name', sorted(PROTOCOLS))
-def test_a_bad_line_is_survived_and_counted(name, share):
-    """Few long frames survive a tenth of faulty bytes; a good line shows right decoding."""
-    protocol, generator = find_protocol(name), np.random.default_rng(2)
-    encode = protocol.encoder(SETTINGS[name])
-    frames = [encode(Sample(0.5, 25.0, number / 100.0, number)) for number in range(3000)]
-    world = World(30.0)
-    world.send((damaged(frame, generator, *(3 * [share / 3.0])) if number < 2000 else frame
-                for number, frame in enumerate(frames)))
-    reading = Reading(world, name, settings=SETTINGS[name])
-    exact = reading.samples[-1].output
-    last = [sample.output for chunk in reading.chunks for sample in chunk.samples
-            if chunk.arrival > BEGIN + 20.5]
-    assert exact == pytest.approx(0.5, abs=0.01) and set(last) == {exact} and len(last) > 900
-    assert reading.connection.counts().discarded_bytes > 0 and min(reading.steps) > 0.0
-    outputs = [sample.output for sample in reading.samples]
-    assert all(abs(output) <= protocol.effective_full_scale(SETTINGS[name]) for output in outputs)
-    assert name != 'kvh_1750' or set(outputs) == {exact}, 'a CRC lets nothing wrong through'
-
-
 # The port alone
 
 
@@ -396,18 +375,6 @@ def read_all(path, protocol, enough=None, settings=None, until=lambda received: 
     finally:
         port.close()
     return received
-
-
-@pytest.mark.parametrize('name', sorted(PROTOCOLS))
-def test_a_reader_gets_every_sample(name, tmp_path):
-    settings, protocol = SETTINGS[name], find_protocol(name)
-    emulator = Emulator(protocol, samples(200), settings, speed=math.inf,
-                        link=tmp_path / 'gyro', wait_for_reader=True)
-    with emulator:
-        received = read_all(emulator.path, name, 200, settings)
-    resolution = settings.sensitivity or protocol.sensitivity
-    assert [sample.output for sample in received] == pytest.approx(
-        [sample.output for sample in samples(200)], abs=resolution)
 
 
 @pytest.mark.parametrize('speed', [1.0, 10.0])
