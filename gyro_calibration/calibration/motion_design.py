@@ -285,10 +285,6 @@ def _ramp_shape(robot: RobotLimits, rate: float) -> tuple[Array, Array]:
     return time, (squares[0] - squares[1] - squares[2] + squares[3]) / (2.0 * rising * rounding)
 
 
-#: Smallest angle of a turn, rad.
-_MIN_ANGLE = 1e-9
-
-
 class _MotionFamily:
     """
     Motions of one duration that alternate between two headings, as points of a unit cube.
@@ -297,8 +293,6 @@ class _MotionFamily:
     that are used, rates of one pair of turns and of the next, and fraction of the time that is
     rest between turns. Angles are stretched up to the duration or the limits of the heading.
     """
-
-    axes = 7
 
     def __init__(self, robot: RobotLimits, duration: float):
         self._robot, self._moving_duration = robot, duration - 2.0 * robot.rest
@@ -322,7 +316,7 @@ class _MotionFamily:
         ends[1 + first:-1:2] = point[2] * self._reach_up
         ends[2 - first:-1:2] = -point[3] * self._reach_down
         angles = np.diff(ends)
-        if not np.abs(angles).min() > _MIN_ANGLE:
+        if not np.abs(angles).min() > 0.0:
             return None
         return self._fit_duration(angles, np.where(np.arange(count) // 2 % 2, point[5], point[4]),
                                   point[6])
@@ -333,7 +327,7 @@ class _MotionFamily:
         ends = np.cumsum(angles)
         max_stretch = min(
             [place / end for place, end in ((self._reach_up, ends.max()),
-                                            (self._reach_down, -ends.min())) if end > _MIN_ANGLE])
+                                            (self._reach_down, -ends.min())) if end > 0.0])
         rates = np.array([speed * robot.max_turn_rate(abs(angle) * max_stretch)
                           for speed, angle in zip(speeds, angles)])
         stretch = ((self._moving_duration * (1.0 - rest_share) - robot.ramp_duration(rates).sum())
@@ -377,8 +371,8 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     def cost(point: Array) -> float:
         motion = family.motion_at(point)
         return math.inf if motion is None else forecast.search_error(motion)
-    found = differential_evolution(cost, _AXIS_BOUNDS, maxiter=generations, popsize=10, tol=0.0,
-                                   seed=generator, polish=False)
+    found = differential_evolution(cost, [(0.0, 1.0)] * 7, maxiter=generations, popsize=10,
+                                   tol=0.0, seed=generator, polish=False)
     if (motion := family.motion_at(found.x)) is None:
         raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: '
                           'allow more seconds or a larger angle')
@@ -394,10 +388,6 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
             f'{limits.min_rate_spread / DEGREE:g} deg/s: allow more seconds, a larger angle or '
             'faster turns')
     return plan
-
-
-#: Bounds of the axes of `_MotionFamily`.
-_AXIS_BOUNDS = [(0.0, 1.0)] * 4 + [(0.2, 1.0)] * 2 + [(0.0, 0.6)]
 
 
 def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
