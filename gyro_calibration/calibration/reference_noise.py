@@ -34,7 +34,7 @@ _COMPARISON_SPAN = 1.0
 #: Largest error of an exact reference heading as a share of the difference of the headings over a
 #: second: a fifth of its variance.
 _MAX_HEADING_ERROR_SHARE = 0.25
-#: Numerical error of a heading, rad.
+#: Numerical error of a heading, rad, which is all that a simulated log without noise has.
 _NUMERICAL_ERROR = 1e-9
 #: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
 #: random walk, and of -0.5 for its integral, which is as smooth as a motion.

@@ -64,7 +64,7 @@ _MAX_LOG_VALUES = 1 << 29
 #: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
 MAX_TIME = 1e12
 _ROS_1_MAGIC = b'#ROSBAG V2.0'
-#: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
+#: Largest magnitudes where they are not `MAX_MAGNITUDE`: a single larger one decides a fit, degC.
 _MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
 #: Line numbers of the rows and the line after, quantity -> values in SI, other columns as text.

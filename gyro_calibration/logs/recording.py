@@ -46,7 +46,7 @@ _ROLES = {
 
 #: Largest step back of stamps by messages out of order, s; at a larger one a clock was set.
 _MAX_STEP_BACK = 1.0
-_MAX_LISTED_TOPICS = 20  # largest number of topics in a message
+_MAX_LISTED_TOPICS = 20  # in a message, which hundreds of topics would make unreadable
 #: Time without a temperature beyond which a note is made, s; gyros take minutes to warm up.
 _MAX_TEMPERATURE_GAP = 30.0
 
