@@ -489,7 +489,7 @@ def _with_several(search: Search, causes: Causes) -> Causes:
         grown = _refine_in_turn(white, (*grown, steps[0][0]), len(causes))
         tried.append(grown)
     for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
-                           key=lambda each: each[0].penalty - each[1])[:1]:
+                           key=lambda each: each[0].penalty - each[1])[:3]:
         tried.append(eliminate_backward(
             white, _refine_in_turn(white, (*grown, drift), len(causes))))
     likelihood, best = max(((_penalized_likelihood(problem, each), each) for each in tried
