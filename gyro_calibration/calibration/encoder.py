@@ -515,11 +515,6 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
                'are for that, as far as the delay shows it. A reference that was smoothed without '
                'a delay may err by more: turn slowly, at several speeds, with stops')
-    if fit.shaft_error.size and (turned := float(np.ptp(motion.heading))) < math.tau:
-        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, less than a revolution, '
-               'in which an error once in a revolution, as of an eccentric encoder, may have the '
-               'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
-               'not include what the likelihood does not show: turn further')
     if fit.misalignment.size:
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
         if chance < FALSE_ALARM_RATE:
@@ -547,6 +542,11 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
            f'{360.0 * (1.0 + reference_error):.2f} for 360 deg, '
            f'would have the same effect as this scale factor error of {100 * s:+.2f} %: '
            'check it over whole turns closed on a mark')
+    if fit.shaft_error.size and (turned := float(np.ptp(motion.heading))) < math.tau:
+        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, less than a revolution, '
+               'in which an error once in a revolution, as of an eccentric encoder, may have the '
+               'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
+               'not include what the likelihood does not show: turn further')
     if method == 'rate':
         yield ('the regression of rates fits no time offset, and noise of the gyro biases its '
                'scale factor error by up to '
