@@ -12,6 +12,7 @@
 Fit simulated dwells of gyros whose output is rounded to coarse steps.
 
     python benchmarks/coarse_output.py [RUNS [SEED]]
+    python benchmarks/coarse_output.py runs [RUNS [SEED]]
 
 The simulator is its own. A run has 1 to 4 sweeps of 3 to 20 rates, even or drawn, up to 10 or 100
 deg/s both ways, of 3 to 12 s each with ramps of 1 s, at 10 to 100 Hz; steps of 0.02 to 0.5 deg/s;
@@ -21,6 +22,9 @@ table of the means of the dwells. The noise of a sample is a multiple of the ste
 kind and noise, the share of biases b and scale factor errors s within their 95 % intervals, of
 `fit` with all that it chooses and of these effects alone, how many are more than 5 standard
 deviations off, and how often another effect of the rate is taken.
+
+With `runs`, `self_calibrate` by 20 s of a known motion and 6 s of rest after it, at constant rates
+or by hand, at 20 to 100 Hz; the steps are 1 to 20 times the noise of a sample.
 """
 
 from __future__ import annotations
@@ -28,8 +32,9 @@ from __future__ import annotations
 import math
 import sys
 
-from gyro_calibration import fit, Log
+from gyro_calibration import fit, Log, self_calibrate
 import numpy as np
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 DEGREE = math.pi / 180.0
 NOISES = (0.0, 0.05, 0.15, 0.5, 2.0)  # of a sample, steps
@@ -105,5 +110,45 @@ def main(runs: int = 100, seed: int = 1) -> None:
                   + f' | {beyond} | {refused} | {others} |', flush=True)
 
 
+def run(kind: str, ratio: float, seed: int) -> np.ndarray:
+    """Return errors of s and b in standard deviations, nan where the run is refused."""
+    draw = np.random.default_rng([seed, len(kind), round(ratio)])
+    frequency = int(draw.choice([20, 50, 100]))
+    count = 20 * frequency
+    if kind == 'hand':
+        rate = gaussian_filter1d(draw.standard_normal(count), 0.25 * frequency)
+        rate *= 60.0 / rate.std()
+    else:
+        rate = np.repeat(np.round(draw.uniform(-90.0, 90.0, 10)) * (draw.random(10) < 0.7),
+                         2 * frequency)
+    rest = 3 * frequency // 2
+    rate[:rest] = rate[-rest:] = 0.0
+    rate = uniform_filter1d(rate, frequency // 2)
+    s, b = draw.uniform(-0.02, 0.02), draw.uniform(-0.5, 0.5)
+    step = math.exp(draw.uniform(math.log(0.05), math.log(2.0)))
+    output = (1.0 + s) * np.append(rate, np.zeros(6 * frequency)) + b
+    output = step * np.round(output / step + draw.standard_normal(len(output)) / ratio)
+    try:
+        found = self_calibrate(Log(np.arange(len(output)) / frequency, output * DEGREE),
+                               (np.arange(count) / frequency, rate * DEGREE))
+    except ValueError:
+        return np.full(2, np.nan)
+    return np.array([(found.scale_factor_error - s) / found.scale_factor_error_std,
+                     (found.bias - b * DEGREE) / found.bias_std])
+
+
+def main_of_runs(runs: int = 20, seed: int = 1) -> None:
+    print('| motion | steps, noises of a sample | s, b held | largest error of b | refused |')
+    print('|---|---|---|---|---|')
+    for kind in ('constant rates', 'hand'):
+        for ratio in (1.0, 3.0, 8.0, 20.0):
+            found = np.abs([run(kind, ratio, seed + number) for number in range(runs)])
+            known = found[np.isfinite(found[:, 0])]
+            held = np.mean(known < 1.96, axis=0)
+            print(f'| {kind} | {ratio:g} | {held[0]:.2f}, {held[1]:.2f} '
+                  f'| {known[:, 1].max():.3g} | {runs - len(known)} |', flush=True)
+
+
 if __name__ == '__main__':
-    main(*(int(word) for word in sys.argv[1:3]))
+    of_runs = sys.argv[1:2] == ['runs']
+    (main_of_runs if of_runs else main)(*(int(word) for word in sys.argv[1 + of_runs:3 + of_runs]))

@@ -14,6 +14,7 @@ Measure the coverage of 95 % intervals of scale factor error and bias with a wan
     python benchmarks/encoder_intervals.py [RUNS]
     python benchmarks/encoder_intervals.py motions [RUNS]
     python benchmarks/encoder_intervals.py smoothings [RUNS]
+    python benchmarks/encoder_intervals.py eccentric [RUNS [SEED]]
 
 Ten minutes at 20 Hz to and fro, an encoder of 0.088 deg, s = 2 %, b = 0.3 deg/s at the beginning,
 white noise of 0.3 deg/sqrt(h). Prints a table in Markdown. The true bias is the one at the
@@ -27,6 +28,10 @@ of 2 to 20 s; b is compared with its mean. The simulator shares nothing with the
 With `smoothings`, 30 s of swings of one frequency (0.05 to 0.6 Hz) and of a robot, beside a
 reference with noise of 0.003 deg that was delayed or smoothed before, or an encoder of such a
 shaft.
+
+With `eccentric`, one to four minutes at 50 or 100 Hz of constant rates, of one rate between two
+rests, of even swings to and fro, and of sines, beside an encoder that errs by 0 to 1 deg once in a
+revolution, without steps or with steps of 0.01 to 0.35 deg.
 """
 
 from __future__ import annotations
@@ -220,10 +225,74 @@ def table_of_smoothings(runs: int) -> Iterator[str]:
                            f'| {np.isnan(error).sum()} of {runs} |')
 
 
+def turned(kind: str, count: int, frequency: int, generator: np.random.Generator) -> Array:
+    """Return rates on a turntable, deg/s, of a kind of motion."""
+    if 'sine' in kind:
+        half = generator.uniform(60.0, 200.0) if kind == 'sine' else generator.uniform(15.0, 45.0)
+        cycle = 2.0 * np.pi / (frequency * generator.uniform(4.0, 20.0))
+        return half * frequency * cycle * np.cos(cycle * np.arange(count))
+    rate, row, sign = np.zeros(count), 2 * frequency, 1.0
+    half, speed = generator.uniform(90.0, 360.0), generator.uniform(20.0, 90.0)
+    if kind == 'one rate':
+        rate[count // 5:-(count // 5)] = generator.choice([-1, 1]) * generator.uniform(10.0, 80.0)
+        row = count
+    while row < count:
+        steps = kind == 'steps'
+        length = int(frequency * (generator.uniform(4.0, 15.0) if steps else half / speed))
+        rate[row:row + length] = (generator.uniform(-100.0, 100.0) if steps else sign * speed)
+        sign, row = -sign, row + length + int(frequency * generator.choice([0.0, 0.5, 3.0]))
+    return uniform_filter1d(rate, frequency // 2)
+
+
+def run_eccentric(case: tuple[str, float, int]) -> Array:
+    """Return error and standard deviation of s and b of one run, shape (2, 2), nan if refused."""
+    kind, size, seed = case
+    generator = np.random.default_rng([seed, 11, *map(ord, kind), round(1e3 * size)])
+    frequency = int(generator.choice([50, 100]))
+    count = int(generator.uniform(60.0, 240.0) * frequency)
+    rate = turned(kind, count, frequency, generator)
+    heading = (generator.uniform(0.0, 360.0)
+               + np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) / frequency)))
+    read = heading + size * np.sin(heading * DEGREE + generator.uniform(0.0, 2.0 * np.pi))
+    step = generator.choice([0.0, 0.01, 0.088, 0.35])
+    read = (np.round(read / step) * step if step
+            else read + 0.003 * generator.standard_normal(count))
+    s, b = generator.uniform(-0.02, 0.02), generator.uniform(-0.5, 0.5)
+    output = (1.0 + s) * rate + b + 10.0 ** generator.uniform(
+        -2.3, -0.7) * generator.standard_normal(count)
+    try:
+        fit = calibrate_encoder(Log(output=output * DEGREE, time=np.arange(count) / frequency,
+                                    reference_heading=read * DEGREE)).fit
+    except DataRefused:
+        return np.full((2, 2), np.nan)
+    return np.array([(fit.scale_factor_error - s, fit.bias - b * DEGREE),
+                     np.sqrt(np.diag(fit.covariance))])
+
+
+def table_of_eccentric(runs: int, seed: int = 1) -> Iterator[str]:
+    yield ('| motion | error of the encoder, deg | s within | b within | largest, s | rms error '
+           'of s | stated, median | refused |')
+    yield '|---|---|---|---|---|---|---|---|'
+    with ProcessPoolExecutor(initializer=warnings.simplefilter, initargs=('ignore',)) as pool:
+        for kind in ('steps', 'one rate', 'swing', 'sine', 'small sine'):
+            for size in (0.0, 0.05, 0.2, 1.0):
+                found = np.array(list(pool.map(run_eccentric, [
+                    (kind, size, seed + number) for number in range(runs)])))
+                answered = found[np.isfinite(found[:, 0, 0])]
+                ratio = np.abs(answered[:, 0] / answered[:, 1])
+                within = 100.0 * np.mean(ratio < 1.96, axis=0)
+                yield (f'| {kind} | {size:g} | {within[0]:.0f} % | {within[1]:.0f} % '
+                       f'| {ratio[:, 0].max():.1f} '
+                       f'| {100.0 * np.sqrt(np.mean(answered[:, 0, 0] ** 2)):.4f} % '
+                       f'| {100.0 * np.median(answered[:, 1, 0]):.4f} % '
+                       f'| {runs - len(answered)} of {runs} |')
+
+
 if __name__ == '__main__':
-    tables = {'motions': (table_of_motions, 12), 'smoothings': (table_of_smoothings, 12)}
+    tables = {'motions': (table_of_motions, 12), 'smoothings': (table_of_smoothings, 12),
+              'eccentric': (table_of_eccentric, 12)}
     asked = sys.argv[1:2] if sys.argv[1:2] and sys.argv[1] in tables else []
     rows, usual = tables[asked[0]] if asked else (table, 400)
-    counts = [int(word) for word in sys.argv[1 + len(asked):2 + len(asked)]]
+    counts = [int(word) for word in sys.argv[1 + len(asked):3 + len(asked)]]
     for line in rows(*counts or [usual]):
         print(line, flush=True)

@@ -37,7 +37,8 @@ from gyro_calibration.cli.compensate import (
     check_finite, CompensatedBlock, integrate_log, track_log)
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import Fitted
-from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
+from gyro_calibration.cli.self_calibrate import (
+    calibrate_run, CalibratedRun, describe_unused_rows, make_self_calibration)
 from gyro_calibration.cli.verb import PrintedResult
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
@@ -45,6 +46,7 @@ from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import as_sentence, terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
+from gyro_calibration.heading.log_compensation import plausible_rows
 from gyro_calibration.logs import log as logs
 from gyro_calibration.logs.log import Array, DEGREE, Log, log_from_table, unwrap_heading, write_log
 from gyro_calibration.logs.recording import read_recording, Topics
@@ -214,10 +216,11 @@ class Run(PrintedResult):
     scale_factor_error_std: float
     bias_std: float  # rad/s
     fit: RunFit = field(repr=False)  # with the delay of the gyro and the goodness of fit
+    remarks: tuple[str, ...]  # on the rows of the log that were not used
     _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
-        return as_sentence(str(self.model.self_calibration))
+        return ' '.join([as_sentence(str(self.model.self_calibration)), *self.remarks])
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the run and of its heading error before and after."""
@@ -247,7 +250,8 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
            calibrate_run(log, model, driven, begin, method, default_reference_errors(driven)))
     calibration = make_self_calibration(run.fit, method, log, run.is_used)
     return Run(with_self_calibration(model, calibration), run.fit.scale_factor_error,
-               run.fit.bias, *calibration.standard_deviations, run.fit, run)
+               run.fit.bias, *calibration.standard_deviations, run.fit,
+               tuple(describe_unused_rows(log, plausible_rows(model, log))), run)
 
 
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,

@@ -37,7 +37,8 @@ from gyro_calibration.calibration.heading_regression import (
     COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
     TECHNOLOGY_PRIORS, WANDER_COSINES)
 from gyro_calibration.calibration.likelihood import (
-    fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle, ScaleBiasFit)
+    correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
+    ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, HierarchicalPrior,
     TridiagonalMatrix)
@@ -48,7 +49,7 @@ from gyro_calibration.calibration.reference_noise import (
 from gyro_calibration.calibration.run_faults import fit_profile, refuse_unit_error, split_run
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, select_effects, Selection
 from gyro_calibration.calibration.self_calibration import (
-    DRIVE_DURATION, fit_rate, refuse_one_speed, refuse_scale, RunLimits)
+    DRIVE_DURATION, fit_rate, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -189,7 +190,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         _heading_residual(on_reference, (output - fit.bias) / (1.0 + fit.scale_factor_error),
                           motion),
         0 if lost is None else int(lost.sum()),
-        (*repeated, *jumps, *_list_remarks(fit, method, technology)))
+        (*repeated, *jumps, *_list_remarks(fit, motion, method, technology)))
 
 
 def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
@@ -220,6 +221,8 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     if fit.misalignment.size:  # the heading about the axis of the gyro
         motion = replace(motion, heading=motion.heading + crossing @ fit.misalignment / (
             1.0 + fit.scale_factor_error))
+    elif fit.shaft_error.size:
+        motion = replace(motion, heading=correct_shaft(motion.heading, fit.shaft_error))
     drift = _estimate_drift(motion, _heading_residual(
         time - np.nan_to_num(fit.time_offset), corrected, motion).heading, fit.bias, technology)
     # a bias within chance that could make a heading worse
@@ -229,6 +232,9 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
                           f'{drift.deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
                           'heading: turn more slowly, with rests, or for longer')
     fit = _apply_drift(fit, drift, motion)
+    # what the steps of the output cause is seen between a few rates only
+    unseen = np.diag(rounding_covariance(time, output, fit)[0] - fit.covariance)
+    fit = replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
     response_variance = fit.response_deviation ** 2
     deviation = math.sqrt(fit.covariance[0, 0])
     if deviation > limits.max_scale_deviation:
@@ -361,7 +367,9 @@ def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:
     scores = columns * (columns @ (scale, offset) - motion.rate_at(time))[:, None]
     jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
     influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
-    return replace(fit, influence=np.column_stack([influence, time]), time_offset=math.nan)
+    # the noise of the output, the regressor, biases the scale factor error by its share
+    return replace(fit, influence=np.column_stack([influence, time]), time_offset=math.nan,
+                   response_deviation=white_noise_deviation(output) ** 2 / float(np.var(output)))
 
 
 def _number_pieces(time: Array) -> NDArray[np.intp]:
@@ -493,14 +501,15 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
     return HeadingResidual(error - error.mean())
 
 
-def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[str]:
+def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
+                  technology: str) -> Iterator[str]:
     s, largest = fit.scale_factor_error, (COURSE_TREATMENT.largest_delay if method == 'course'
                                           else MAX_ENCODER_OFFSET)
     if abs(fit.time_offset) + NORMAL_QUANTILE_975 * fit.time_offset_deviation >= largest:
         yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
-    if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
+    if method != 'rate' and fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
         yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag of '
                'the reference or the gyro, as where it has one frequency, or a period that is not '
                f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
@@ -533,10 +542,16 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
            f'{360.0 * (1.0 + reference_error):.2f} for 360 deg, '
            f'would have the same effect as this scale factor error of {100 * s:+.2f} %: '
            'check it over whole turns closed on a mark')
+    if fit.shaft_error.size and (turned := float(np.ptp(motion.heading))) < math.tau:
+        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, less than a revolution, '
+               'in which an error once in a revolution, as of an eccentric encoder, may have the '
+               'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
+               'not include what the likelihood does not show: turn further')
     if method == 'rate':
         yield ('the regression of rates fits no time offset, and noise of the gyro biases its '
-               'scale factor error by more than its interval; compare it with the method '
-               'likelihood')
+               'scale factor error by up to '
+               f'{100.0 * fit.response_deviation:.2g} %, which the interval includes; compare it '
+               'with the method likelihood')
 
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.

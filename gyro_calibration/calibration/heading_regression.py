@@ -1028,6 +1028,9 @@ def is_noisy(log: Log) -> bool:
     if count < MIN_SPANS:
         return False
     spans = replace(spans, delay=find_delay(spans))
-    columns = np.column_stack([spans.base_columns(), spans.acceleration_changes()])[:count]
+    # an eccentric encoder is no course
+    columns = np.column_stack([
+        spans.base_columns(), spans.acceleration_changes(),
+        spans.cause_columns(CauseTerm('reference_once_per_rev'))])[:count]
     residual = robust_residual(columns, spans.observed[:count], 10)
     return robust_deviation(residual) > math.sqrt(2.0) * MIN_COURSE_NOISE

@@ -110,6 +110,8 @@ class ScaleBiasFit:
     # and their covariance, shape (k, k); k is 2 where it shows the rotation about these, else 0
     misalignment: Array = field(default_factory=lambda: np.empty(0))
     misalignment_covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
+    # sizes of the error of a measured heading once in a revolution, rad, shape (2,), or none (0,)
+    shaft_error: Array = field(default_factory=lambda: np.empty(0))
 
 
 #: What to do about an oblique axis.
@@ -213,6 +215,8 @@ class _RunAlignment:
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
                                                 excess_turn, cross_rotation)
+        self.shaft_error: Array = np.zeros(2)  # in the columns of the shaft, rad
+        self.has_shaft = self.is_measured and not cross_rotation.size
 
     def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
         """
@@ -274,6 +278,13 @@ class _RunAlignment:
         """Compute accelerations as in a Gaussian window of a lag, s² (Gauss and Hermite)."""
         self._acceleration_time = max(self._smoothing_time, min(
             math.sqrt(6.0 * abs(lag)), self._block_duration))
+
+    def set_shaft_error(self, sizes: Array) -> None:
+        """Compute the errors of a shaft at its headings without errors of these sizes, rad."""
+        points, self.shaft_error = self._points, sizes
+        shared = np.column_stack([_shaft_columns(correct_shaft(points.heading, sizes)),
+                                  points.shared[:, 2:]])
+        self._points = replace(points, shared=shared)
 
     def require_increments(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""
@@ -362,18 +373,37 @@ def _select_reference_points(motion: Motion, block: float, slip_deviation: float
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
                                 *tracking_error_columns(motion, time, slip_deviation, excess_turn))
     step = encoder_step(motion.heading)
-    if not step or cross_rotation.size:
+    if cross_rotation.size:  # an attitude, which has no shaft
         ones = np.ones(cross_rotation.shape[1])
         return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
                                 cross_rotation, MISALIGNMENT_DEVIATION * ones, ones[None])
-    step_crossings = _find_step_crossings(motion, step)
-    constant_readings = _find_constant_readings(motion, step, block)
-    order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
-    time, heading, variance, shared = (np.concatenate(
-        [getattr(points, name) for points in (step_crossings, constant_readings)])[order]
-                                       for name in ('time', 'heading', 'variance', 'shared'))
-    return _ReferencePoints(time, heading, variance, shared, np.full(2, step / math.sqrt(12.0)),
-                            np.ones((1, 2)))
+    time, heading, variance, shared = (motion.time, motion.heading, np.ones(len(motion.time)),
+                                       np.empty((len(motion.time), 0)))
+    if step:
+        step_crossings = _find_step_crossings(motion, step)
+        constant_readings = _find_constant_readings(motion, step, block)
+        order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
+        time, heading, variance, shared = (np.concatenate(
+            [getattr(points, name) for points in (step_crossings, constant_readings)])[order]
+                                           for name in ('time', 'heading', 'variance', 'shared'))
+    rests = np.ones(shared.shape[1])
+    return _ReferencePoints(
+        time, heading, variance, np.column_stack([_shaft_columns(heading), shared]),
+        np.append(np.full(2, _SHAFT_ERROR_DEVIATION), step / math.sqrt(12.0) * rests),
+        np.array([[factor, factor, *rests] for factor in _PRIOR_FACTORS]))
+
+
+def _shaft_columns(heading: Array) -> Array:
+    """Return the errors once in a revolution of a shaft, from the heading 0 on, shape (n, 2)."""
+    return np.column_stack([np.sin(heading), np.cos(heading) - 1.0])
+
+
+def correct_shaft(heading: Array, sizes: Array) -> Array:
+    """Return the headings of a shaft that errs once in a revolution, by sizes in rad, (2,)."""
+    corrected = heading
+    for _ in range(3):
+        corrected = heading + _shaft_columns(corrected) @ sizes
+    return corrected
 
 
 #: Standard deviation of the scale factor error by which the two senses of turning may differ.
@@ -387,6 +417,9 @@ _MAX_TURN_GROUPS = 12
 _RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.2 * np.arange(1, 5), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
 _PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
+#: Largest prior standard deviation of an error of a shaft once in a revolution, as of an eccentric
+#: encoder, rad.
+_SHAFT_ERROR_DEVIATION = math.radians(1.0)
 
 
 def tracking_error_columns(
@@ -619,10 +652,13 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
                      rate_variance, noise, float(log_likelihood), weighted)
 
 
-def _average_over_noise(data: _Increments,
-                        prior_factors: Array) -> tuple[Array, Array, _Estimate]:
+def _average_over_noise(data: _Increments, prior_factors: Array,
+                        has_shaft: bool) -> tuple[Array, Array, _Estimate]:
     """
     Return the average over all ratios of the noises and factors of the priors, (m, k).
+
+    An error of the shaft is included only where the likelihoods show it: over less than a
+    revolution it has nearly the effect of a scale factor error.
 
     Returns
     -------
@@ -637,6 +673,11 @@ def _average_over_noise(data: _Increments,
     logarithms, values, covariances = (
         np.array([getattr(each, name) for each in estimates])
         for name in ('log_likelihood', 'values', 'covariance'))
+    if has_shaft:
+        has_error = np.tile(prior_factors[:, 4] > prior_factors[0, 4], len(noises))
+        # by the chi-squared distribution of two degrees of freedom
+        if math.exp(logarithms[~has_error].max() - logarithms.max()) > MIN_FIT_PROBABILITY:
+            logarithms[has_error] = -math.inf
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     return (weights @ values, np.tensordot(weights, covariances, 1)
@@ -778,6 +819,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         alone = _solve_weighted(data, white, white.solve(data.columns), estimate.prior_deviation)
     scale, bias = values.tolist()
     of_axes = slice(4, 4 + cross_rotation.shape[1])
+    of_shaft = slice(4, 6 if alignment.has_shaft else 4)
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
     dof = alone.dof + (not alignment.is_measured)
@@ -793,7 +835,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         heading_difference=math.sqrt(6.0 * np.mean(np.cumsum(estimate.residual) ** 2)),
         response_deviation=response_deviation,
         misalignment=estimate.values[of_axes],
-        misalignment_covariance=averaged_covariance[of_axes, of_axes])
+        misalignment_covariance=averaged_covariance[of_axes, of_axes],
+        shaft_error=estimate.values[of_shaft] / _nonzero_scale(scale))
 
 
 def _rms_slip(data: _Increments, values: Array, slip_deviation: float) -> float:
@@ -822,7 +865,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     possible, response_deviation = float(alignment.prior_deviation[3]), 0.0
     estimate: _Estimate | None = None
     for prior_factors in (data.prior_factors[:1], data.prior_factors, data.prior_factors):
-        before = offset
+        before, shaft_error = offset, alignment.shaft_error
         if alignment.is_measured:
             alignment.prior_deviation[3] = math.inf
             if estimate is not None:
@@ -830,7 +873,8 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
                     data, estimate, offset, possible)
                 alignment.set_lag(float(estimate.values[3]))
             data = alignment.require_increments(offset, lag)
-        values, covariance, estimate = _average_over_noise(data, prior_factors)
+        values, covariance, estimate = _average_over_noise(data, prior_factors,
+                                                           alignment.has_shaft)
         for _ in range(8):
             if alignment.is_measured:
                 estimate = _errors_in_variables(data, estimate)
@@ -843,8 +887,11 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
             noise = _IncrementCovariance(data, estimate.noise.ratio)
             estimate = _solve_weighted(data, noise, noise.solve(_instrument(data, noise)),
                                        estimate.prior_deviation)
+        if alignment.has_shaft:
+            alignment.set_shaft_error(estimate.values[4:6] / _nonzero_scale(estimate.values[0]))
         if (len(prior_factors) == len(data.prior_factors)
-                and abs(offset - before) < _OFFSET_TOLERANCE):
+                and abs(offset - before) < _OFFSET_TOLERANCE
+                and np.abs(alignment.shaft_error ** 2 - shaft_error ** 2).max() < 1e-6):
             break
     assert estimate is not None
     return offset, data, values, covariance, estimate, response_deviation

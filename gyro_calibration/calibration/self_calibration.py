@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.likelihood import (
-    ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_NOISE_SIGMAS,
-    MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
+    ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_BLOCK_DURATION,
+    MAX_NOISE_SIGMAS, MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
 from gyro_calibration.calibration.run_faults import (
     fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
     RunPieces, split_run)
@@ -180,14 +180,12 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     # slip that all turns have; the root mean square of slips between zero and a largest one is
     # twice their standard deviation
     scale = 1.0 + fit.scale_factor_error
-    rounding = 0.0 if motion.rate is None else _rounding_variance(rate if output is None
-                                                                  else output)
     unobservable = np.diag(
-        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2
-         + rounding / float(np.mean(rate ** 2)),
-         noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2 + rounding])
-    fit = replace(fit, covariance=fit.covariance + unobservable, rounding_variance=rounding,
-                  goodness=_goodness_of_fit(fit, reference, noise))
+        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
+         noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2])
+    of_steps, rounding = rounding_covariance(time, rate if output is None else output, fit)
+    fit = replace(fit, covariance=fit.covariance + unobservable + of_steps,
+                  rounding_variance=rounding, goodness=_goodness_of_fit(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
@@ -198,13 +196,41 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     return fit
 
 
-def _rounding_variance(output: Array) -> float:
-    """Return the variance of a mean at a constant rate by the steps of an output, (rad/s)²."""
+def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
+    """
+    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
+
+    By least squares on blocks of half a second or ten samples. At one code, as at all rests, the
+    steps cause one error, which is no noise of a fit; between codes the errors are independent.
+    Changes within a block average them out, as noise does. Zeros without steps.
+
+    Parameters
+    ----------
+    time : s, shape (n,)
+    output : rad/s, shape (n,)
+
+    Returns
+    -------
+    covariance, shape (2, 2), and variance, (rad/s)²
+
+    """
     step = quantization_step(output)
     if not step:
-        return 0.0
-    noise = noise_before_rounding(np.array([(white_noise_deviation(output) / step) ** 2]))
-    return step ** 2 * float(rounding_product(noise, np.zeros(1))[0])
+        return np.zeros((2, 2)), 0.0
+    length = max(MAX_BLOCK_DURATION, 10.0 * float(np.median(np.diff(time))))
+    block = np.unique(np.floor((time - time[0]) / length), return_inverse=True)[1]
+    count = np.bincount(block)
+    mean = np.bincount(block, output) / count
+    variance = np.bincount(block, ((output - mean[block]) / step) ** 2) / count
+    quiet = variance <= max(0.25, variance.min())
+    variance[quiet] = variance[quiet].mean()
+    error = step * np.sqrt(rounding_product(noise_before_rounding(variance), np.zeros(1)))
+    rate = (mean - fit.bias) / (1.0 + fit.scale_factor_error)
+    root = np.sqrt(count)[:, None]
+    weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) * root.T
+    code = np.unique(np.rint(mean / step), return_inverse=True)[1]
+    sums = np.array([np.bincount(code, each * error) for each in weights])
+    return sums @ sums.T, float(error[quiet][0] ** 2)
 
 
 def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) -> None:

@@ -171,17 +171,23 @@ def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
 
 def _exclude_invalid(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the records, with those excluded whose fault only the whole fleet shows."""
-    first_log: dict[str, str] = {}
+    copies: dict[str, list[dict[str, Any]]] = {}
     for each in sorted(records, key=lambda one: not one['unit']):
-        first_log.setdefault(each['content'], each['log'])
+        copies.setdefault(each['content'], []).append(each)
     median_noise = {each['type']: float(np.median([
         _rest_noise(one) for one in records if _rest_noise(one) and one['type'] == each['type']]))
         for each in records if _rest_noise(each)}
     found = []
     for each in records:
-        exclusion = ''
-        if each['status'] == DONE and first_log[each['content']] != each['log']:
-            exclusion = f'it is a copy of {first_log[each["content"]]}'
+        exclusion, first = '', copies[each['content']][0]
+        other = next((one for one in copies[each['content']]
+                      if one['unit'] and one['unit'] != each['unit']), None)
+        if each['status'] == DONE and each['unit'] and other is not None:
+            exclusion = (f'it is of unit {to_printable(each["unit"])} and has the values of '
+                         f'{other["log"]}, of unit {to_printable(other["unit"])}: delete the one '
+                         'that is a copy, or correct its unit')
+        elif each['status'] == DONE and first is not each:
+            exclusion = f'it is a copy of {first["log"]}'
         elif each['status'] == DONE and not each['unit']:
             exclusion = 'its unit is unknown; give a table or --pattern'
         elif (_rest_noise(each)

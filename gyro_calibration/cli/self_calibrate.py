@@ -101,15 +101,20 @@ def run(given: argparse.Namespace) -> Answer:
     calibration = make_self_calibration(fit, 'turns' if by_turns else given.method, log, is_used)
     if given.out:
         write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
-    refused_count = int(np.count_nonzero(np.isfinite(output) & ~plausible))
-    if refused_count:
-        lines.append(f'{refused_count} rows have an implausible rate or temperature and are not '
-                     'used.')
     first = as_sentence(f'{calibration}, from {is_used.sum()} samples')
-    return Answer([first, *lines],
+    return Answer([first, *lines, *describe_unused_rows(log, plausible)],
                   {**calibration.to_dict(), 'samples': int(is_used.sum()),
-                   'refused_samples': refused_count, **data, 'out': given.out},
-                  (given.picture, given.out))
+                   'rows_without_output': int(np.count_nonzero(~np.isfinite(output))),
+                   'refused_samples': int(np.count_nonzero(np.isfinite(output) & ~plausible)),
+                   **data, 'out': given.out}, (given.picture, given.out))
+
+
+def describe_unused_rows(log: Log, plausible: Mask) -> list[str]:
+    """Return a sentence on the rows without an output, and one on those that are implausible."""
+    known = np.isfinite(np.asarray(log.output))
+    return [f'{rows.sum()} of {len(log)} rows have {words} and are not used.' for rows, words in (
+        (~known, 'no output of the gyro'),
+        (known & ~plausible, 'an implausible rate or temperature')) if rows.any()]
 
 
 #: A fit, the rows of the log that were used, further data and lines of the answer.

@@ -18,7 +18,7 @@ from dataclasses import replace
 import math
 
 from chance import fewest
-from encoder_intervals import run, run_smoothing
+from encoder_intervals import run, run_eccentric, run_smoothing
 from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import calibrate, calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
@@ -125,7 +125,8 @@ def test_scale_bias_and_delay_are_found(log, late, lost, count):
     found = calibrate_encoder(log)
     assert (found.method, found.lost_samples, len(found.reference.time)) == (
         'likelihood', lost, count)
-    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
+    # the steps of the encoder, the same in each period, look like an error of the shaft
+    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=1e-4)
     assert found.fit.time_offset == pytest.approx(late, abs=1e-4)
 
 
@@ -231,6 +232,19 @@ def test_turns_and_stops_show_a_smoothing(smoothing):
     assert stated.max() < 3e-4
 
 
+@pytest.mark.parametrize('kind, size', [('swing', 1.0), ('steps', 0.05),
+                                        ('small sine', 1.0)])
+def test_an_eccentric_encoder_leaves_the_intervals_true(kind, size):
+    found = np.array([run_eccentric((kind, size, seed)) for seed in range(6)])
+    assert (np.abs(found[:, 0]) < 3.0 * found[:, 1]).all()
+
+
+def test_less_than_a_revolution_is_stated():
+    assert 'turns by 198 deg in all' in ' '.join(calibrate_encoder(CLEAN).remarks)
+    turned = motion_from_rates(SWING.time, 2.0 * SWING.rate)
+    assert 'deg in all' not in ' '.join(calibrate_encoder(log_of(turned, 100.0)).remarks)
+
+
 def test_turns_in_one_direction_leave_the_bias_as_uncertain_as_the_scale():
     generator, time = np.random.default_rng(2), np.arange(2000) * INTERVAL
     rate = 40.0 * DEGREE * (1.0 - np.cos(2.0 * np.pi * time / 2.5)) * (time > 1.0)
@@ -245,7 +259,7 @@ def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says
     """By 0.25 % for 50 ms on ramps of 0.3 s; by more where the motion is not smooth."""
     late = log_of(SWING, 100.0, late=0.05)
     by_rate, by_likelihood = (calibrate_encoder(late, method) for method in ('rate', 'likelihood'))
-    assert by_rate.fit.scale_factor_error - S > 0.002 > 50.0 * abs(
+    assert by_rate.fit.scale_factor_error - S > 0.002 > 20.0 * abs(
         by_likelihood.fit.scale_factor_error - S)
     assert 'no time offset' in by_rate.remarks[1]
 

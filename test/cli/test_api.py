@@ -43,6 +43,18 @@ def run_model():
     return self_calibrate(run_and_rest(), 'calibration', NOISE)
 
 
+@pytest.mark.parametrize('value, words', [
+    (np.nan, 'no output of the gyro'), (1e9, 'an implausible rate or temperature')])
+def test_a_run_states_how_many_rows_were_not_used(run, tmp_path, value, words):
+    log = run_and_rest()
+    log.output[::2] = value
+    sentence = f'{len(log.output[::2])} of {len(log)} rows have {words} and are not used.'
+    assert sentence in str(self_calibrate(log, 'calibration', NOISE))
+    write_log(tmp_path / 'log.csv', log)
+    code, text, _ = run('self-calibrate', tmp_path / 'log.csv')
+    assert code == 0 and sentence in text
+
+
 @pytest.mark.parametrize('order', ['import gyro_calibration.allan.deviation; {}',
                                    '{}; import gyro_calibration.allan.deviation'])
 def test_allan_is_a_function_and_a_folder_whichever_comes_first(order):

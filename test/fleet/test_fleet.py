@@ -188,6 +188,19 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
         '': ['1', '2'], 'FOG': ['3']}
 
 
+def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, capsys):
+    logs = tmp_path / 'logs'
+    for unit in (1, 2, 3):
+        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
+    (logs / 'b_unit2.csv').write_bytes((logs / 'a_unit1.csv').read_bytes())
+    assert run(logs, '--out', tmp_path / 'out') == 0
+    found = json.loads(capsys.readouterr().out)
+    reasons = {os.path.basename(each['log']): each['reason'] for each in found['no_evidence']}
+    assert set(reasons) == {'a_unit1.csv', 'b_unit2.csv'}
+    assert 'of unit 1' in reasons['b_unit2.csv'] and 'of unit 2' in reasons['a_unit1.csv']
+    assert found['types'][0]['units'] == ['2', '3']
+
+
 def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, capsys):
     """At rest, and on rate tables; deg/s in place of rad/s, and a sign."""
     generator = np.random.default_rng(1)
