@@ -492,13 +492,22 @@ def _with_several(search: Search, causes: Causes) -> Causes:
                            key=lambda each: each[0].penalty - each[1])[:3]:
         tried.append(eliminate_backward(
             white, _refine_in_turn(white, (*grown, drift), len(causes))))
-    likelihood, best = max(((_penalized_likelihood(problem, each), each) for each in tried
-                            if _are_apart(problem, each)), default=(-math.inf, ()),
-                           key=lambda each: each[0])
-    if likelihood < _penalized_likelihood(problem, causes) - math.log(search.rate):
+    evidence, best = max(((_joint_evidence(search, causes, each, len(tried)), each)
+                          for each in tried if _are_apart(problem, each)),
+                         default=(-math.inf, ()), key=lambda each: each[0])
+    if evidence < 0.0:
         return ()
     best = eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
     return best if len(best) > len(causes) + 1 else ()
+
+
+def _joint_evidence(search: Search, causes: Causes, several: Causes, tried: int) -> float:
+    """Return the evidence for several causes in place of others beyond that of noise alone."""
+    gain, penalty = (of(several) - of(causes) for of in (
+        lambda each: fit_causes(search.problem, each).log_likelihood,
+        lambda each: sum(map(complexity_penalty, each))))
+    more = max(len(several) - len(causes), 1)
+    return gain - penalty - 0.5 * float(chi2.isf(search.rate / tried, more))
 
 
 def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
@@ -507,10 +516,6 @@ def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
         fit = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
         causes = (*causes[:place], refine_shape(fit, causes[place])[0], *causes[place + 1:])
     return refine_jointly(search, causes)
-
-
-def _penalized_likelihood(problem: RegressionProblem, causes: Causes) -> float:
-    return fit_causes(problem, causes).log_likelihood - sum(map(complexity_penalty, causes))
 
 
 def _are_apart(problem: RegressionProblem, causes: Causes) -> bool:
