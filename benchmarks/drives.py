@@ -20,19 +20,15 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.model.presets import Preset, XV3500
+from gyro_calibration.model.presets import GOOD_MEMS, Preset, RD2100, XV3500
 import numpy as np
 from numpy.typing import NDArray
 
 #: Motions are made at this interval, s, with corners on multiples of `GRID` after their begin.
 STEP, GRID = 0.01, 0.1
-_RD2100 = Preset('RD2100', 'KVH E-Core RD2100, open-loop fibre-optic, by Ojeda et al. 2000, '
-                 'Table I and section 5: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; '
-                 'half of 2 % and of 0.2 deg/s, both over the range of temperatures',
-                 5.0 / 60.0, 7.2, 0.01, 0.1, 0.1)
-_GOOD_MEMS = Preset('good MEMS', 'round figures of the better ones, such as the ADIS16488',
-                    0.3, 6.0, 0.01, 0.2)
-GYROS = {each.name: each for each in (XV3500, _RD2100, _GOOD_MEMS)}
+
+
+GYROS = {each.name: each for each in (XV3500, RD2100, GOOD_MEMS)}
 
 
 @dataclass(frozen=True)

@@ -45,13 +45,13 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.motion import motion_from_headings
-from gyro_calibration.model.presets import Preset
+from gyro_calibration.model.presets import MPU6050
 import numpy as np
 
 FOLLOWED = 300.0
 #: The gyro is mounted upside down against the encoder in two of them.
 RECORDINGS = {'yaw_slow': -1.0, 'pitch_slow': 1.0, 'yaw_fast': -1.0}
-NOISE = Preset('MPU-6050', 'as measured at rest on the encoder turntable', 0.64).noise
+NOISE = MPU6050.noise
 #: Length of the increments, s, and delays that are tried, s.
 BLOCK, LAGS = 0.5, np.arange(-20, 21) * 0.004
 

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A gyro by published figures, for plans, the demonstration and benchmarks."""
+"""Gyros by published figures, for simulations, plans and benchmarks."""
 
 from dataclasses import dataclass
 
@@ -46,3 +46,10 @@ class Preset:
 XV3500 = Preset('XV3500', 'Epson XV-3500CB by Hong and Park 2008, sections 1, 2.1 and 4.2; their '
                 'bias is printed in deg/s, but only deg/min explains the drift',
                 2.5, 18.0, 0.0373, 0.75 / 60.0)
+RD2100 = Preset('RD2100', 'KVH E-Core RD2100, open-loop fibre-optic, by Ojeda et al. 2000, '
+                'Table I and section 5: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; '
+                'half of 2 % and of 0.2 deg/s, both over the range of temperatures',
+                5.0 / 60.0, 7.2, 0.01, 0.1, 0.1)
+MPU6050 = Preset('MPU-6050', 'as measured at rest on the encoder turntable', 0.64)
+GOOD_MEMS = Preset('good MEMS', 'round figures of the better ones, such as the ADIS16488',
+                   0.3, 6.0, 0.01, 0.2)
