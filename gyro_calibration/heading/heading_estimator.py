@@ -238,9 +238,9 @@ class HeadingEstimator:
 
     @property
     def bias_message(self) -> str:
-        """Return the message on a bias that rests on an assumption; '' if it is known better."""
+        """Return the message on several rates that may be the bias; '' if it is known better."""
         tracker, ambiguity = self.tracker, self.tracker.bias_ambiguity
-        return (f'the bias is a steady rate that may be a turn: it may be off by '
+        return (f'several steady rates may be that of a rest: the bias may be off by '
                 f'{ambiguity / DEGREE:.3f} deg/s, and the heading by '
                 f'{math.sqrt(tracker.variance) / DEGREE:.1f} deg; let the robot rest again after '
                 'a turn, or calibrate it' if ambiguity > tracker.bias[1] / math.sqrt(2.0) else '')

@@ -143,7 +143,7 @@ class HeadingTracker:
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
-        # None with a known bias, and with wheels, which tell of rests
+        # None with wheels, which tell of rests
         self._steady_rates: SteadyRates | None = SteadyRates(covariance)
         self._heading_begin_time = self._last_time
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
@@ -939,9 +939,8 @@ class HeadingTracker:
     def _compare_steady_rates(self, rates: SteadyRates, turn: RateIntegral, end: float) -> None:
         """Compare the bias with steady rates, and an integral that ends at a time, s."""
         sigmas = self._sigmas[MEAN_LAGS[0]]
-        if not rates.add(turn, end, self._state.noise, sigmas, self.is_resting):
-            self._steady_rates = None
-        if self._steady_rates is None or rates.is_current:
+        if not rates.add(turn, end, self._state.noise, sigmas, self.is_resting) or (
+                self.is_resting and not rates.variance):
             return
         change = rates.compare(self._state, sigmas)
         if change is None or self.is_resting:
