@@ -200,7 +200,11 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
     axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING_COLORMAP, alpha=0.8,
                   vmin=-largest, vmax=largest, extend='both')
     lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
-    axes.clabel(lines, fontsize=9)
+    # each line has its label away from its ends and from the labels of its neighbours
+    places = [tuple(line[round((0.35, 0.5, 0.65)[number % 3] * (len(line) - 1))].tolist())
+              for number, level in enumerate(lines.allsegs) for line in level if len(line) > 10]
+    for text in axes.clabel(lines, fontsize=9, manual=places):
+        text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
     title = 'Error of the gyro by the model [deg/s]'
     if dwells is not None and dwells.temperature is not None:
         axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
