@@ -503,9 +503,9 @@ def _with_several(search: Search, causes: Causes) -> Causes:
 
 def _joint_evidence(search: Search, causes: Causes, several: Causes, tried: int) -> float:
     """Return the evidence for several causes in place of others beyond that of noise alone."""
-    gain, penalty = (of(several) - of(causes) for of in (
-        lambda each: fit_causes(search.problem, each).log_likelihood,
-        lambda each: sum(map(complexity_penalty, each))))
+    gain = (fit_causes(search.problem, several).log_likelihood
+            - fit_causes(search.problem, causes).log_likelihood)
+    penalty = sum(map(complexity_penalty, several)) - sum(map(complexity_penalty, causes))
     more = max(len(several) - len(causes), 1)
     return gain - penalty - 0.5 * float(chi2.isf(search.rate / tried, more))
 
