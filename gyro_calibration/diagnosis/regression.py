@@ -94,8 +94,8 @@ class RegressionProblem:
 def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
     """Set up the regression of logs with a grid of noises."""
     logs, rounding_ratio = tuple(replays), 0.0
-    if any(each.heading_step for each in logs):
-        # the most likely variance of the rounding of a heading, relative to white noise
+    if any(each.heading_noise for each in logs):
+        # the most likely variance of the noise of a heading, relative to white noise
         tried = _assemble_problem(logs, NoiseShape(), [
             NoiseShape(walk, rounding_ratio=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))
             for walk in (0.0, 1e-4, 1e-2)])

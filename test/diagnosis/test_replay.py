@@ -140,6 +140,26 @@ def test_the_ends_of_a_fine_encoder_are_no_slips_or_steps(frequency, seed):
     assert {cause.effect for cause in found.findings} == {'reference_quantization'}
 
 
+@pytest.mark.parametrize('dead_zone', [0.0, 0.5])
+@pytest.mark.parametrize('noise', [0.0005, 0.005])
+def test_the_noise_of_a_heading_is_no_dead_zone_and_hides_none(dead_zone, noise):
+    """The rests of a motion have white noise of the heading alone, deg; the zone is in deg/s."""
+    generator = np.random.default_rng(77)
+    time = np.arange(12_000) * 0.05
+    turns = np.repeat(generator.uniform(-0.8, 0.8, 60) * (np.arange(60) % 2), 200)
+    shape = np.hanning(61) / np.hanning(61).sum()
+    rate = np.convolve(turns, shape, 'same')
+    heading = np.cumsum(rate) * 0.05 - 0.025 * (rate + rate[0])
+    output = (np.where(np.abs(rate) < dead_zone * DEGREE, 0.0, 1.005 * rate)
+              + 0.07 * DEGREE * generator.standard_normal(len(time)))
+    log = Log(time=time, output=output, reference_heading=heading + noise * DEGREE
+              * generator.standard_normal(len(time)))
+    found = diagnose([log], np.random.default_rng(0)).findings
+    assert [each.effect for each in found] == ['dead_zone'] * (dead_zone > 0.0)
+    for each in found:
+        assert each.parameters['dead_zone'].estimate == pytest.approx(dead_zone * DEGREE, rel=0.1)
+
+
 @pytest.mark.parametrize('seed', seeds(2))
 def test_single_lost_samples_neither_cost_nor_bias_a_scale_in_a_random_walk(seed):
     """The walk is as large as the white noise after a third of a second."""
