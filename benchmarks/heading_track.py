@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.heading.log_compensation import smooth_track
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import Array, Mask
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -37,7 +37,8 @@ class Track:
 
 
 def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
-          settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
+          settings: TrackerSettings, wheels: Sequence[bool | None] | None = None,
+          hindsight: bool = False,
           age: float | None = 0.0, still: Array | None = None) -> Track:
     """
     Return the heading over a whole log, with hindsight smoothed by all later data.

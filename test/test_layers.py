@@ -69,6 +69,13 @@ def test_a_module_imports_only_what_is_read_before_it():
         assert unknown and not any(unknown.values()), (module, unknown)
 
 
+def test_one_name_has_one_module_and_one_class():
+    names = [path.stem for path in FILES if path.stem != '__init__']
+    names += [node.name for path in FILES for node in ast.parse(path.read_text()).body
+              if isinstance(node, ast.ClassDef) and not node.name.startswith('_')]
+    assert len(names) > 200 and not [name for name in names if names.count(name) > 1]
+
+
 @pytest.mark.parametrize('folder', FOLDERS)
 def test_a_file_of_a_folder_imports_only_what_is_read_before_it(folder):
     dotted = f'gyro_calibration.{folder.replace("/", ".")}'

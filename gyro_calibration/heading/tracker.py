@@ -68,7 +68,7 @@ _MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 1
 
 
 @dataclass(frozen=True)
-class Settings:
+class TrackerSettings:
     """Settings of the heading tracker."""
 
     #: False detections of motion at rest, 1/h; 0 disables the detection of rest, as does an
@@ -87,7 +87,7 @@ class HeadingTracker:
     are outliers, and both count as lost; `rebuild_count` tells how often the state was not finite.
     """
 
-    def __init__(self, noise: Noise, covariance: Array, settings: Settings,
+    def __init__(self, noise: Noise, covariance: Array, settings: TrackerSettings,
                  age: float | None = 0.0, keeps_steps: bool = False,
                  sensitivity_slope: Array | None = None):
         """
@@ -154,7 +154,7 @@ class HeadingTracker:
     def _new_integral(self) -> RateIntegral:
         return RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
 
-    def configure(self, settings: Settings) -> None:  # noqa: A003
+    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
         """Go on with other settings."""
         self._settings = settings
         self._state = self._state.with_added_variance(HEADING_INDEX, self._filtered_turn ** 2)

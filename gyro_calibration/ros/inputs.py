@@ -32,7 +32,7 @@ _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', fl
 
 
 @dataclass(frozen=True)
-class Parameter:
+class NodeParameter:
     """One parameter of a node; its type is the type of its default."""
 
     name: str  # groups are separated by a dot, as in ``calibration.maximum_bias``
@@ -79,7 +79,7 @@ class Parameter:
         raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
 
 
-def parameter_values(table: Sequence[Parameter],
+def parameter_values(table: Sequence[NodeParameter],
                      given: Mapping[str, object] | None = None) -> SimpleNamespace:
     """Return the values of a table by attribute: checked given values, else defaults."""
     given = given or {}

@@ -18,8 +18,8 @@ from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import (
     CauseTerm, find_drift, fit_spans, lay_out_spans)
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.noisy_reference import search_causes
-from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows

@@ -24,7 +24,7 @@ import time
 import fatal_tasks
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
 from gyro_calibration.cli.main import main
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.logs import (
     compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
