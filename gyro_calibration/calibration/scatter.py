@@ -36,6 +36,7 @@ from gyro_calibration.calibration.dwells import (
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.quality import robust_deviation
 from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -220,7 +221,7 @@ def find_inliers(dwells: Dwells) -> Mask:
             columns = extended
     residual = np.abs(robust_residual(columns, dwells.output - dwells.rate, 20))
     # Such a fit passes through as many dwells as it has columns; these are left out of the median.
-    spread = 1.4826 * float(np.median(np.sort(residual)[columns.shape[1]:]))
+    spread = robust_deviation(np.sort(residual)[columns.shape[1]:])
     limit = OUTLIER_THRESHOLD * np.hypot(spread, np.nan_to_num(dwells.deviation)) + 1e-12
     return (residual <= limit) | (len(dwells) < _MIN_DWELLS)
 
