@@ -29,9 +29,9 @@ from gyro_calibration.calibration.rate_table import bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import SelectedEffects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress, wrap_line
+from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
-from gyro_calibration.diagnosis.words import as_sentence, display_unit
+from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
 from gyro_calibration.files import InputError, suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (

@@ -27,8 +27,9 @@ from typing import Any
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.gates import is_degree_ratio
+from gyro_calibration.diagnosis.words import wrap_line
 from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.fleet.logs import (
     compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
