@@ -59,7 +59,6 @@ class RestResult:
     sigmas: float  # of the mean, by the variance of the model; nan where unknown
     is_bias_normal: bool  # within chance
     bias_deviation: float  # standard deviation of the mean by the noise of this stretch, rad/s
-    is_announced: bool
 
 
 class RepeatedOutputDetector:
@@ -258,32 +257,32 @@ class HealthMonitor:
         if np.ptp(output) > 0.0:
             self._step = min(self._step, quantization_step(output))
         rest = examine_stretch(time, output, rate, self._noise, self._level, self._step,
-                               bias_variance, age, is_announced)
+                               bias_variance, age)
         if rest is not None:
             self.last_rest, self.examined_count = rest, self.examined_count + 1
             self.has_noise_at_rest = (self.has_noise_at_rest
                                       or rest.is_noise_normal and rest.is_bias_normal)
             self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
-            self._set_alarms(rest)
+            self._set_alarms(rest, is_announced)
         return rest
 
-    def _set_alarms(self, rest: RestResult) -> None:
+    def _set_alarms(self, rest: RestResult, is_announced: bool) -> None:
         last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
         # the mean was the same in the last stretches, unlike in turns
         biases = [each.bias for each in last]
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
         if rest.is_noise_normal:
             self.noise_alarm = ''
-        elif rest.is_announced or several and not any(each.is_noise_normal for each in last):
+        elif is_announced or several and not any(each.is_noise_normal for each in last):
             remedy = ('record a log at rest, and run allan or diagnose on it'
                       if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = ('' if rest.is_announced or rest.noise_ratio < 1.0
+            shaken = ('' if is_announced or rest.noise_ratio < 1.0
                       else ', or the robot vibrates')
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
                                 f'model{shaken}: {remedy}')
         if rest.is_bias_normal:
             self.bias_alarm = ''
-        elif (rest.is_announced or abs(rest.bias) < self.standstill_rate
+        elif (is_announced or abs(rest.bias) < self.standstill_rate
               or several and stays and not any(each.is_bias_normal for each in last)):
             self.bias_alarm = (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
                                f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
@@ -291,8 +290,8 @@ class HealthMonitor:
 
 
 def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level: float,
-                    step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0,
-                    is_announced: bool = False) -> RestResult | None:
+                    step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0
+                    ) -> RestResult | None:
     """
     Test a stretch of samples against noise and bias of a model.
 
@@ -342,7 +341,7 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     return RestResult(
         math.sqrt(measured / claimed), not (too_much or too_little), mean, sigmas,
         not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level,
-        math.sqrt(of_noise + noise.mean_change_variance(duration, duration)), is_announced)
+        math.sqrt(of_noise + noise.mean_change_variance(duration, duration)))
 
 
 def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise, age: float,

@@ -332,18 +332,7 @@ class Pipeline:
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')
             return None
-        if stamp < self._last_stamp:
-            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
-        if frame != self._frame:
-            before, self._frame = self._frame, frame
-            if before is None:
-                self._first_frame = frame
-            else:
-                self._note_jump(now, to_printable(
-                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
-                    'imu/data_raw'))
-        if self.publisher_conflict:
-            self._detect_interleaving(stamp)
+        self._detect_several_gyros(stamp, frame, now)
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
@@ -353,22 +342,8 @@ class Pipeline:
             self._update_host_clock()
             time = self._host_time.convert_sample(time, self._last_time, self._usual_interval,
                                                   silence)
-        if time == self._last_time:
-            counts['repeated_stamps'] += 1
-            first, fastest = self._frozen_stamp or (now, 0.0)
-            self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = (
-                f'the stamp stands still at {time:.3f} s; the sample is not used'
-                if now - first > DRIVE_SAMPLE_TIMEOUT else
-                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
-                'on its arrival; only the first of them is used: stamp when the gyro measures')
+        if self._repeats_stamp(time, output, now):
             return None
-        if self._frozen_stamp is not None:
-            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
-            if now - first > DRIVE_SAMPLE_TIMEOUT:  # add the possible turn meanwhile
-                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
-                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                 'came; turns in this time are not in the heading')
         interval = time - self._last_time
         if 0.0 < interval <= self.values.maximum_gap:
             self._usual_interval = min(interval, self.estimator.tracker.intervals.usual_interval)
@@ -403,6 +378,42 @@ class Pipeline:
             f'the samples on imu/data_raw have the frame {self._frame:.99}, and had '
             f'{self._first_frame:.99}: the calibration may be that of another gyro; restart this '
             'node, and calibrate another gyro')
+
+    def _detect_several_gyros(self, stamp: int, frame: str, now: float) -> None:
+        """Detect stamps that jump back, frames that alternate, and samples that interleave."""
+        if stamp < self._last_stamp:
+            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
+        if frame != self._frame:
+            before, self._frame = self._frame, frame
+            if before is None:
+                self._first_frame = frame
+            else:
+                self._note_jump(now, to_printable(
+                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
+                    'imu/data_raw'))
+        if self.publisher_conflict:
+            self._detect_interleaving(stamp)
+
+    def _repeats_stamp(self, time: float, output: float, now: float) -> bool:
+        """Tell whether a stamp is that of the last sample, and add the turn while it was so."""
+        journal = self.journal
+        if time == self._last_time:
+            journal.counts['repeated_stamps'] += 1
+            first, fastest = self._frozen_stamp or (now, 0.0)
+            self._frozen_stamp = first, max(fastest, abs(output))
+            journal.event = (
+                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                if now - first > DRIVE_SAMPLE_TIMEOUT else
+                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
+                'on its arrival; only the first of them is used: stamp when the gyro measures')
+            return True
+        if self._frozen_stamp is not None:
+            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
+            if now - first > DRIVE_SAMPLE_TIMEOUT:
+                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
+                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
+                                 'came; turns in this time are not in the heading')
+        return False
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
