@@ -12,6 +12,7 @@
 
 import csv
 from dataclasses import replace
+from datetime import date, timedelta
 import io
 import json
 import os
@@ -381,6 +382,34 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
     told = '; '.join(describe_type(found))
     assert 'hysteresis: established in 20 of 20 logs, of 5 of 5 units: the model' in told
     assert 'reference scale: established in 20 of 20 logs, of 5 of 5 units: the ref' in told
+
+
+def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
+    """Over age all drift alike; the values less those of their units are drawn over the dates."""
+    generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
+    slopes = 1e-4 * (2.0 + generator.standard_normal(8))
+    logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '', 'slow': {},
+             'date': str(date(2026, 1, 1) + timedelta(365.25 * age)), 'temperature': temperature,
+             'values': {'bias': {'value': unit + slope * temperature + 2e-3 * age
+                                 + 1e-4 * generator.standard_normal(), 'deviation': 1e-5,
+                                 'unit': 'rad/s'}}}
+            for unit, slope in enumerate(slopes)
+            for place, (temperature, age) in enumerate(
+                zip(generator.permutation(degc).tolist(), years))]
+    (found,) = summarize_types(logs)
+    shown = data(found)['values']['bias']
+    low, high = shown['between_units_over_temperature']['ci95']
+    assert 0.0 < low < np.std(slopes, ddof=1) < high
+    assert shown['between_units_over_age']['ci95'][0] == 0.0
+    assert shown['slopes']['age']['ci95'][0] < 2e-3 < shown['slopes']['age']['ci95'][1]
+    ends = np.array([shown['units'][str(unit)]['slopes']['temperature']['ci95']
+                     for unit in range(8)])
+    assert np.sum((ends[:, 0] < slopes) & (slopes < ends[:, 1])) >= 6
+    (row, *_) = csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines())
+    assert float(row['temperature_slope_low']) == ends[0, 0]
+    text = render_report([found], [{**each, 'reason': ''} for each in logs])
+    assert 'bias less that of the unit' in text and f'dates: {", ".join(found.dates)}' in text
+    assert '>drift</th>' in text
 
 
 # models
