@@ -32,7 +32,8 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD, rounding_covariance, select_dwells)
+    dwell_rounding_covariance, Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD,
+    select_dwells)
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
@@ -346,7 +347,7 @@ class Uncertainty:
         if len(dwells.rounding):
             # errors by the steps of the output are known: a small residual does not remove them
             whiten = Whitener(dwells, scatter).whiten
-            sizes_known, directions = np.linalg.eigh(rounding_covariance(
+            sizes_known, directions = np.linalg.eigh(dwell_rounding_covariance(
                 dwells.rate, dwells.output, dwells.rounding))
             known = np.linalg.pinv(whiten(columns / lengths)) @ whiten(
                 directions * np.sqrt(np.maximum(sizes_known, 0.0)))

@@ -28,7 +28,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 # ruff: noqa: E402
 from gyro_calibration import __version__
 from gyro_calibration.cli.verb import print_message
-from gyro_calibration.diagnosis.causes import add_causes
+from gyro_calibration.diagnosis.causes import register_causes
 from gyro_calibration.files import (
     describe_error, describe_os_error, format_json, InputError, suggest_nearest, to_printable)
 from gyro_calibration.logs.log import DataRefused
@@ -78,7 +78,7 @@ def _load_effects(path: str) -> None:
     try:
         spec.loader.exec_module(module)
         add_effects(module.EFFECTS)
-        add_causes(module.EFFECTS)
+        register_causes(module.EFFECTS)
     except Exception as error:
         raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
                          f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'

@@ -31,8 +31,8 @@ from gyro_calibration.diagnosis.words import (
     as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
-    Alarm, DRIVES, find_changes, find_outliers, IntegerArray, Interval, Observations, OWN_SHARE,
-    PooledValue, POWER_ONS, SLOPES, UNITS)
+    Alarm, DRIVES, find_changes, find_outlying_groups, IntegerArray, Interval, Observations,
+    OWN_SHARE, PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -161,8 +161,8 @@ def _summarize_value(name: str, slow: bool, records: Sequence[LogRecord],
         {over: of_units(row, part=part)
          for part, (over, row) in enumerate(zip(columns, slopes), 1)
          if SLOPES[part - 1] in pooled.variance_names},
-        find_outliers(pooled, UNITS, units, significance),
-        find_outliers(pooled, DRIVES, drives, significance),
+        find_outlying_groups(pooled, UNITS, units, significance),
+        find_outlying_groups(pooled, DRIVES, drives, significance),
         find_changes(pooled, day, units, dates, significance))
 
 
@@ -374,7 +374,7 @@ _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 're
             'samples', 'duration_s', 'sha256', 'page')
 
 
-def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
+def render_fleet_page(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '

@@ -337,7 +337,7 @@ class SlowTurn:
 
 
 #: Time constant with which a pending correction of the heading is applied in motion, s.
-SETTLING_TIME = 1.0
+CORRECTION_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -412,7 +412,7 @@ class EvenSamples:
         self.block_squares = self.block_angles ** 2 / np.maximum(
             self.block_sums[0], MIN_SAMPLE_INTERVAL)
         self.block_ends = np.array(self.block_stops) - 1
-        self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
+        self._pending_retention = 1.0 - self.intervals / CORRECTION_TIME
         self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
 

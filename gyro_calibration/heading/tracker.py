@@ -30,8 +30,8 @@ from gyro_calibration.heading.integration import (
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, STANDSTILL, TrackStep, WALK_INDEX)
 from gyro_calibration.heading.stationary import (
-    Block, BLOCK_DURATION, BLOCK_RATIOS, ENDING_RATES, EnergyDetector, Epoch, EvenSamples,
-    MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SETTLING_TIME, SlowTurn,
+    Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES, EnergyDetector, Epoch,
+    EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SlowTurn,
     Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
 from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
@@ -637,7 +637,7 @@ class HeadingTracker:
         deleted = half * (rate - filtered + last_rate - last_filtered)
         self.deleted_heading += deleted
         self._filtered_turn += deleted
-        settled = self._pending_correction * duration / SETTLING_TIME
+        settled = self._pending_correction * duration / CORRECTION_TIME
         self._pending_correction -= settled
         self.heading += corrected + settled
 

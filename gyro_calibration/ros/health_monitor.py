@@ -31,7 +31,7 @@ from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_TURN_RATE
+from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_ODOMETRY_TURN_RATE
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
@@ -98,7 +98,8 @@ class RepeatedOutputDetector:
                     or self._acceleration > MAX_ANGULAR_ACCELERATION):
                 self.unseen_turn = self._find_unseen_turn(math.hypot(step, self._last_step))
             self._last_step = step
-            self._acceleration = (step - MIN_TURN_RATE) / max(changed_after, MIN_SAMPLE_INTERVAL)
+            self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
+                                  / max(changed_after, MIN_SAMPLE_INTERVAL))
             self._value, self._since, self._until, self._count = output, time, time, 0
             self._changes += 1
             return toggles
@@ -106,7 +107,7 @@ class RepeatedOutputDetector:
         lasts = time - self._since
         if toggles or self._count < 20 or lasts < _MIN_REPEAT_DURATION:
             return toggles
-        if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_TURN_RATE
+        if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)

@@ -29,10 +29,12 @@ from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.logs import (
     compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
-from gyro_calibration.fleet.pooling import find_changes, find_outliers, Observations, PooledValue
+from gyro_calibration.fleet.pooling import (
+    find_changes, find_outlying_groups, Observations, PooledValue)
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models, count_effects, data, describe_type, render_report, summarize_types, table_files)
+    build_models, count_effects, data, describe_type, render_fleet_page, summarize_types,
+    table_files)
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -314,12 +316,12 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     values = generator.standard_normal((12, 1)) + 0.2 * generator.standard_normal((12, 6))
     date = np.tile(np.arange(6), 12)
     names = [str(number) for number in range(12)]
-    assert find_outliers(PooledValue(crossed(values)), 'units', names, 0.01) == []
+    assert find_outlying_groups(PooledValue(crossed(values)), 'units', names, 0.01) == []
     assert find_changes(PooledValue(crossed(values)), date, names, names, 0.01) == []
     values[3] += 12.0
     values[7, 4:] += 3.0
     pooled = PooledValue(crossed(values))
-    assert [each.name for each in find_outliers(pooled, 'units', names, 0.01)] == ['3']
+    assert [each.name for each in find_outlying_groups(pooled, 'units', names, 0.01)] == ['3']
     (change,) = find_changes(pooled, date, names, names, 0.01)
     assert ((change.name, change.since) == ('7', '4')
             and change.size == pytest.approx(3.0, abs=0.5))
@@ -364,7 +366,7 @@ def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
     assert set(dict(build_models(found))) == {'', *'01234'}
     rows = list(csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines()))
     assert sum(row['unit'] == unit for row in rows) == 1
-    assert unit in render_report([found], [{**each, 'reason': ''} for each in logs])
+    assert unit in render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
 
 
 def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
@@ -407,7 +409,7 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
     assert np.sum((ends[:, 0] < slopes) & (slopes < ends[:, 1])) >= 6
     (row, *_) = csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines())
     assert float(row['temperature_slope_low']) == ends[0, 0]
-    text = render_report([found], [{**each, 'reason': ''} for each in logs])
+    text = render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
     assert 'bias less that of the unit' in text and f'dates: {", ".join(found.dates)}' in text
     assert '>drift</th>' in text
 
@@ -463,7 +465,7 @@ def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
             for each in records()]
     left = {'log': 'x/<b>.csv', 'type': '', 'unit': '', 'drive': '', 'date': '',
             'reason': 'holds no gyro'}
-    text = render_report(summarize_types(logs), [*logs, left])
+    text = render_fleet_page(summarize_types(logs), [*logs, left])
     assert all(f'<td data-key="&lt;{unit}&gt;">&lt;{unit}&gt;</td>' in text for unit in range(5))
     assert 'href="logs/a.html"' in text and 'holds no gyro' in text and '<b>' not in text
     assert 'class="sortable"' in text and '1 more logs are excluded' in text
