@@ -58,6 +58,17 @@ def run(*arguments):
     return main(['fleet', *map(str, arguments), '--no-diagnosis', '--workers', '1', '--json'])
 
 
+@pytest.fixture
+def pool(tmp_path, capsys):
+    """Return a function that runs the verb and gives its answer, and the reasons by file."""
+    def pool(logs):
+        assert run(logs, '--out', tmp_path / 'out') == 0
+        found = json.loads(capsys.readouterr().out)
+        return found, {os.path.basename(each['log']): each['reason']
+                       for each in found['no_evidence']}
+    return pool
+
+
 # the unit of each log
 
 def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
@@ -160,7 +171,7 @@ def test_workers_end_with_the_program_that_is_killed(tmp_path):
 
 # the verb
 
-def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, capsys):
+def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, pool):
     logs = tmp_path / 'logs'
     for unit, seed in ((1, 0), (2, 1)):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))
@@ -176,10 +187,8 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
     (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n'
                                       + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
-    assert run(logs, '--out', tmp_path / 'out') == 0
-    told = json.loads(capsys.readouterr().out)
-    reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
-    assert told['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
+    found, reasons = pool(logs)
+    assert found['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
     assert 'a_unit2.csv' in reasons.pop('copy.csv')
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
     assert 'gyro_rad_s' in reasons['d_unit1.csv'] and 'in ms' in reasons['d_unit2.csv']
@@ -187,24 +196,22 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
                             'd_unit2.csv'}
     assert not any('\n' in each for each in reasons.values())
     # types are pooled apart
-    assert {each['type']: each['units'] for each in told['types']} == {
+    assert {each['type']: each['units'] for each in found['types']} == {
         '': ['1', '2'], 'FOG': ['3']}
 
 
-def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, capsys):
+def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, pool):
     logs = tmp_path / 'logs'
     for unit in (1, 2, 3):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
     (logs / 'b_unit2.csv').write_bytes((logs / 'a_unit1.csv').read_bytes())
-    assert run(logs, '--out', tmp_path / 'out') == 0
-    found = json.loads(capsys.readouterr().out)
-    reasons = {os.path.basename(each['log']): each['reason'] for each in found['no_evidence']}
+    found, reasons = pool(logs)
     assert set(reasons) == {'a_unit1.csv', 'b_unit2.csv'}
     assert 'of unit 1' in reasons['b_unit2.csv'] and 'of unit 2' in reasons['a_unit1.csv']
     assert found['types'][0]['units'] == ['2', '3']
 
 
-def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, capsys):
+def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, pool):
     """At rest, and on rate tables; deg/s in place of rad/s, and a sign."""
     generator = np.random.default_rng(1)
     rate = np.tile(np.linspace(-1.0, 1.0, 11), 2)
@@ -219,15 +226,13 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, cap
     (tmp_path / 'logs.csv').write_text(
         'log,unit,type\n' + ''.join(f'logs/{kind}_unit{unit}.csv,{unit},{kind}\n'
                                     for kind in ('rest', 'type_2') for unit in range(5)))
-    assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 0
-    told = json.loads(capsys.readouterr().out)
-    reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
+    found, reasons = pool(tmp_path / 'logs.csv')
     assert set(reasons) == {f'{name}.csv'
                             for name in ('rest_unit3', 'type_2_unit0', 'type_2_unit3')}
     assert 'its white noise is 5' in reasons['rest_unit3.csv']
     assert '-1 is -1' in reasons['type_2_unit0.csv']
     assert '180/pi' in reasons['type_2_unit3.csv']
-    assert [each['units'] for each in told['types']] == [list('0124'), list('124')]
+    assert [each['units'] for each in found['types']] == [list('0124'), list('124')]
 
 
 def test_names_may_hold_any_characters(tmp_path):
