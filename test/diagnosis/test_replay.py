@@ -15,7 +15,7 @@ from dataclasses import replace
 from chance import seeds
 from gyro_calibration.calibration.reference_noise import keep_own_instants
 from gyro_calibration.diagnosis.gates import refuse_unusable
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.residuals import BandEnergies, drop_tone_bands, residual_curves

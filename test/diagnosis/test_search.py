@@ -16,7 +16,7 @@ import math
 from diagnosed import diagnosis_of, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate, effect_candidate, generic_terms, is_named, propose_candidates)
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, likelihood_without)
 from gyro_calibration.diagnosis.replay import replay
