@@ -41,6 +41,7 @@ from scipy.fft import dct, idct, next_fast_len
 from scipy.linalg import toeplitz
 from scipy.ndimage import binary_opening, maximum_filter1d
 from scipy.signal import oaconvolve
+from scipy.special import ndtri
 from scipy.stats import chi2
 
 
@@ -145,8 +146,9 @@ _BLOCK_SAMPLES = 16
 #: spline is 0.43 times as large from sample to sample. Shorter gaps change the slope by little.
 _GAP_MARGIN_SAMPLES = 6
 #: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
-#: sign are 3 sigma. Largest share of corners.
-_CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
+#: sign are 3 sigma. Share of bends by noise or jitter that pass for corners; 13 samples are left
+#: out at each.
+_CORNER_NOISE_SHARE, _CORNER_CHANCE = 0.1, 1e-3
 
 
 #: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1.
@@ -560,11 +562,14 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
 
     At a corner, a spline through the heading and the trapezoidal integral of the output differ by
     a 72nd of the sixth difference, which passes for a dead zone or a slip. That of a smooth
-    motion is small at any acceleration; where a noisy reference has bends everywhere, none are
-    excluded.
+    motion is small at any acceleration; that of a noisy reference, or of a motion that jitters, is
+    everywhere, and a corner differs from it by more than chance.
     """
     bend = np.abs(np.diff(np.pad(rate, 3, mode='edge'), 6)) / 72.0
     white = white_noise_deviation((output - rate)[valid])
-    sharp = maximum_filter1d(bend > _CORNER_NOISE_SHARE * white + rounding, 7)
+    usual = white_noise_deviation(rate, 6) * math.sqrt(math.comb(12, 6)) / 72.0
+    sharp = maximum_filter1d(bend > max(_CORNER_NOISE_SHARE * white + rounding,
+                                        -float(ndtri(0.5 * _CORNER_CHANCE)) * usual),
+                             2 * _GAP_MARGIN_SAMPLES + 1)
     rounded = rounding > math.sqrt(6.0) * white  # most of what looks white is of the steps
-    return np.zeros_like(sharp) if rounded or sharp[valid].mean() > _MAX_CORNER_SHARE else sharp
+    return np.zeros_like(sharp) if rounded else sharp

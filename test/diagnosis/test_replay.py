@@ -11,6 +11,7 @@
 """A log is laid out for the search whatever its reference lost; and what is left of it."""
 
 from dataclasses import replace
+import math
 
 from chance import seeds
 from gyro_calibration.calibration.reference_noise import keep_own_instants
@@ -23,6 +24,7 @@ from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 LATE = 0.004
 
@@ -255,3 +257,19 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     assert len(used.energy) == (60 if tone == 1.0 else 59)
     assert np.exp(0.5 * used.fit()[0][0]) == pytest.approx(2.0, rel=0.03)
     assert tone == 1.0 or np.exp(0.5 * bands.fit()[0][0]) > 2.2
+
+
+def test_corners_of_a_motion_that_jitters_are_no_cause():
+    """A rate begins with a corner; in turns it jitters from sample to sample."""
+    generator, interval, fine = np.random.default_rng(2), 0.05, 8
+    step, count = interval / fine, 6000 * fine
+    turns = np.repeat(generator.uniform(-1.0, 1.0, 60), count // 60) * np.tile(
+        np.repeat([0.0, 1.0], count // 60), 30)
+    rate = lfilter([step / 0.3], [1.0, step / 0.3 - 1.0], turns)
+    jitter = lfilter([math.sqrt(2.0 * step / 0.5)], [1.0, step / 0.5 - 1.0],
+                     0.012 * generator.standard_normal(count))
+    rate = rate + jitter * (np.abs(rate) > 0.02)
+    heading = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step))[::fine]
+    log = Log(time=interval * np.arange(6000), reference_heading=heading,
+              output=rate[::fine] + 1e-3 * generator.standard_normal(6000))
+    assert not diagnose([log], generator).findings
