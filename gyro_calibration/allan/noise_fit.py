@@ -180,8 +180,8 @@ class CombinationFit:
         return float(lower), float(upper)
 
 
-def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
-                    fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
+def _fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
+                     fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
     """Fit nonnegative terms, with the covariance of the fitted noise; one more may be fixed."""
     given = np.zeros(_FILTER_BEND + 1)
     if fixed_term >= 0:
@@ -260,7 +260,7 @@ class Ranking:
                         < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
 
-def rank_combinations(octaves: OctaveVariances) -> Ranking:
+def _rank_combinations(octaves: OctaveVariances) -> Ranking:
     """
     Rank all combinations of terms.
 
@@ -284,7 +284,7 @@ def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ra
         name: getattr(octaves, name)[start:]
         for name in ('size', 'loss_factor', 'variance', 'columns')})
     descriptions = tuple(
-        sorted((fit_combination(since, places, misfit) for places in _COMBINATIONS),
+        sorted((_fit_combination(since, places, misfit) for places in _COMBINATIONS),
                key=CombinationFit.penalized_deviance))
     best = descriptions[0]
     kept = {tuple(place for place in best.active_terms if place not in replaced)
@@ -317,7 +317,7 @@ def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
 
     process = min((GaussMarkov(math.sqrt(2.0 / constant), constant) for constant in np.geomspace(
         octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=approximate_deviance)
-    found = fit_combination(octaves.with_process(process), places, misfit)
+    found = _fit_combination(octaves.with_process(process), places, misfit)
     first = found.squares * found.octaves.columns[0]
     return found if 0.0 < first[_PROCESS] < 0.5 * first.sum() else None
 
@@ -397,7 +397,7 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
                           f'lowest Allan deviation {chart.deviation.min(initial=math.inf):g} '
                           f'rad/s; wanted {_MIN_OCTAVES} octaves, all above 0: record longer and '
                           'without losses')
-    ranking = rank_combinations(OctaveVariances.from_chart(chart))
+    ranking = _rank_combinations(OctaveVariances.from_chart(chart))
     process = None
     if ranking.best_process is not None and ranking.best_process.octaves.process is not None:
         time = ranking.best_process.octaves.process.correlation_time * interval
@@ -448,13 +448,13 @@ def _likelihood_bounds(ranking: Ranking, best: CombinationFit, index: int) -> tu
     held = {_N, _B, _K, *(each for one in (best, *ranking.plausible_fits, *ranking.alternatives)
                           for each in one.active_terms)}
     others = tuple(sorted(held - {index}))
-    joint = fit_combination(best.octaves, (*others, index), ranking.misfit)
+    joint = _fit_combination(best.octaves, (*others, index), ranking.misfit)
     (*_, square), (*_, deviation) = joint.estimate_squares((*others, index))
 
     @cache
     def deviance_at(coefficient: float) -> float:
-        return fit_combination(best.octaves, others, ranking.misfit, index,
-                               coefficient ** 2).deviance
+        return _fit_combination(best.octaves, others, ranking.misfit, index,
+                                coefficient ** 2).deviance
 
     found = math.sqrt(joint.squares[index])
     scale = math.sqrt(max(square, 0.0) + deviation)

@@ -46,7 +46,7 @@ _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
 _USUAL_SPANS = 500
 #: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
 #: the errors of an encoder are at most so many times its rounding error.
-MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
+_MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
 #: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
 #: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
@@ -237,7 +237,7 @@ def is_course(log: Log) -> bool:
     bent = np.abs(np.diff(log.reference_heading, 2))
     # a heading between slower fixes lies on straight lines
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > MIN_LOST_SHARE
+    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > _MIN_LOST_SHARE
               else _COURSE_NOISE_RATIO)
     # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
     # the variance

@@ -60,8 +60,8 @@ except ImportError as error:
 
 PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
-MAX_ATTEMPTS = 3  # to calibrate
-DRIVE_MOTION = constant_rate_motion([
+_MAX_ATTEMPTS = 3  # to calibrate
+_DRIVE_MOTION = constant_rate_motion([
     *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
 
@@ -235,7 +235,7 @@ def run_demo(out: Path, seed: int) -> Answer:
 
 def _calibrate_and_drive(client: DemoClient) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
-    total = round(CALIBRATION_MOTION.duration + 4.0 + DRIVE_MOTION.duration)
+    total = round(CALIBRATION_MOTION.duration + 4.0 + _DRIVE_MOTION.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
               disable=None) as bar:
         bar.set_description('starting driver and compensation')
@@ -250,8 +250,8 @@ def _calibrate_and_drive(client: DemoClient) -> float:
         client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
         begin, started = time.time(), time.monotonic()
-        while (elapsed := time.monotonic() - started) < DRIVE_MOTION.duration:
-            client.command_rate(float(DRIVE_MOTION.rate_at(np.array(elapsed))))
+        while (elapsed := time.monotonic() - started) < _DRIVE_MOTION.duration:
+            client.command_rate(float(_DRIVE_MOTION.rate_at(np.array(elapsed))))
             _wait(bar, 0.02)
         client.command_rate(0.0)
         _wait(bar, 0.5)
@@ -260,12 +260,12 @@ def _calibrate_and_drive(client: DemoClient) -> float:
 
 def calibrate(client: DemoClient, bar: tqdm) -> None:
     """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
-    for attempt in range(1, MAX_ATTEMPTS + 1):
+    for attempt in range(1, _MAX_ATTEMPTS + 1):
         try:
             client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
             return
         except CallRefused as refusal:
-            if attempt == MAX_ATTEMPTS:
+            if attempt == _MAX_ATTEMPTS:
                 raise
             bar.total += CALIBRATION_MOTION.duration + 4.0
             bar.write(f'{refusal}; the run is repeated', file=sys.stderr)

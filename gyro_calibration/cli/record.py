@@ -267,7 +267,7 @@ class CsvRecorder(_Recorder):
         self._rows.clear()
 
 
-def recording_notes(**details: object) -> dict[str, str]:
+def _recording_notes(**details: object) -> dict[str, str]:
     """Return the notes of a recording: program, date, and details except empty ones."""
     known = {name.replace('_', ' '): str(value)
              for name, value in details.items() if value not in (None, '')}
@@ -355,7 +355,7 @@ class _PortSession:
             scale['inverted'] = 'yes' if factor < 0.0 else 'no'
             if protocol is not CSV or settings.sensitivity is not None:
                 scale['sensitivity'] = f'{abs(factor)!r} rad/s a unit of the device{angles}'
-        return recording_notes(
+        return _recording_notes(
             port=self._given.port, device=found.path, protocol=protocol and protocol.name,
             baud=found.baud, axis=settings.axis, **scale)
 
@@ -435,7 +435,7 @@ class _TopicSession:
         self._previous, self._intervals, self._clock_steps = (0, 0), Intervals(), 0
         self._given, self._stop, self._start_time = given, stop, time.monotonic()
         self.recorder = McapRecorder(given.out if self._is_mcap else f'{given.out}.mcap',
-                                     lambda: recording_notes(topics=', '.join(self._roles)))
+                                     lambda: _recording_notes(topics=', '.join(self._roles)))
 
     def counts(self) -> tuple[int, int]:
         samples = self._samples or (self._messages if self._is_mcap else 0)

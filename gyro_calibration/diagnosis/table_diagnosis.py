@@ -87,8 +87,8 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
                           'bias; record several rates, both ways')
     record = resolve_unit(inspect_record(log, model))
     dwells = replace(dwells, output=dwells.output * record.unit_factor)
-    named = name_causes(dwells, model, FALSE_ALARM_RATE)
-    structures, gains = find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
+    named = _name_causes(dwells, model, FALSE_ALARM_RATE)
+    structures, gains = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
     # structure along the variable of a cause, above a tenth of what that explains
     withdrawn = frozenset(
         effect for effect in named.causes if effect not in BASIC_EFFECTS
@@ -96,13 +96,13 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
         named = NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
-        structures, _ = find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
+        structures, _ = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
     gain = (_cross_validated_gain(dwells, model, FALSE_ALARM_RATE, withdrawn, on_progress)
             if named.causes else None)
     on_progress(0.97, 'findings')
     before = model or named.plain_model
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
-    after = assemble_model(model, named.fit) if offered else before
+    after = _assemble_model(model, named.fit) if offered else before
     strongest_first = sorted(named.causes, key=lambda each: -named.misfit_reduction(each))
     outliers = _outlier_findings(named.fit, 0.05 * FALSE_ALARM_RATE)
     findings = add_remedies([*record.findings, *outliers, *(
@@ -113,7 +113,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     return Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
-        error_curves(named.fit, before, after),
+        _error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
                  *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
         method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE))
@@ -135,12 +135,12 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
         hidden = groups == number
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:
-            named = name_causes(rest, model, false_alarm_rate, withdrawn)
-            models = (model or GyroModel(), named.plain_model, assemble_model(model, named.fit))
+            named = _name_causes(rest, model, false_alarm_rate, withdrawn)
+            models = (model or GyroModel(), named.plain_model, _assemble_model(model, named.fit))
         except DataRefused:
             continue
         for each, error in zip(models, errors.values()):
-            error[hidden] = left_out.output - simulate_output(each, left_out)
+            error[hidden] = left_out.output - _simulate_output(each, left_out)
     known = np.isfinite(errors['extended'])
     if not known.any():
         return None
@@ -224,8 +224,8 @@ class NamedCauses:
         return fit_effects(self.fit.dwells, basic, self.fit.scatter).model
 
 
-def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                withdrawn: Collection[Effect] = ()) -> NamedCauses:
+def _name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
+                 withdrawn: Collection[Effect] = ()) -> NamedCauses:
     """
     Find the causes that dwells support on top of a model, or of an ideal gyro.
 
@@ -243,7 +243,7 @@ def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float
     return NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
 
 
-def simulate_output(model: GyroModel, dwells: Dwells) -> Array:
+def _simulate_output(model: GyroModel, dwells: Dwells) -> Array:
     """Return the output that a model has for the dwells, rad/s, shape (n,)."""
     known = replace(model, terms=tuple(static_terms(model)))
     return np.zeros(len(dwells)) + known.output_from_channels(
@@ -263,7 +263,7 @@ def _is_slope_by_origin(fit: Calibration) -> bool:
                 < np.ptp(temperature))
 
 
-def assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
+def _assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
     """Return a model with the values of a fit in place of its own, or in addition to them."""
     if model is None:
         return fit.model
@@ -297,8 +297,8 @@ def _combined_covariance(model: GyroModel, fit: Calibration,
 _MAX_CURVE_COLUMNS, _MIN_DWELLS_PER_COLUMN = 9, 4
 
 
-def find_structure(fit: Calibration, false_alarm_rate: float,
-                   ) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
+def _find_structure(fit: Calibration, false_alarm_rate: float,
+                    ) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
     """
     Search for structure in the residual of a fit; errors by the model's values are none.
 
@@ -379,7 +379,7 @@ def _rate_columns(dwells: Dwells) -> Array:
 # findings
 
 def _cause_finding(named: NamedCauses, effect: Effect) -> Finding:
-    others, separate_by = find_alternatives(named.fit, effect)
+    others, separate_by = _find_alternatives(named.fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
     own = _given_values(named.fit, effect)
     # what is added to the model's values
@@ -480,7 +480,7 @@ def _untestable_causes(dwells: Dwells) -> dict[str, str]:
 
 # curves
 
-def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
+def _error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
     """Return the errors of dwells, without outliers, along rate, temperature and their order."""
     used, scatter = fit.used, fit.scatter
     ones = np.ones(len(used))
@@ -491,7 +491,7 @@ def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple
         # errors count in the sense of the turn.
         variables += [('temperature', 'degC', used.temperature, ones),
                       ('temperature_while_turning', 'degC', used.temperature, np.sign(used.rate))]
-    outputs = [simulate_output(model, used) for model in (before, after)]
+    outputs = [_simulate_output(model, used) for model in (before, after)]
     errors = np.array([used.output - outputs[0], used.output - outputs[1],
                        outputs[0] - used.rate])
     found = []
@@ -513,7 +513,7 @@ def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple
 _ALWAYS_CONFOUNDED = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
 
 
-def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
+def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
     """Return the alternatives of an effect, and the experiment that would distinguish them."""
     experiment = CAUSES[effect.name].separate_by
     if effect in _ALWAYS_CONFOUNDED:

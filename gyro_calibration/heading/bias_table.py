@@ -48,7 +48,7 @@ from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 
 #: Width of a temperature bin, K; a run has one entry in each.
-BIN_WIDTH = 1.5
+_BIN_WIDTH = 1.5
 #: Largest number of entries.
 MAX_ENTRIES = 80
 #: Averaging time of a rest, s.
@@ -418,7 +418,7 @@ def _covariance_of_differences(from_origin: Array, pairwise: Array) -> Array:
 
 
 def _bin_number(entry: Entry) -> int:
-    return round(entry.temperature / BIN_WIDTH)
+    return round(entry.temperature / _BIN_WIDTH)
 
 
 def _is_possible(entry: Entry) -> bool:
@@ -435,8 +435,6 @@ def _clip_to_range(temperature: float, time: float) -> tuple[float, float]:
 
 FORMAT = 'gyro_calibration/bias_table'
 VERSION = 1
-#: A table of `MAX_ENTRIES` entries has a twentieth of this.
-_MAX_FILE_BYTES = 200_000
 _HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest and before '
            'any self-calibration; times are UTC.\n'
            '# Written by the compensation node. If it is deleted, estimation begins again.\n')
@@ -501,7 +499,7 @@ def _keep_aside(path: Path, digest: str) -> str:
 
 def _read_file(path: Path) -> tuple[str, list[Entry], list[Jump]]:
     """Return digest, entries and jumps of a file."""
-    content = read_settings(path, _MAX_FILE_BYTES)
+    content = read_settings(path)
     if not isinstance(content, dict) or content.get('format') != FORMAT:
         raise ValueError(f'it has no line format: {FORMAT}')
     if content.get('version') != VERSION:

@@ -260,25 +260,22 @@ class HeadingTracker:
             self.refused_count += 1
             return ''
         spike, self._held_jump = self._held_jump, None
-        if self._last_sample is not None and self._is_jump(
-                time - self._last_sample[0], rate - self._last_sample[1]):
+        last = self._last_sample
+        # whether the rate changed by more than a robot can
+        if (last is not None and (step := abs(rate - last[1])) > MAX_RATE_STEP
+                and 0.0 <= time - last[0] <= self._settings.maximum_gap
+                and step > MAX_RATE_STEP + MAX_ACCELERATION * (time - last[0])):
             if spike is None:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
             if not self._may_be_erroneous(spike[0]):
-                self._before_jump = self._last_sample[:2]
-            elif abs(spike[1] - self._before_jump[1]) < abs(spike[1] - self._last_sample[1]):
+                self._before_jump = last[:2]
+            elif abs(spike[1] - self._before_jump[1]) < abs(spike[1] - last[1]):
                 self._before_jump = -math.inf, 0.0  # the rate is as before
             self._take_sample(*spike)
         elif spike is not None:
             self.outlier_count += 1
         return self._take_sample(time, rate, sensitivity, wheels, still)
-
-    def _is_jump(self, interval: float, step: float) -> bool:
-        """Tell whether the rate changed by more than a robot can in an interval."""
-        return (abs(step) > MAX_RATE_STEP
-                and abs(step) > MAX_RATE_STEP + MAX_ACCELERATION * interval
-                and 0.0 <= interval <= self._settings.maximum_gap)
 
     def _may_be_erroneous(self, time: float) -> bool:
         """Tell whether the rate has jumped so shortly before that it may be erroneous."""
