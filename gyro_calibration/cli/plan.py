@@ -46,7 +46,7 @@ _LIMIT_FIELDS = {
     'rest_s': ('rest', (0.1, 100.0)),
 }
 #: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
-COMPARED_DURATIONS, MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
+COMPARED_DURATIONS, _MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -69,8 +69,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    if given.seconds > MAX_DURATION:
-        raise InputError(f'--seconds {given.seconds:g} is above {MAX_DURATION:g}; '
+    if given.seconds > _MAX_DURATION:
+        raise InputError(f'--seconds {given.seconds:g} is above {_MAX_DURATION:g}; '
                          'plan a shorter motion and repeat it')
     robot = _read_limits(given.limits)
     noise = read_model(given.model).noise if given.model else XV3500.noise

@@ -123,7 +123,7 @@ def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
 # Files
 
 
-class DiskFull(OSError):
+class _DiskFull(OSError):
     """Nothing more can be written; the written pieces remain."""
 
 
@@ -150,8 +150,8 @@ class _Recorder:
             self.is_full = True
             self._file.truncate(self.size)
             self._file.seek(self.size)
-            raise DiskFull(error.errno,
-                           f'{self.path}: writing has failed ({error.strerror})') from error
+            raise _DiskFull(error.errno,
+                            f'{self.path}: writing has failed ({error.strerror})') from error
         self.size += len(piece)
 
     def flush(self, is_due: bool = False) -> None:
@@ -210,7 +210,7 @@ class McapRecorder(_Recorder):
     def close(self) -> None:
         """Close the file, on a full disk with an end that readers understand."""
         if self.is_full and self.size:
-            with suppress(DiskFull):  # a reader then takes the file for truncated
+            with suppress(_DiskFull):  # a reader then takes the file for truncated
                 self.append(MCAP_END)
         super().close()
 
@@ -298,7 +298,7 @@ def _record(session: _PortSession | _TopicSession, out: str) -> Answer:
                 session.record(on_chunk)
             finally:
                 recorder.close()
-    except DiskFull as error:
+    except _DiskFull as error:
         written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but for '
                    f'the last {_WRITE_INTERVAL:g} s' if recorder.size else 'nothing was written')
         raise DataRefused(f'{error.strerror}; {written}: make room, then record again') from None

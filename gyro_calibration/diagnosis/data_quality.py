@@ -99,7 +99,7 @@ def _local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class DeadBand:
+class _DeadBand:
     """A frequent value without other values near it."""
 
     value: float  # rad/s
@@ -119,12 +119,12 @@ class DeadBand:
         return ndtr((reach - off) / deviation) - ndtr((-reach - off) / deviation)
 
 
-def _find_dead_band(codes: QuantizationCodes, output: Array) -> DeadBand | None:
+def _find_dead_band(codes: QuantizationCodes, output: Array) -> _DeadBand | None:
     """Return the dead band of an output, or None where it shows none."""
     counts = np.where(np.abs(codes.values) < _rest_rate_limit(output), codes.counts, 0)
     place = int(np.argmax(counts))
     away = np.abs(np.delete(codes.values, place) - codes.values[place])
-    band = DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
+    band = _DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
     runs = np.count_nonzero(np.diff(band.contains(output), prepend=False, append=False)) // 2
     return (band if counts[place] > 1 and runs > 1
             and band.half_width > 1.5 * codes.step else None)
@@ -136,7 +136,7 @@ def _rest_rate_limit(output: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Limit:
+class _Limit:
     """Largest and smallest code of a saturated output."""
 
     # low, high: the limit on each side, infinite where there is none
@@ -156,7 +156,7 @@ class Limit:
 
 
 def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
-                level: float) -> Limit | None:
+                level: float) -> _Limit | None:
     """
     Return the limit of an output, or None, by a test of this level on each side.
 
@@ -180,7 +180,7 @@ def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
             continue
         at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
         # a limit on either side counts the runs of both
-        both = (Limit(low, high, chance).is_reached(comparison.output)
+        both = (_Limit(low, high, chance).is_reached(comparison.output)
                 if abs(low + high) < 1.5 * step else at_extreme)
         expected = (np.array([]) if comparison.expected is None
                     else sign * comparison.expected[at_extreme])
@@ -192,14 +192,14 @@ def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
             chances[sign] = (sign * extreme, chance)
     if not chances:
         return None
-    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
-                 min(chance for _, chance in chances.values()))
+    return _Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
+                  min(chance for _, chance in chances.values()))
 
 
 # repeated samples
 
 @dataclass(frozen=True)
-class SampleFault:
+class _SampleFault:
     """Faulty samples."""
 
     is_faulty: Mask  # mask of the samples, shape (n,)
@@ -208,7 +208,8 @@ class SampleFault:
 
 
 def _find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
-                           band: DeadBand | None, valid: Mask, level: float) -> SampleFault | None:
+                           band: _DeadBand | None, valid: Mask,
+                           level: float) -> _SampleFault | None:
     """Find repeated samples among valid ones, or return None."""
     known, change = valid[1:] & valid[:-1], np.diff(comparison.output)
     same = (change == 0.0) & known
@@ -246,7 +247,7 @@ def _find_repeated_samples(comparison: OutputComparison, codes: QuantizationCode
             by_run = min(by_run, unlikely * len(valid))
     if not repeats.any():
         return None
-    return SampleFault(repeats, min(by_run, p_value))
+    return _SampleFault(repeats, min(by_run, p_value))
 
 
 def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) -> Array:
@@ -284,7 +285,7 @@ def _robust_quantile(off: Array) -> float:
 # outliers
 
 def _find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
-                   level: float) -> SampleFault | None:
+                   level: float) -> _SampleFault | None:
     """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
     measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     # more for very long logs
@@ -319,7 +320,7 @@ def _find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float
     if not count or near > 0.5 * count + usual:
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
-    return (SampleFault(outlying, p_value, float(sigmas[outlying].max())) if p_value < level
+    return (_SampleFault(outlying, p_value, float(sigmas[outlying].max())) if p_value < level
             else None)
 
 
@@ -557,7 +558,7 @@ def _is_in_model(model: GyroModel | None, name: str, value: float) -> bool:
                for term in terms)
 
 
-def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit: Limit | None,
+def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit: _Limit | None,
                    at_limit: Mask, model: GyroModel | None) -> Iterator[Finding]:
     """Give quantization and saturation of the output, unless they are in the model."""
     if (codes.step >= _MIN_STEP_NOISE_RATIO * comparison.noise_deviation and codes.step
@@ -576,7 +577,7 @@ def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit
                              f'{" or ".join(sides)}')
 
 
-def _sample_findings(repeated: SampleFault | None, outlying: SampleFault | None, log: Log,
+def _sample_findings(repeated: _SampleFault | None, outlying: _SampleFault | None, log: Log,
                      reference_step: float, noise_deviation: float) -> Iterator[Finding]:
     """Give repeated samples, outliers, and the step of the reference if it adds much variance."""
     assert log.time is not None

@@ -243,7 +243,7 @@ MIN_SAMPLES, _MIN_DURATION, _MIN_TABLE_ROWS, MIN_VALID_SHARE = 100, 20.0, 8, 0.1
 #: Largest number of rows of a rate table; more are samples whose time is missing.
 _MAX_TABLE_ROWS = 5000
 #: Longest log, s: three years; a longer one has stamps in another unit.
-MAX_DURATION = 1e8
+_MAX_DURATION = 1e8
 #: Largest deviation of means over 1 s from their median at rest, without a reference, rad/s.
 _REST_RATE_SPREAD = 3.0 * DEGREE
 #: Largest plausible ratios of the noise and of the rates of a log to those of the model.
@@ -364,7 +364,7 @@ def _log_problems(log: Log) -> Iterator[str]:
         if duration < _MIN_DURATION:
             yield (f'the log lasts {duration:.4g} s; a diagnosis needs at least '
                    f'{_MIN_DURATION:g} s: record longer')
-        if duration > MAX_DURATION:
+        if duration > _MAX_DURATION:
             yield (f'the log lasts {duration:.3g} s by its stamps; check that time_s is in s, or '
                    'give --rate')
         if reference is None and not is_at_rest(log):

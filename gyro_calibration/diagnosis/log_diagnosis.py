@@ -34,8 +34,8 @@ from gyro_calibration.diagnosis.extended_model import (
     heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
     unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
-    Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
-    probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
+    DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED,
+    OnProgress, probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
     VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.gates import (
     check_gates, check_model_units, classify_reference, identify_sample_offset, is_at_rest,
@@ -62,8 +62,6 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import mannwhitneyu, norm
 
-#: Probability that an effect of the minimum detectable size is found.
-_DETECTION_POWER = 0.95
 _SETTLED_REMARK = (
     'Between the dwells, gyro and reference differ by more than the causes explain, as where a '
     'robot follows its command with a lag and overshoot; the log is diagnosed by its dwells '
@@ -494,7 +492,7 @@ def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidenc
     # the evidence of a size of n standard deviations is n² / 2
     threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
     detectable_sigmas = (math.sqrt(2.0 * max(threshold, 0.0))
-                         + float(norm.isf(1.0 - _DETECTION_POWER)))
+                         + float(norm.isf(1.0 - DETECTION_POWER)))
     log = ('' if known.log_index is None or len(replays) == 1
            else f'in log {known.log_index + 1}, ')
     where = None

@@ -38,7 +38,7 @@ from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
     gain_from_squares, HEADING_WINDOW, origin_notes, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
+    Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -95,7 +95,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
         and any(gain > 0.1 * named.misfit_reduction(effect) for name, gain in gains.items()
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
-        named = NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
+        named = _NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
         structures, _ = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
     gain = (_cross_validated_gain(dwells, model, FALSE_ALARM_RATE, withdrawn, on_progress)
             if named.causes else None)
@@ -174,7 +174,7 @@ def _outlier_findings(fit: Calibration, level: float) -> Iterator[Finding]:
 # causes that dwells support
 
 @dataclass(frozen=True)
-class NamedCauses:
+class _NamedCauses:
     """Causes that dwells support on top of a model."""
 
     fit: Calibration  # of causes, bias and scale factor to the dwells
@@ -183,7 +183,7 @@ class NamedCauses:
 
     @classmethod
     def of(cls, fit: Calibration, model: GyroModel | None, false_alarm_rate: float,
-           withdrawn: Collection[Effect] = ()) -> NamedCauses:
+           withdrawn: Collection[Effect] = ()) -> _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
         named = cls(fit, (), false_alarm_rate)
@@ -225,7 +225,7 @@ class NamedCauses:
 
 
 def _name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                 withdrawn: Collection[Effect] = ()) -> NamedCauses:
+                 withdrawn: Collection[Effect] = ()) -> _NamedCauses:
     """
     Find the causes that dwells support on top of a model, or of an ideal gyro.
 
@@ -240,7 +240,7 @@ def _name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: floa
     technology = model.gyro.get('technology') if model else None
     fit, _ = resolve_confounders(find_supported_effects(dwells, 0.65 * false_alarm_rate, model),
                                  technology if technology in TECHNOLOGY_EFFECTS else None)
-    return NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
+    return _NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
 
 
 def _simulate_output(model: GyroModel, dwells: Dwells) -> Array:
@@ -378,7 +378,7 @@ def _rate_columns(dwells: Dwells) -> Array:
 
 # findings
 
-def _cause_finding(named: NamedCauses, effect: Effect) -> Finding:
+def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
     others, separate_by = _find_alternatives(named.fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
     own = _given_values(named.fit, effect)
@@ -404,7 +404,7 @@ def _given_values(fit: Calibration, effect: Effect) -> tuple[float, ...]:
                 (0.0,) * len(effect.parameters))
 
 
-def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
+def _minimum_detectable(named: _NamedCauses, effect: Effect) -> float | None:
     """
     Return the size of an effect that is found with 95 %, in the unit of its first value.
 
@@ -416,7 +416,7 @@ def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
         return None
     place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
     size = float(uncertainty.half_width(1.0 - named.level(effect))[place]
-                 + norm.ppf(0.95) * math.sqrt(uncertainty.covariance()[place, place]))
+                 + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
     own = _given_values(fit, SINE_RESPONSE)[0]
     return size if fitted is effect else math.sqrt(own ** 2 + 6.0 * size) - own
 
@@ -424,7 +424,7 @@ def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
 # remarks
 
 
-def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
+def _remarks(dwells: Dwells, model: GyroModel | None, named: _NamedCauses,
              structures: Sequence[Unexplained], withdrawn: Collection[Effect], gain: Gain | None,
              offered: bool) -> Iterator[str]:
     scatter = named.fit.scatter

@@ -277,7 +277,7 @@ _MIN_LOG_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Schema of the records; records of another one are not read.
-SCHEMA = 'gyro_calibration/fleet_log/2'
+_SCHEMA = 'gyro_calibration/fleet_log/2'
 
 
 def _fit_spans(log: Log, time_offset: float, heading: tuple[Array, Array] | None) -> tuple[
@@ -383,7 +383,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
             {'type': task.default_type})
         content = sha256_digest(*list_recording_files(task.entry.log))
         state = None if task.generator is None else task.generator.bit_generator.state
-        identity = [SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log,
+        identity = [_SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log,
                     content, state]  # all that the record depends on
         key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
         found = None
@@ -391,7 +391,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
             kept = json.loads(task.record_path.read_bytes())
             found = kept if kept['key'] == key else None
         if found is None:
-            found = {'schema': SCHEMA, 'key': key, 'sha256': content,
+            found = {'schema': _SCHEMA, 'key': key, 'sha256': content,
                      **_calibrate_and_diagnose(task)}
             write_atomically(task.record_path, json.dumps(found, allow_nan=False).encode())
         stated = _stated_fields(entry)
@@ -403,7 +403,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
 
 def make_refused_record(entry: FleetLog, reason_text: str) -> dict[str, Any]:
-    return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated_fields(entry),
+    return {'schema': _SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated_fields(entry),
             'status': NO_EVIDENCE, 'reason': reason_text}
 
 

@@ -82,8 +82,8 @@ class RateIntegral:
 
 
 @dataclass(frozen=True)
-class Transition:
-    """Transition of the state over some time, without the rotation itself."""
+class _Transition:
+    """_Transition of the state over some time, without the rotation itself."""
 
     observation: Array  # of each component in the integral of the compensated rate, shape (n,)
     retention: Array  # decay factor of each component, shape (n,)
@@ -111,7 +111,7 @@ class HeadingState:
         """Return the index of the first value of the calibration in the state."""
         return _FLICKER_INDEX + len(self.noise.flicker_processes()[0])
 
-    def transition(self, rate_integral: RateIntegral) -> Transition:
+    def transition(self, rate_integral: RateIntegral) -> _Transition:
         """Return the transition of the state over an integral of rates."""
         seen, kept, grown = _padded_transition(
             self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved,
@@ -123,7 +123,7 @@ class HeadingState:
         if not rate_integral.is_unobserved:
             grown[HEADING_INDEX, HEADING_INDEX] += (
                 self.noise.angle_random_walk ** 2 * rate_integral.duration)
-        return Transition(seen, kept, grown)
+        return _Transition(seen, kept, grown)
 
     def propagate(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time in motion."""

@@ -825,8 +825,14 @@ class HeadingTracker:
         turn = self._rest_integral - snapshot.rate_integral
         if lag <= WINDOW_DURATION:
             snapshot, turn = self._locate_motion_start(snapshot, turn)
-        self._suspected_turn = (self._slow_turn_since(snapshot, turn)
-                                if lag >= MEAN_LAGS[0] else None)
+        self._suspected_turn = None
+        if lag >= MEAN_LAGS[0]:
+            longest = replace(self._zero_integral, duration=MEAN_LAGS[-1])
+            least = (self._sigmas[MEAN_LAGS[-1]] / MEAN_LAGS[-1]
+                     * math.sqrt(snapshot.state.expected_rest_angle(longest)[1]))
+            turn_rate = (turn.angle - snapshot.state.expected_rest_angle(turn)[0]) / turn.duration
+            if abs(turn_rate) < _SLOW_TURN_FACTOR * least:  # it may be a change of the bias
+                self._suspected_turn = SlowTurn(snapshot, turn_rate, turn + self._zero_integral)
         if len(self._snapshots) > 1 and not self._wheels_stand:
             self._rest_scatter.learn(self._snapshots[-1])
         self._state, self.deleted_heading = snapshot.state, snapshot.deleted_heading
@@ -871,15 +877,6 @@ class HeadingTracker:
                                 + self._corrected_angle(self._block_integral))
         self._advance_at_rest(quiet, turn - quiet)
         return self._snapshots[-1], turn - quiet
-
-    def _slow_turn_since(self, snapshot: Snapshot, turn: RateIntegral) -> SlowTurn | None:
-        """Return the detected turn if it is so slow that it may be a change of the bias."""
-        longest = replace(self._zero_integral, duration=MEAN_LAGS[-1])
-        least = (self._sigmas[MEAN_LAGS[-1]]
-                 * math.sqrt(snapshot.state.expected_rest_angle(longest)[1]) / MEAN_LAGS[-1])
-        rate = (turn.angle - snapshot.state.expected_rest_angle(turn)[0]) / turn.duration
-        return (SlowTurn(snapshot, rate, turn + self._zero_integral)
-                if abs(rate) < _SLOW_TURN_FACTOR * least else None)
 
     def _restart_after_gap(self, interval: float, fastest: float, may_have_turned: bool) -> str:
         """Restart after a gap or a backward jump of the stamps; nothing is integrated over it."""
