@@ -33,7 +33,7 @@ from gyro_calibration.calibration.own_instants import (
     interpolate_by_splines, is_slow, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
     heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
-from gyro_calibration.calibration.run_faults import fit_scale
+from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
@@ -54,8 +54,6 @@ _COMMON_FACTORS: Mapping[str, float] = {
 #: And powers of two instead of powers of ten.
 UNIT_FACTORS: Mapping[str, float] = {
     **_COMMON_FACTORS, **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)}}
-#: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
-_MAX_GYRO_RATIO = 1.1
 #: Largest relative difference between a factor and that of a unit.
 _MAX_FACTOR_ERROR = 0.005
 #: Largest standard deviation of a factor as a share of its distance to 1, and of a delay as a
@@ -85,7 +83,7 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     if matches:
         return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]))
     distant_matches = [name for name, value in _COMMON_FACTORS.items()
-                       if _factor_ratio(factor, value) < _MAX_GYRO_RATIO]
+                       if _factor_ratio(factor, value) < UNIT_TOLERANCE]
     return (distant_matches[0] if distant_matches and deviation < _MAX_DEVIATION * abs(factor)
             else None)
 
@@ -571,7 +569,7 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         yield Gate('sense', False, evidence,
                    'give or omit --invert, or change the sign of the column of the gyro', known)
     elif (name is None and power and log.reference_rate is None
-            and 1.0 / _MAX_GYRO_RATIO < abs(factor) / slower < _MAX_GYRO_RATIO
+            and 1.0 / UNIT_TOLERANCE < abs(factor) / slower < UNIT_TOLERANCE
             and _SAMPLE_INTERVAL_RANGE[0] < interval / slower < _SAMPLE_INTERVAL_RANGE[1]):
         yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
                    f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '

@@ -45,8 +45,8 @@ NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 _MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
 #: Index of a figure -> lowest and highest logarithm of its square.
 Limits: TypeAlias = Mapping[int, tuple[float, float]]
-#: Bins of a curve, and points of a line over time.
-_CURVE_BINS, _CURVE_POINTS = 40, 600
+#: Bins of a curve.
+_CURVE_BINS = 40
 
 
 @dataclass(frozen=True)
@@ -365,8 +365,7 @@ def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Headin
     each = after.problem.replays[0]
     lines = [np.cumsum(each.resample(left[0])) * each.point_interval
              for left in (before, after.unbiased_residuals)]
-    some = np.unique(np.linspace(0, each.point_count - 1, _CURVE_POINTS).astype(int))
-    return HeadingCurve(some * each.point_interval, lines[0][some], lines[1][some])
+    return HeadingCurve(np.arange(each.point_count) * each.point_interval, *lines)
 
 
 def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> NoiseCurve:
