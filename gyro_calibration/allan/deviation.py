@@ -36,7 +36,7 @@ from scipy.special import chdtri
 from scipy.stats import pearsonr
 
 #: Least number of samples for a noise figure; of white noise they determine it to 9 %.
-MIN_ALLAN_SAMPLES = 100
+_MIN_ALLAN_SAMPLES = 100
 #: Largest share of lost samples in a window; it is also the largest change of the variance.
 _MAX_LOST_PER_WINDOW = 0.01
 #: Least number of spans in the test whether a reference turns with the output: chance shows such a
@@ -87,9 +87,9 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
 
 def _refuse_few(count: int, samples: str = 'samples') -> None:
     """Refuse fewer samples than a noise figure needs."""
-    if count < MIN_ALLAN_SAMPLES:
+    if count < _MIN_ALLAN_SAMPLES:
         raise DataRefused(f'{count} {samples}; an Allan deviation needs at least '
-                          f'{MIN_ALLAN_SAMPLES}: record longer')
+                          f'{_MIN_ALLAN_SAMPLES}: record longer')
 
 
 def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
@@ -139,14 +139,14 @@ def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
 
 def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
     """Refuse a record whose means change by more than noise; name time and longest rest."""
-    angle, lost = integrate_angle(rate), _count_lost_before(rate)
+    angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
         # changes of the mean over `size` samples, times `size`
         end, step = len(angle) - 2 * size, max(1, size // 4)
         at = np.arange(0, end, step)
         if lost is not None:
-            at = at[mask_complete_windows(lost, size, 0, end, step)]
+            at = at[_mask_complete_windows(lost, size, 0, end, step)]
         if len(at) < MIN_WINDOWS:
             break
         change = np.abs(angle[at + 2 * size] - 2.0 * angle[at + size] + angle[at])
@@ -170,7 +170,7 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
 
 # lost samples
 
-def integrate_angle(rate: Array) -> Array:
+def _integrate_angle(rate: Array) -> Array:
     """
     Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
 
@@ -196,7 +196,7 @@ def _count_lost_before(rate: Array) -> Integers | None:
     return np.concatenate([[0], np.cumsum(lost)]) if lost.any() else None
 
 
-def mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
+def _mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
     """Return which second differences over `size` samples have few of the samples lost before."""
     return np.asarray(lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
                       <= _MAX_LOST_PER_WINDOW * 2 * size)
@@ -277,7 +277,7 @@ def allan_deviation(rate: Array, interval: float,
 
 def _sum_squared_differences(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
     """Return the sums of the squared second differences of the angle, and their numbers."""
-    angle, lost = integrate_angle(rate), _count_lost_before(rate)
+    angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     twice, buffer = 2.0 * angle, np.empty(_BLOCK_SAMPLES)
     sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
     for begin in range(0, len(angle), _BLOCK_SAMPLES):
@@ -291,7 +291,7 @@ def _sum_squared_differences(rate: Array, sizes: Integers) -> tuple[Array, Integ
             if lost is None:
                 counts[place] += len(block)
             else:
-                kept = mask_complete_windows(lost, size, begin, end)
+                kept = _mask_complete_windows(lost, size, begin, end)
                 block *= kept
                 counts[place] += np.count_nonzero(kept)
             sums[place] += float(block @ block)

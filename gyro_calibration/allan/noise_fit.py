@@ -58,7 +58,7 @@ _COMBINATIONS = [combination for count in range(len(NOISE_TERMS))
 
 
 @dataclass(frozen=True)
-class OctaveVariances:
+class _OctaveVariances:
     """Allan variances at octaves and the terms of their covariance, all in samples."""
 
     samples: int  # of the record
@@ -72,7 +72,7 @@ class OctaveVariances:
     process: GaussMarkov | None = None  # of 1 rad/s
 
     @classmethod
-    def from_chart(cls, chart: AllanChart) -> OctaveVariances:
+    def from_chart(cls, chart: AllanChart) -> _OctaveVariances:
         columns = np.column_stack([*(part.allan_variance(chart.size) for part in NOISE_TERMS),
                                    np.zeros(len(chart.size)),
                                    -QUANTIZATION_NOISE.allan_variance(chart.size)])
@@ -87,7 +87,7 @@ class OctaveVariances:
         columns[:, _PROCESS] = process.allan_variance(self.size.astype(float))
         return columns
 
-    def with_process(self, process: GaussMarkov) -> OctaveVariances:
+    def with_process(self, process: GaussMarkov) -> _OctaveVariances:
         """Add a process of 1 rad/s, and its part of the covariance."""
         forms = _octave_covariance_forms(self.samples, tuple(self.size.tolist()), process)
         return replace(self, columns=self.process_columns(process), process=process, forms=forms
@@ -115,10 +115,10 @@ def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
 
 
 @dataclass(frozen=True)
-class CombinationFit:
+class _CombinationFit:
     """A combination of terms, fitted to octaves."""
 
-    octaves: OctaveVariances
+    octaves: _OctaveVariances
     squares: Array  # of the coefficients, shape (7,)
     cholesky_factor: Array  # of the covariance of the variances
 
@@ -180,8 +180,8 @@ class CombinationFit:
         return float(lower), float(upper)
 
 
-def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
-                    fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
+def _fit_combination(octaves: _OctaveVariances, indices: tuple[int, ...], misfit: float,
+                     fixed_term: int = -1, fixed_square: float = 0.0) -> _CombinationFit:
     """Fit nonnegative terms, with the covariance of the fitted noise; one more may be fixed."""
     given = np.zeros(_FILTER_BEND + 1)
     if fixed_term >= 0:
@@ -207,29 +207,29 @@ def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: 
             values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
             half = size[:, None] * np.linalg.cholesky(
                 (vectors * np.maximum(values, 1e-4)) @ vectors.T)
-    return CombinationFit(octaves, squares, half)
+    return _CombinationFit(octaves, squares, half)
 
 
 @dataclass(frozen=True)
-class Ranking:
+class _Ranking:
     """All combinations of terms, fitted to the same octaves."""
 
     first_octave: int  # that is fitted
     misfit: float  # see `NoiseFit`
-    fits: tuple[CombinationFit, ...]  # the likeliest first
+    fits: tuple[_CombinationFit, ...]  # the likeliest first
     #: The best with a Gauss-Markov process in place of its flicker and rate random walk, and in
     #: place of the walk alone.
-    process_fits: tuple[CombinationFit, ...] = ()
+    process_fits: tuple[_CombinationFit, ...] = ()
 
     @property
-    def best(self) -> CombinationFit:
+    def best(self) -> _CombinationFit:
         """Return the fit with the least penalized -2 ln likelihood."""
         return self.fits[0]
 
     @property
-    def best_process(self) -> CombinationFit | None:
+    def best_process(self) -> _CombinationFit | None:
         """Return the best fit with a process, if it is better than the best without."""
-        found = min(self.process_fits, key=CombinationFit.penalized_deviance, default=None)
+        found = min(self.process_fits, key=_CombinationFit.penalized_deviance, default=None)
         return (found
                 if found and found.penalized_deviance() < self.best.penalized_deviance() else None)
 
@@ -244,7 +244,7 @@ class Ranking:
                    < NORMAL_QUANTILE_975 ** 2 for each in self.process_fits)
 
     @cached_property
-    def alternatives(self) -> list[CombinationFit]:
+    def alternatives(self) -> list[_CombinationFit]:
         """Return the combinations of other terms, not more of them, that are nearly as likely."""
         best = self.best
         return [each for each in self.fits if each.deviance < best.deviance + _ALTERNATIVE_LIMIT
@@ -252,7 +252,7 @@ class Ranking:
                 and not set(each.active_terms) - {_FILTER_BEND, _Q} <= set(best.active_terms)]
 
     @cached_property
-    def plausible_fits(self) -> list[CombinationFit]:
+    def plausible_fits(self) -> list[_CombinationFit]:
         """Return the best, likelier ones with more terms, and those joined with alternatives."""
         best = self.best
         both = [{*best.active_terms, *other.active_terms} for other in self.alternatives]
@@ -260,7 +260,7 @@ class Ranking:
                         < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
 
-def rank_combinations(octaves: OctaveVariances) -> Ranking:
+def _rank_combinations(octaves: _OctaveVariances) -> _Ranking:
     """
     Rank all combinations of terms.
 
@@ -279,22 +279,22 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
                       'as a swing or a vibration; record again at rest')
 
 
-def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ranking:
+def _rank_from_octave(octaves: _OctaveVariances, start: int, misfit: float) -> _Ranking:
     since = replace(octaves, forms=octaves.forms[start:, start:], **{
         name: getattr(octaves, name)[start:]
         for name in ('size', 'loss_factor', 'variance', 'columns')})
     descriptions = tuple(
-        sorted((fit_combination(since, places, misfit) for places in _COMBINATIONS),
-               key=CombinationFit.penalized_deviance))
+        sorted((_fit_combination(since, places, misfit) for places in _COMBINATIONS),
+               key=_CombinationFit.penalized_deviance))
     best = descriptions[0]
     kept = {tuple(place for place in best.active_terms if place not in replaced)
             for replaced in ((_B, _K), (_K,)) if set(replaced) & set(best.active_terms)}
-    return Ranking(start, misfit, descriptions,
-                   tuple(filter(None, (_fit_with_process(best, each, misfit) for each in kept))))
+    return _Ranking(start, misfit, descriptions,
+                    tuple(filter(None, (_fit_with_process(best, each, misfit) for each in kept))))
 
 
-def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
-                      misfit: float) -> CombinationFit | None:
+def _fit_with_process(best: _CombinationFit, kept_terms: tuple[int, ...],
+                      misfit: float) -> _CombinationFit | None:
     """Return the best fit of some terms and a Gauss-Markov process, or None without one."""
     # The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the
     # chart: a process with a longer correlation time is a random walk. It must make less than half
@@ -313,11 +313,11 @@ def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
             squares[list(places)] = nnls(white[:, :-1] / size, white[:, -1])[0] / size
             model = np.maximum(columns @ squares, 1e-3 * octaves.variance)
             half = best.cholesky_factor * (model / known)[:, None]
-        return CombinationFit(replace(octaves, columns=columns), squares, half).deviance
+        return _CombinationFit(replace(octaves, columns=columns), squares, half).deviance
 
     process = min((GaussMarkov(math.sqrt(2.0 / constant), constant) for constant in np.geomspace(
         octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=approximate_deviance)
-    found = fit_combination(octaves.with_process(process), places, misfit)
+    found = _fit_combination(octaves.with_process(process), places, misfit)
     first = found.squares * found.octaves.columns[0]
     return found if 0.0 < first[_PROCESS] < 0.5 * first.sum() else None
 
@@ -397,7 +397,7 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
                           f'lowest Allan deviation {chart.deviation.min(initial=math.inf):g} '
                           f'rad/s; wanted {_MIN_OCTAVES} octaves, all above 0: record longer and '
                           'without losses')
-    ranking = rank_combinations(OctaveVariances.from_chart(chart))
+    ranking = _rank_combinations(_OctaveVariances.from_chart(chart))
     process = None
     if ranking.best_process is not None and ranking.best_process.octaves.process is not None:
         time = ranking.best_process.octaves.process.correlation_time * interval
@@ -412,7 +412,7 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
                                   for each in ranking.alternatives})), process)
 
 
-def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
+def _build_figure(ranking: _Ranking, index: int, interval: float) -> NoiseFigure:
     """Return a figure with bounds that hold with and without undetected terms."""
     part, process = NOISE_TERMS[index], ranking.best_process
     # flicker and rate random walk approximate a process; the other terms are fitted with it
@@ -441,20 +441,21 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
     return NoiseFigure(part, *(each * unit for each in (value, deviation, lower, upper)))
 
 
-def _likelihood_bounds(ranking: Ranking, best: CombinationFit, index: int) -> tuple[float, float]:
+def _likelihood_bounds(ranking: _Ranking, best: _CombinationFit,
+                       index: int) -> tuple[float, float]:
     """Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum."""
     # At each coefficient the other terms are fitted anew (profile likelihood): those of the best
     # fits, N, B and K, detected or not, and a process where it is fitted with the term.
     held = {_N, _B, _K, *(each for one in (best, *ranking.plausible_fits, *ranking.alternatives)
                           for each in one.active_terms)}
     others = tuple(sorted(held - {index}))
-    joint = fit_combination(best.octaves, (*others, index), ranking.misfit)
+    joint = _fit_combination(best.octaves, (*others, index), ranking.misfit)
     (*_, square), (*_, deviation) = joint.estimate_squares((*others, index))
 
     @cache
     def deviance_at(coefficient: float) -> float:
-        return fit_combination(best.octaves, others, ranking.misfit, index,
-                               coefficient ** 2).deviance
+        return _fit_combination(best.octaves, others, ranking.misfit, index,
+                                coefficient ** 2).deviance
 
     found = math.sqrt(joint.squares[index])
     scale = math.sqrt(max(square, 0.0) + deviation)

@@ -194,7 +194,7 @@ def dwells_from_table(log: Log) -> Dwells:
     remark = (f'{len(lost)} rows without output or reference are left out: '
               f'{format_list([str(row) for row in lost])}')
     rate, names = log.reference_rate[rows], log.others.get('sweep')
-    sweep = (number_sweeps(rate) if names is None else np.array(
+    sweep = (_number_sweeps(rate) if names is None else np.array(
         [list(dict.fromkeys(names)).index(names[row]) for row in rows]))
     try:
         deviation: Array = np.array(log.others.get(
@@ -205,26 +205,19 @@ def dwells_from_table(log: Log) -> Dwells:
     output = output[rows]
     rounding: Array = np.empty((0, 2))
     if not (deviation > 0.0).any():  # that of the steps is the only one that is known
+        # The step is the largest one that all differences are multiples of: that of the gyro
+        # where its samples are all alike, or of the digits that were written. Where the rates
+        # explain it, as those of a gyro without errors, it is at most 1 deg/s.
+        step = _largest_divisor(output - output[0])
+        if step > 0.5 * _largest_divisor(rate - rate[0]):
+            step = _largest_divisor(np.append(output - output[0], DEGREE))
         rounding = _coarse_rounding(rate, output, np.column_stack(
-            [np.full(len(rows), _table_step(output, rate)), np.zeros(len(rows))]))
+            [np.full(len(rows), step), np.zeros(len(rows))]))
         deviation = _independent_rounding(rate, output, rounding)
     return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
                   np.where(deviation > 0.0, deviation, np.nan), sweep,
                   tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
                   tuple(np.split(rows, len(rows))), rounding)
-
-
-def _table_step(output: Array, rate: Array) -> float:
-    """
-    Return the step of the outputs of a rate table, rad/s; 0 without one.
-
-    It is the largest step that all differences are multiples of: that of the gyro where its
-    samples are all alike, or of the digits that were written. Where the rates explain it, as those
-    of a gyro without errors, it is at most 1 deg/s.
-    """
-    step = _largest_divisor(output - output[0])
-    return (_largest_divisor(np.append(output - output[0], DEGREE))
-            if step > 0.5 * _largest_divisor(rate - rate[0]) else step)
 
 
 def _largest_divisor(values: Array) -> float:
@@ -240,7 +233,7 @@ def _largest_divisor(values: Array) -> float:
     return 0.0
 
 
-def number_sweeps(rate: Array) -> Numbers:
+def _number_sweeps(rate: Array) -> Numbers:
     """
     Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
 
@@ -438,7 +431,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None
                   else np.array([temperature[rows].mean() for rows in dwells]), deviation,
-                  number_sweeps(rate),
+                  _number_sweeps(rate),
                   tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
                   tuple(remarks), tuple(row[rows] for rows in dwells), rounding)
 

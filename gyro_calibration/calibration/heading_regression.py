@@ -97,13 +97,13 @@ _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Cosines over which the power spectrum of a rate is averaged: that of white noise to 14 %.
-SPECTRUM_BINS = 101
+_SPECTRUM_BINS = 101
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
 #: vibration.
 _MAX_VEHICLE_WALK = 5e-4
 #: Least number of spans to determine the noise of a course, and largest deviation of its turn in
 #: a span from that of a gyro that follows it, rad.
-MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
+_MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
 
 
 @dataclass(frozen=True)
@@ -325,7 +325,7 @@ class Spans:
         """
         rate = np.asarray(self.channels.rate)
         cosines = dct(rate, norm='ortho')
-        power = uniform_filter1d(cosines ** 2, SPECTRUM_BINS)
+        power = uniform_filter1d(cosines ** 2, _SPECTRUM_BINS)
         share = 1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300)
         return np.asarray(idct(np.maximum(share, 0.0) * cosines, norm='ortho'))
 
@@ -612,7 +612,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     given, causes = causes, spans.all_causes(causes)
     free = spans.prior_deviations(causes)
     count = len(spans.time) - 1
-    delayed = replace(spans, delay=spans.delay or find_delay(spans))
+    delayed = replace(spans, delay=spans.delay or _find_delay(spans))
     point_variances: Array = np.ones(count + 1)
     for _ in range(2):
         design = design_matrix(delayed, causes)
@@ -633,7 +633,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     return _fit_with_noise(delayed, causes, point_variances)
 
 
-def find_delay(spans: Spans) -> float:
+def _find_delay(spans: Spans) -> float:
     """Return the trial delay of the best agreement of gyro and reference, s."""
     count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
 
@@ -918,9 +918,9 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     """
     spans = lay_out_spans(log, 'course', np.array(TECHNOLOGY_PRIORS[technology]))
     length = spans.treatment.min_span
-    if len(spans.time) < MIN_SPANS:
+    if len(spans.time) < _MIN_SPANS:
         raise DataRefused(f'the course is known for {len(spans.time) * length:.0f} s, wanted at '
-                          f'least {MIN_SPANS * length:.0f} s: drive for longer, faster than a '
+                          f'least {_MIN_SPANS * length:.0f} s: drive for longer, faster than a '
                           'walk')
     fit = fit_spans(spans)
     turned = np.diff(spans.heading)
@@ -1025,9 +1025,9 @@ def is_noisy(log: Log) -> bool:
         return False
     spans = lay_out_spans(log)
     count = len(spans.time) - 1
-    if count < MIN_SPANS:
+    if count < _MIN_SPANS:
         return False
-    spans = replace(spans, delay=find_delay(spans))
+    spans = replace(spans, delay=_find_delay(spans))
     # an eccentric encoder is no course
     columns = np.column_stack([
         spans.base_columns(), spans.acceleration_changes(),

@@ -227,7 +227,11 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
     edges = np.concatenate([np.linspace(0.0, duration, cells + 1), duration + rest_times,
                             begin + np.linspace(0.0, drive_duration, drive_cells + 1)[1:]])
     covariance = increment_covariance(noise, edges)
-    spread = _block_weights(blocks, duration / blocks)
+    # heading between blocks for a unit rate in each cell, s, shape (blocks - 1, cells)
+    rising = (np.arange(_CELLS_PER_BLOCK) + 0.5) / _CELLS_PER_BLOCK
+    before_edge, after_edge = np.eye(blocks)[:-1], np.eye(blocks)[1:]
+    spread = ((np.kron(before_edge, rising) + np.kron(after_edge, rising[::-1]))
+              * (duration / blocks) / _CELLS_PER_BLOCK)
     sums = np.tril(np.full((drive_cells, drive_cells), drive_duration / drive_cells))
     white = spread @ spread.T * (noise.angle_random_walk ** 2 * cells / duration)
     before = cells + len(rest_times)
@@ -241,13 +245,6 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
                              ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
 
 
-def _block_weights(blocks: int, length: float) -> Array:
-    """Return the heading between blocks for a unit rate in each cell, s, (blocks - 1, cells)."""
-    rising = (np.arange(_CELLS_PER_BLOCK) + 0.5) / _CELLS_PER_BLOCK
-    before, after = np.eye(blocks)[:-1], np.eye(blocks)[1:]
-    return (np.kron(before, rising) + np.kron(after, rising[::-1])) * length / _CELLS_PER_BLOCK
-
-
 @dataclass(frozen=True)
 class Turn:
     """One turn through an angle, rad, signed, at a rate above 0, rad/s, and its rest after, s."""
@@ -257,7 +254,7 @@ class Turn:
     rest: float
 
 
-def build_motion(robot: RobotLimits, turns: list[Turn], first_rest: float) -> Motion:
+def _build_motion(robot: RobotLimits, turns: list[Turn], first_rest: float) -> Motion:
     """Return the motion of a rest and then turns; angles are large enough for their rates."""
     time, rate = [0.0, first_rest], [0.0, 0.0]
     for turn in turns:
@@ -306,7 +303,7 @@ class _MotionFamily:
     def motion_at(self, point: Array) -> Motion | None:
         """Return the motion at a point, or None where the robot is not able to do it."""
         turns = self.turns_at(point)
-        return None if turns is None else build_motion(self._robot, turns, self._robot.rest)
+        return None if turns is None else _build_motion(self._robot, turns, self._robot.rest)
 
     def turns_at(self, point: Array) -> list[Turn] | None:
         """Return the turns at a point, the last followed by the rest at the end."""
@@ -418,8 +415,8 @@ def plain_motion(robot: RobotLimits, duration: float) -> Motion:
     angle = min(place, rate * (half - robot.ramp_duration(rate)))
     between = 2.0 * (half - angle / rate - robot.ramp_duration(rate))
     side = 1.0 if robot.highest == place else -1.0
-    return build_motion(robot, [Turn(side * angle, rate, between),
-                                Turn(-side * angle, rate, robot.rest)], robot.rest)
+    return _build_motion(robot, [Turn(side * angle, rate, between),
+                                 Turn(-side * angle, rate, robot.rest)], robot.rest)
 
 
 def can_follow(robot: RobotLimits, motion: Motion) -> bool:

@@ -72,10 +72,10 @@ from scipy.linalg.lapack import dpttrf, dpttrs
 
 #: Points of the grid for each size, and passes: the first is over the whole range, each further
 #: one around the likely points.
-GRID_POINTS, GRID_PASSES = 5, 4
+_GRID_POINTS, _GRID_PASSES = 5, 4
 #: Cosines that describe a wandering bias; faster changes are hardly distinguishable from white
 #: noise.
-COSINE_COUNT = 24
+_COSINE_COUNT = 24
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def _quasi_differences(columns: Array, carried: Array | None) -> Array:
 
 def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
                         rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
-                        cosine_count: int = COSINE_COUNT) -> tuple[Array, list[SharedNoise]]:
+                        cosine_count: int = _COSINE_COUNT) -> tuple[Array, list[SharedNoise]]:
     """
     Return the columns of a wandering bias in increments between points, and its noise parts.
 
@@ -401,8 +401,9 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     regression = _Regression(_quasi_differences(observed - columns @ mean, carried),
                              _quasi_differences(together, carried), count, precision, banded,
                              shared, hierarchical_priors)
-    axes = [_initial_axis(part.size_range) for part in regression.parts]
-    for remaining in reversed(range(GRID_PASSES)):
+    axes = [np.array([low]) if low == high else np.geomspace(low, high, _GRID_POINTS)
+            for low, high in (part.size_range for part in regression.parts)]
+    for remaining in reversed(range(_GRID_PASSES)):
         grid = _evaluate_grid(regression, axes)
         weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
         weights /= weights.sum()
@@ -425,10 +426,6 @@ class _Grid:
     log_likelihood: Array
     values: Array
     covariance: Array
-
-
-def _initial_axis(limits: tuple[float, float]) -> Array:
-    return np.array(limits[:1]) if limits[0] == limits[1] else np.geomspace(*limits, GRID_POINTS)
 
 
 def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:

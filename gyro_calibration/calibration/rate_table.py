@@ -39,13 +39,13 @@ from scipy.linalg import solve_triangular
 from scipy.stats import f as fisher
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
-MAX_CONDITION_NUMBER = 1e3
+_MAX_CONDITION_NUMBER = 1e3
 #: Two effects that explain nearly the same -> the other one.
 CONFOUNDERS = {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}
 #: rad/s; the error of slower turns is mostly bias, not scale; as published.
 MIN_TURN_RATE = 5.0 * DEGREE
 #: A dwell that turns slower than this is a rest.
-MAX_REST_RATE = 0.1 * DEGREE
+_MAX_REST_RATE = 0.1 * DEGREE
 
 
 class ColumnTest(NamedTuple):
@@ -163,7 +163,7 @@ class Calibration:
         """
         known_basis, white, new = self._whiten_beside(known, unexplained, columns)
         # a sine may have its zeros at the rates of all dwells
-        new_basis = _orthonormal_columns(new, 1.0 / MAX_CONDITION_NUMBER)
+        new_basis = _orthonormal_columns(new, 1.0 / _MAX_CONDITION_NUMBER)
         count, freedom = new_basis.shape[1], len(white) - known_basis.shape[1] - new_basis.shape[1]
         if not count or freedom < 1:
             return ColumnTest(1.0, 0.0, 0.0)
@@ -185,7 +185,7 @@ class Calibration:
         """Return the gain of the best of several columns, with the arguments of `test`."""
         _, white, new = self._whiten_beside(known, unexplained, columns)
         lengths = np.linalg.norm(new, axis=0)
-        new = new / np.where(lengths > 1.0 / MAX_CONDITION_NUMBER, lengths, math.inf)
+        new = new / np.where(lengths > 1.0 / _MAX_CONDITION_NUMBER, lengths, math.inf)
         return float(((new.T @ white) ** 2).max())
 
     def _whiten_beside(self, known: Array, unexplained: Array | float,
@@ -344,17 +344,17 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     whitener = Whitener(used, scatter)
     terms = _iterate_gauss_newton(used, _search_shapes(used, terms), whitener)
     orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
-    whitened = whitener.whiten(unexplained_error(used, terms))
+    whitened = whitener.whiten(_unexplained_error(used, terms))
     left_out, deviation = np.full((2, len(dwells)), np.nan)
     left_out[scatter.inliers] = _left_out_residuals(orthogonal, whitened, whitener,
                                                     cross_validation_parts(used))
     deviation[scatter.inliers] = whitener.deviation
-    return Calibration(terms, dwells, given, scatter, unexplained_error(rest, terms), left_out,
+    return Calibration(terms, dwells, given, scatter, _unexplained_error(rest, terms), left_out,
                        deviation, float(np.linalg.cond(triangle)), len(used) - len(lengths),
                        float(whitened @ whitened))
 
 
-def unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
+def _unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
     """Return the errors of the dwells that the effects do not explain, rad/s, shape (n,)."""
     channels = channels_of(dwells)
     return dwells.output - dwells.rate - sum(term.error(channels) for term in terms)
@@ -415,7 +415,7 @@ def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
     columns = [term.columns(channels)[place - len(term.effect.nonlinear_parameters)]
                for term in terms
                for place in term.fitted_indices if place >= len(term.effect.nonlinear_parameters)]
-    error = unexplained_error(dwells, terms)
+    error = _unexplained_error(dwells, terms)
     matrix = np.column_stack([*columns, np.zeros(len(dwells))])
     return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
 
@@ -426,7 +426,7 @@ def _iterate_gauss_newton(dwells: Dwells, terms: tuple[Term, ...],
     for _ in range(20):
         orthogonal, triangle, lengths = _factor_columns(dwells, terms, whitener)
         step = solve_triangular(
-            triangle, orthogonal.T @ whitener.whiten(unexplained_error(dwells, terms))) / lengths
+            triangle, orthogonal.T @ whitener.whiten(_unexplained_error(dwells, terms))) / lengths
         changes, new_terms = iter(step.tolist()), []
         for term in terms:
             for place in term.fitted_indices:
@@ -444,7 +444,7 @@ def _factor_columns(dwells: Dwells, terms: Sequence[Term],
     columns = whitener.whiten(sensitivity_columns(dwells, terms))
     lengths = np.linalg.norm(columns, axis=0)
     orthogonal, triangle = np.linalg.qr(columns / np.where(lengths > 0.0, lengths, 1.0))
-    if not np.linalg.cond(triangle) < MAX_CONDITION_NUMBER:
+    if not np.linalg.cond(triangle) < _MAX_CONDITION_NUMBER:
         raise _unidentifiable_error(terms, triangle)
     return orthogonal, triangle, lengths
 
@@ -612,7 +612,7 @@ def _find_rests(dwells: Dwells) -> tuple[Rests, str]:
     sweeps = np.unique(dwells.sweep).tolist()
     for number in sweeps:
         rows = np.flatnonzero(dwells.sweep == number)
-        rests = rows[speed[rows] <= MAX_REST_RATE]
+        rests = rows[speed[rows] <= _MAX_REST_RATE]
         if len(rests):
             at_rest[number] = rests, np.full(len(rests), 1.0 / len(rests))
         ways = [rows[way * dwells.rate[rows] > 0.0] for way in (1.0, -1.0)]

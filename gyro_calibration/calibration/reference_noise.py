@@ -34,11 +34,6 @@ _COMPARISON_SPAN = 1.0
 #: Largest error of an exact reference heading as a share of the difference of the headings over a
 #: second: a fifth of its variance.
 _MAX_HEADING_ERROR_SHARE = 0.25
-#: Numerical error of a heading, rad, which is all that a simulated log without noise has.
-_NUMERICAL_ERROR = 1e-9
-#: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
-#: random walk, and of -0.5 for its integral, which is as smooth as a motion.
-_WHITE_CORRELATION_RATIO = -0.5
 #: Noise of a reference rate that is not white is detected from so many standard deviations on, in
 #: this quietest share of the log, in blocks of so many samples.
 _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
@@ -46,7 +41,7 @@ _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
 _USUAL_SPANS = 500
 #: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
 #: the errors of an encoder are at most so many times its rounding error.
-MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
+_MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
 #: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
 #: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
@@ -116,8 +111,8 @@ class HeadingDifference:
     @property
     def is_significant(self) -> bool:
         """Tell whether the error is a significant part of the difference over a second."""
-        return (self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk,
-                                          _NUMERICAL_ERROR))
+        # a simulated log without noise has numerical errors of 1e-9 rad
+        return self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk, 1e-9)
 
 
 def heading_difference(log: Log) -> HeadingDifference:
@@ -197,7 +192,9 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
         return 0.0
     energy = float(np.mean(fast ** 2))
     variance, products = energy / 20.0, (fast[1:] * fast[:-1])[np.diff(place) == 1]
-    if not (variance > 0.0 and products.sum() < _WHITE_CORRELATION_RATIO * energy * len(products)):
+    # neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
+    # random walk, and of -0.5 for its integral, which is as smooth as a motion
+    if not (variance > 0.0 and products.sum() < -0.5 * energy * len(products)):
         if is_commanded:
             return 0.0
         product = -fast * left / 20.0
@@ -237,7 +234,7 @@ def is_course(log: Log) -> bool:
     bent = np.abs(np.diff(log.reference_heading, 2))
     # a heading between slower fixes lies on straight lines
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > MIN_LOST_SHARE
+    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > _MIN_LOST_SHARE
               else _COURSE_NOISE_RATIO)
     # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
     # the variance

@@ -64,8 +64,8 @@ _UNIT_CONFUSIONS = {
     1e-3: ('the gyro is in thousands',
            'the profile in thousandths (mdeg, mrad) and read as whole units'),
 }
-#: Largest ratio of the scale factor to that of a confused unit.
-_UNIT_TOLERANCE = 1.1
+#: Largest ratio of the scale factor of a gyro to 1 in the right unit, or to that of another unit.
+UNIT_TOLERANCE = 1.1
 
 
 def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
@@ -80,8 +80,8 @@ def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
     """
     size = max(abs(scale), 1e-300)
     found = [factor for factor in _UNIT_CONFUSIONS
-             if 1.0 / _UNIT_TOLERANCE < size / factor < _UNIT_TOLERANCE]
-    if not found or 1.0 / _UNIT_TOLERANCE < size < _UNIT_TOLERANCE:
+             if 1.0 / UNIT_TOLERANCE < size / factor < UNIT_TOLERANCE]
+    if not found or 1.0 / UNIT_TOLERANCE < size < UNIT_TOLERANCE:
         return
     usual = _name_confusions(_USUAL_UNITS)
     gyro, profile = _UNIT_CONFUSIONS[min(
@@ -189,7 +189,7 @@ def _try_motions(run: RunPieces, motion: Motion,
                    f'the gyro follows the reference until about {end:.1f} s of {duration:.1f} s '
                    'only: repair the line that stopped, and record again')
         for speed in (2.0 ** (each / 16.0) for each in range(-32, 33)):
-            if max(speed, 1.0 / speed) > _UNIT_TOLERANCE:
+            if max(speed, 1.0 / speed) > UNIT_TOLERANCE:
                 yield (run.fit_scale(run.reference_angle(motion, offset, speed))[0],
                        f'the robot drove the profile {speed:.2f} times as fast as given, in '
                        f'{duration / speed:.1f} s instead of {duration:.1f} s: drive it at its '

@@ -51,7 +51,7 @@ _MIN_DWELLS = 12
 #: Standard deviations between gyros, by data sheets: the change of the bias with temperature,
 #: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
 #: the nonlinearity at the fastest rate that is not fitted, 1 (L3G4200D: 0.2 %).
-BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, NONLINEARITY_DEVIATION = (
+BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, _NONLINEARITY_DEVIATION = (
     Prior().coefficient, 3e-4, 2e-3)
 
 
@@ -91,7 +91,7 @@ class Scatter:
         """Return the standard deviation of the mean error of some dwells, rad/s."""
         # errors common to a sweep do not average out within it
         shared = sum_by_part(self.sweep_columns(dwells) * np.broadcast_to(
-            sign, len(dwells))[:, None], sweep_numbers(dwells))
+            sign, len(dwells))[:, None], _sweep_numbers(dwells))
         return math.sqrt(float(np.sum(self.deviation(dwells) ** 2) + np.sum(shared ** 2))) / len(
             dwells)
 
@@ -109,14 +109,14 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
     than four sweeps do not determine a model without one of them, nor do two temperatures the
     slope between them: then parts are about 60 blocks of time within sweeps, or the dwells.
     """
-    sweeps, count = sweep_numbers(dwells), min(len(dwells), 60)
+    sweeps, count = _sweep_numbers(dwells), min(len(dwells), 60)
     if sweeps.max() + 1 >= MIN_SWEEPS:
         return sweeps
     return np.unique(sweeps * count + np.arange(len(dwells)) * count // len(dwells),
                      return_inverse=True)[1]
 
 
-def sweep_numbers(dwells: Dwells) -> Numbers:
+def _sweep_numbers(dwells: Dwells) -> Numbers:
     """Return the number of the sweep of each dwell, from 0 on without gaps, shape (n,)."""
     return np.unique(dwells.sweep, return_inverse=True)[1]
 
@@ -134,7 +134,7 @@ class Whitener:
         self.deviation = scatter.deviation(dwells)
         shared = scatter.sweep_columns(dwells)
         # without errors in common, all dwells are independent
-        parts = (sweep_numbers if shared.any() else cross_validation_parts)(dwells)
+        parts = (_sweep_numbers if shared.any() else cross_validation_parts)(dwells)
         rows = (np.flatnonzero(parts == part) for part in range(parts.max() + 1))
         # by the factors of the covariance: exact dwells would be lost in it beside their sweep
         self._factors = [(own, np.asarray(np.linalg.qr(np.vstack(
@@ -214,7 +214,7 @@ def find_inliers(dwells: Dwells) -> Mask:
     """
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
-        parts = sweep_numbers(dwells)
+        parts = _sweep_numbers(dwells)
         own = (parts[:, None] == np.arange(parts.max() + 1)).astype(float)
         turning = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
         extended = _orthonormal_basis(np.column_stack([columns, own, own * turning[:, None]]))
@@ -274,7 +274,7 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
     inner, outer = (sum_by_part(shared[:, :, None] * each[:, None, :],
-                                sweep_numbers(dwells)) for each in (shared, columns))
+                                _sweep_numbers(dwells)) for each in (shared, columns))
     # Woodbury: the covariance is diagonal plus two shared columns for each sweep
     inner = np.eye(2) + sizes[:, None, :, None] * inner * sizes[:, None, None, :]
     outer = sizes[:, None, :, None] * outer
@@ -390,7 +390,7 @@ class Uncertainty:
 def _sweep_variances(dwells: Dwells, deviation: Array) -> Array:
     """Return the variance of bias and scale of each sweep by its dwells, shape (2, sweeps)."""
     weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
-    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, sweep_numbers(dwells)).T
+    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, _sweep_numbers(dwells)).T
 
 
 def _scatter_grid(size: float, variances: Array) -> tuple[Array, Array]:
@@ -431,7 +431,7 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
     curve = 0.5 / Prior().correlation_length  # a slope changes by its own size over this length
     unfitted_deviations = [
         BIAS_SLOPE_DEVIATION, BIAS_SLOPE_DEVIATION * curve, SCALE_SLOPE_DEVIATION * fastest,
-        SCALE_SLOPE_DEVIATION * fastest * curve, *[NONLINEARITY_DEVIATION * fastest] * 2]
+        SCALE_SLOPE_DEVIATION * fastest * curve, *[_NONLINEARITY_DEVIATION * fastest] * 2]
     first = 4 if dwells.temperature is None else 0
 
     def extended_columns(rate: Array, warm: Array) -> Array:

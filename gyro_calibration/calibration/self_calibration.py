@@ -90,7 +90,7 @@ def default_reference_errors(motion: Motion) -> ReferenceErrors:
 
 #: Standard deviations from which on a stretch is a slip. With three times the noise of the
 #: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
-MIN_SLIP_SIGMAS = 4.5
+_MIN_SLIP_SIGMAS = 4.5
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
@@ -166,8 +166,7 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
     """
     reference = default_reference_errors(motion) if reference is None else reference
-    refuse_samples(time, rate, limits)
-    refuse_dead(rate if output is None else output)
+    refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
     run = split_run(time, rate)
     _refuse_run(time, run, motion, limits)
@@ -237,7 +236,7 @@ def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) ->
     """Refuse a reference that follows the noise of the gyro: it is computed from this gyro."""
     # that of the model, if it is known, or less by the samples, `white_noise`, rad/√s
     own = min(noise.angle_random_walk, white_noise) ** 2
-    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-MIN_SLIP_SIGMAS):
+    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-_MIN_SLIP_SIGMAS):
         raise DataRefused(
             'the reference is computed from this gyro, since they differ by '
             f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
@@ -254,10 +253,10 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
                               slip_deviation=slip_deviation, excess_turn=excess_turn)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
-    return fit if motion.rate is not None else add_asymmetry_variance(fit, rate)
+    return fit if motion.rate is not None else _add_asymmetry_variance(fit, rate)
 
 
-def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
+def _add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
     """
     Return the fit with the variance of a scale difference between both senses of turning added.
 
@@ -285,8 +284,8 @@ def _goodness_of_fit(fit: ScaleBiasFit, reference: ReferenceErrors,
                          fit.angle_random_walk / math.sqrt(known))
 
 
-def refuse_samples(time: Array, rate: Array, limits: RunLimits) -> None:
-    """Refuse samples that are too few, no numbers, or too far apart."""
+def refuse_samples(time: Array, rate: Array, limits: RunLimits, output: Array | None) -> None:
+    """Refuse samples that are too few, no numbers, too far apart, or of a dead gyro."""
     if len(time) < limits.min_samples:
         raise DataRefused(f'only {len(time)} samples came; at least {limits.min_samples} are '
                           "needed: check the gyro's line and rate")
@@ -297,6 +296,14 @@ def refuse_samples(time: Array, rate: Array, limits: RunLimits) -> None:
     if gap > limits.max_gap:
         raise DataRefused(f'no samples came for {gap:.2f} s; at most {limits.max_gap:g} s may be '
                           'missing: repair the line and run again')
+    refuse_dead(rate if output is None else output)
+
+
+def refuse_bias(bias: float, limits: RunLimits, remedy: str) -> None:
+    """Refuse a bias, rad/s, beyond the limit."""
+    if abs(bias) > limits.max_bias:
+        raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
+                          f'{limits.max_bias / DEGREE:g} deg/s: {remedy}')
 
 
 def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None:
@@ -355,9 +362,9 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     """
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual
-    s, b = fit.scale_factor_error, fit.bias
+    s = fit.scale_factor_error
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
-    has_slipped = excess_angle > limits.max_stretch_residual and sigmas > MIN_SLIP_SIGMAS
+    has_slipped = excess_angle > limits.max_stretch_residual and sigmas > _MIN_SLIP_SIGMAS
     slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
             else '')
     # against measured headings the deviations include the noise of mount and encoder; a wobble
@@ -375,9 +382,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
                           f'and the unit of the {motion.name}')
-    if abs(b) > limits.max_bias:
-        raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.max_bias / DEGREE:g} deg/s: do not turn the robot by hand')
+    refuse_bias(fit.bias, limits, 'do not turn the robot by hand')
     if deviation > limits.max_scale_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
                           f'wanted {100 * limits.max_scale_deviation:g} %: turn further, faster, '
@@ -390,7 +395,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           f'{limits.max_noise_ratio:g} are allowed: check that the robot follows '
                           f'the {motion.name}, fasten the gyro, stop vibration, or measure the '
                           'noise again (allan)')
-    refuse_no_improvement(fit, limits.max_heading_error)
+    _refuse_no_improvement(fit, limits.max_heading_error)
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
@@ -419,7 +424,7 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
 DRIVE_DURATION = 300.0
 
 
-def refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
+def _refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
     """
     Refuse a calibration that by its own covariance makes a heading less accurate.
 
@@ -552,7 +557,7 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
     if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
         change, variance = 0.0, variance + change ** 2
-    elif sigmas > MIN_SLIP_SIGMAS:
+    elif sigmas > _MIN_SLIP_SIGMAS:
         raise DataRefused(
             f'after the run the corrected rate is {change / DEGREE:.3f} deg/s ({sigmas:.0f} '
             'standard deviations): the robot turned throughout the run, or still turned after '
@@ -575,7 +580,7 @@ def _find_turn_end(time: Array, rate: Array) -> float | None:
     sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rate) - count))
     best = int(np.argmax(sigmas))
     return (float(time[count[best]])
-            if sigmas[best] > MIN_SLIP_SIGMAS * white_noise_deviation(rate, 1) else None)
+            if sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rate, 1) else None)
 
 
 def rest_variance(noise: Noise, duration: float, white_deviation: float,
@@ -709,8 +714,7 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
     DataRefused : too few samples, a dead gyro, motion, or a mean that is no bias
 
     """
-    refuse_samples(time, rate, limits)
-    refuse_dead(rate if output is None else output)
+    refuse_samples(time, rate, limits, output)
     parts = np.array_split(rate, 10)
     blocks = np.array([part.mean() for part in parts])
     within = math.sqrt(np.mean([part.var(ddof=1) for part in parts]) / (len(rate) / 10))
@@ -730,9 +734,7 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
     mean_variance = max(blocks.var(ddof=1) / 10.0,
                         noise.angle_random_walk ** 2 / float(time[-1] - time[0]))
     bias = float(rate.mean())
-    if abs(bias) > limits.max_bias:
-        raise DataRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.max_bias / DEGREE:g} deg/s: the gyro turns, or is broken')
+    refuse_bias(bias, limits, 'the gyro turns, or is broken')
     expected = math.sqrt(noise.rate_variance(float(np.median(np.diff(time)))))
     if expected and rate.std() > 3.0 * expected:
         raise DataRefused(f'the rate varies by {rate.std() / DEGREE:.2f} deg/s where rest gives '

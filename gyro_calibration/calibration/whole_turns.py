@@ -22,10 +22,11 @@ import math
 
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS, ScaleBiasFit
 from gyro_calibration.calibration.run_faults import refuse_unit_error
-from gyro_calibration.calibration.self_calibration import refuse_samples, refuse_scale, RunLimits
+from gyro_calibration.calibration.self_calibration import (
+    refuse_bias, refuse_samples, refuse_scale, RunLimits)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise_deviation
+from gyro_calibration.logs.quality import refuse_saturated, white_noise_deviation
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
@@ -34,15 +35,15 @@ from scipy.special import ndtri
 #: finger's width apart at half a metre.
 MARK_DEVIATION = 1.0 * DEGREE
 #: Shortest rest, s.
-MIN_REST_DURATION = 1.0
+_MIN_REST_DURATION = 1.0
 #: Length of the means that separate rest from motion, s; the one beside the motion is left
 #: out. And the smallest deviation that is motion for any noise of the gyro, rad/s.
 _PART_DURATION, _MIN_MOVING_RATE = 0.25, 0.5 * DEGREE
 #: Largest difference between the angle and the number of turns, in turns; half a turn would be as
 #: near to the next number.
-MAX_COUNT_ERROR = 0.35
+_MAX_COUNT_ERROR = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
-MAX_COUNTING_SCALE_ERROR = 0.05
+_MAX_COUNTING_SCALE_ERROR = 0.05
 #: Probability of refusing by chance: two rests of equal bias, or a reference beside noise.
 FALSE_REFUSAL_RATE = 1e-4
 
@@ -65,7 +66,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     Find scale factor error and bias from whole turns between two rests on one mark.
 
     The rates of the turns do not matter, only the net number of turns. The number is accepted only
-    where the gyro agrees to less than `MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
+    where the gyro agrees to less than `_MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
     factor error needs few turns.
 
     Parameters
@@ -73,7 +74,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     time : s, shape (n,)
     rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
     turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
-        factor error up to `MAX_COUNTING_SCALE_ERROR`
+        factor error up to `_MAX_COUNTING_SCALE_ERROR`
     noise : of the gyro, if it is known; the standard deviations include the wander of the bias
     mark_deviation : standard deviation of the angle between the two rests on the mark, rad
     output : of the gyro before its model, where that differs, shape (n,)
@@ -83,29 +84,17 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     DataRefused : with the reason and the remedy
 
     """
-    refuse_samples(time, rate, limits)
-    refuse_dead(rate if output is None else output)
+    refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
     # N², rad²/s: by differences between neighbours, and at least the known one
     white_density = max(white_noise_deviation(rate) ** 2 * float(np.median(np.diff(time))),
                         noise.angle_random_walk ** 2)
     begin, end = _find_turns(time, rate, white_density)
-    rest_durations = float(begin - time[0]), float(time[-1] - end)
-    first, last = float(rate[time <= begin].mean()), float(rate[time >= end].mean())
-    duration = end - begin
-    wander_variance = noise.mean_change_variance(duration, min(rest_durations))
-    difference_variance = white_density / rest_durations[0] + white_density / rest_durations[1]
-    bias, variance = 0.5 * (first + last), 0.25 * difference_variance + 0.5 * wander_variance
-    difference, deviation = last - first, math.sqrt(difference_variance + wander_variance)
-    if abs(difference) > max(-float(ndtri(0.5 * FALSE_REFUSAL_RATE)) * deviation,
-                             limits.max_rest_rate):
-        raise DataRefused(
-            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
-            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
-            'both ends, or the gyro still warms up; wait, and run again')
-    if abs(bias) > limits.max_bias:
-        raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.max_bias / DEGREE:g} deg/s: let the robot rest at both ends')
+    rest_durations, duration = (float(begin - time[0]), float(time[-1] - end)), end - begin
+    bias, variance = _compare_rests(
+        (float(rate[time <= begin].mean()), float(rate[time >= end].mean())),
+        white_density / rest_durations[0] + white_density / rest_durations[1],
+        noise.mean_change_variance(duration, min(rest_durations)), limits)
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
     count = _count_turns(gyro_angle / math.tau, turns, limits)
@@ -134,14 +123,34 @@ def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, 
         middle = np.array([np.median(values[:end]) for end in range(1, len(values) + 1)])
         steady = int(np.argmax(np.append(np.abs(values - middle) > limit, True)))
         lengths.append((steady - 1) * _PART_DURATION)
-        if lengths[-1] < MIN_REST_DURATION:
+        if lengths[-1] < _MIN_REST_DURATION:
             raise DataRefused(f'the robot rests for {max(lengths[-1], 0.0):.1f} s {name} the '
-                              f'turns, wanted {MIN_REST_DURATION:g} s at least: leave it at rest '
+                              f'turns, wanted {_MIN_REST_DURATION:g} s at least: leave it at rest '
                               'on the mark, and record until after that')
     if sum(lengths) >= time[-1] - time[0] - 2.0 * _PART_DURATION:
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and does the gyro respond?')
     return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
+
+
+def _compare_rests(means: tuple[float, float], difference_variance: float,
+                   wander_variance: float, limits: RunLimits) -> tuple[float, float]:
+    """
+    Return the bias by two rests, rad/s, and its variance, or refuse rests that differ.
+
+    The variances, (rad/s)², of the difference of the means are those by white noise and by the
+    wander of the bias.
+    """
+    difference, deviation = means[1] - means[0], math.sqrt(difference_variance + wander_variance)
+    if abs(difference) > max(-float(ndtri(0.5 * FALSE_REFUSAL_RATE)) * deviation,
+                             limits.max_rest_rate):
+        raise DataRefused(
+            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
+            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
+            'both ends, or the gyro still warms up; wait, and run again')
+    bias = 0.5 * (means[0] + means[1])
+    refuse_bias(bias, limits, 'let the robot rest at both ends')
+    return bias, 0.25 * difference_variance + 0.5 * wander_variance
 
 
 def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
@@ -150,9 +159,10 @@ def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
     if not count:
         raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
                           'turn once at least, all in one direction or nearly so')
-    if turns is None and MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
+    if turns is None and _MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
         raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
-                          f'off by {100 * MAX_COUNTING_SCALE_ERROR:g} %: give the number of turns')
+                          f'off by {100 * _MAX_COUNTING_SCALE_ERROR:g} %: give the number of '
+                          'turns')
     if turns is not None:
         # another unit or sign explains the scale; a factor of two may be a wrong count
         scale = measured / turns
@@ -161,7 +171,7 @@ def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
             refuse_unit_error(scale, '')
         refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
                      "else set the driver's parameter invert")
-    if abs(measured - count) > (MAX_COUNT_ERROR if turns else MAX_COUNTING_SCALE_ERROR
+    if abs(measured - count) > (_MAX_COUNT_ERROR if turns else _MAX_COUNTING_SCALE_ERROR
                                 * abs(count)):
         given = f', and {turns} were given' if turns else ''
         raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '

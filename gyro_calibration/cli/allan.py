@@ -37,8 +37,8 @@ from gyro_calibration.model.noise import NOISE_TERMS
 import numpy as np
 
 #: Symbol -> usual unit, and the factor from SI to it.
-DISPLAY_UNITS = {**{part.symbol: display_unit(part.unit, part.name) for part in NOISE_TERMS},
-                 'Q': ('arcsec', 3600.0 / DEGREE), 'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
+_DISPLAY_UNITS = {**{part.symbol: display_unit(part.unit, part.name) for part in NOISE_TERMS},
+                  'Q': ('arcsec', 3600.0 / DEGREE), 'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +77,7 @@ class NoiseFigures(PrintedResult):
     fit: NoiseFit  # the noise figures
 
     def __str__(self) -> str:
-        record, fit, (unit, factor) = self.record, self.fit, DISPLAY_UNITS['B']
+        record, fit, (unit, factor) = self.record, self.fit, _DISPLAY_UNITS['B']
         lost, (time, *sizes) = np.isnan(record.rate).sum(), self.chart.floor.values()
         deviation, lower, upper = (f'{size * factor:.4g}' for size in sizes)
         floor_line = (f'Lowest Allan deviation: {deviation} {unit} at {time:.4g} s, '
@@ -99,7 +99,7 @@ class NoiseFigures(PrintedResult):
         """Return the Allan chart."""
         return draw_allan(path, self.chart, self.fit, {
             symbol: f'{readable_name(figure.term.name)} {symbol} = '
-            f'{figure.value * DISPLAY_UNITS[symbol][1]:.3g} {DISPLAY_UNITS[symbol][0]}'
+            f'{figure.value * _DISPLAY_UNITS[symbol][1]:.3g} {_DISPLAY_UNITS[symbol][0]}'
             for symbol, figure in self.fit.figures.items() if figure.value})
 
 
@@ -111,7 +111,7 @@ def find_noise_figures(log: Log) -> NoiseFigures:
 
 
 def _figure_line(symbol: str, figure: NoiseFigure) -> str:
-    unit, factor = DISPLAY_UNITS[symbol]
+    unit, factor = _DISPLAY_UNITS[symbol]
     name = f'{readable_name(figure.term.name).capitalize()} {symbol}'
     if not figure.value:
         return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
@@ -133,7 +133,7 @@ def _fit_line(fit: NoiseFit) -> str:
         text += f'; {others} fit nearly as well, and a longer record would distinguish them'
     if fit.process:
         text += ('; a Gauss-Markov process of '
-                 f'{fit.process.standard_deviation * DISPLAY_UNITS["B"][1]:.3g} deg/h '
+                 f'{fit.process.standard_deviation * _DISPLAY_UNITS["B"][1]:.3g} deg/h '
                  f'with a correlation time of {fit.process.correlation_time:.3g} s describes them '
                  'better than B and K, which approximate it and may be zero')
     return f'{text}.'

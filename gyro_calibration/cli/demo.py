@@ -60,8 +60,8 @@ except ImportError as error:
 
 PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
-MAX_ATTEMPTS = 3  # to calibrate
-DRIVE_MOTION = constant_rate_motion([
+_MAX_ATTEMPTS = 3  # to calibrate
+_DRIVE_MOTION = constant_rate_motion([
     *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
 
@@ -77,15 +77,15 @@ def run(given: argparse.Namespace) -> Answer:
         raise InputError(f'the demo needs ROS 2 and matplotlib ({MISSING}); source ROS 2, or '
                          'install gyro_calibration[ros,plot]')
     verb.require_folder(given.out)
-    return run_demo(Path(given.out), given.seed)
+    return _run_demo(Path(given.out), given.seed)
 
 
-class CallRefused(OSError):
+class _CallRefused(OSError):
     """A service refused a call."""
 
 
 @dataclass
-class SimulatedRobot:
+class _SimulatedRobot:
     """A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model."""
 
     model: GyroModel
@@ -113,10 +113,10 @@ class SimulatedRobot:
                          time=number * XV3500.interval)
 
 
-class DemoClient:
+class _DemoClient:
     """Subscribes to the nodes and calls their services, spinning in a thread of its own."""
 
-    def __init__(self, robot: SimulatedRobot):
+    def __init__(self, robot: _SimulatedRobot):
         """Subscribe; the robot receives ``cmd_vel`` from now on."""
         self.raw_rates: list[tuple[float, float]] = []  # s and rad/s
         self.headings: list[tuple[float, float]] = []  # s and rad
@@ -157,7 +157,7 @@ class DemoClient:
                 raise OSError(f'{name} did not answer within {timeout:g} s')
             wait()
         if not answer.result().success:
-            raise CallRefused(f'{name}: {answer.result().message}')
+            raise _CallRefused(f'{name}: {answer.result().message}')
         return answer.result().message
 
     def is_ready(self) -> bool:
@@ -197,7 +197,7 @@ def _node_process(module: str, **parameters: object) -> Iterator[None]:
             process.wait()
 
 
-def run_demo(out: Path, seed: int) -> Answer:
+def _run_demo(out: Path, seed: int) -> Answer:
     """
     Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
 
@@ -216,7 +216,7 @@ def run_demo(out: Path, seed: int) -> Answer:
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
-    robot = SimulatedRobot(XV3500.model, simulate_noise(
+    robot = _SimulatedRobot(XV3500.model, simulate_noise(
         XV3500.noise, 30000, XV3500.interval, np.random.default_rng(seed)))
     with ExitStack() as stack:
         stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
@@ -227,15 +227,15 @@ def run_demo(out: Path, seed: int) -> Answer:
                                           **{'calibration.drive': True}))
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
-        client = DemoClient(robot)
+        client = _DemoClient(robot)
         stack.callback(client.close)
         begin = _calibrate_and_drive(client)
     return _evaluate(out, robot, client, begin, seed)
 
 
-def _calibrate_and_drive(client: DemoClient) -> float:
+def _calibrate_and_drive(client: _DemoClient) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
-    total = round(CALIBRATION_MOTION.duration + 4.0 + DRIVE_MOTION.duration)
+    total = round(CALIBRATION_MOTION.duration + 4.0 + _DRIVE_MOTION.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
               disable=None) as bar:
         bar.set_description('starting driver and compensation')
@@ -250,22 +250,22 @@ def _calibrate_and_drive(client: DemoClient) -> float:
         client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
         begin, started = time.time(), time.monotonic()
-        while (elapsed := time.monotonic() - started) < DRIVE_MOTION.duration:
-            client.command_rate(float(DRIVE_MOTION.rate_at(np.array(elapsed))))
+        while (elapsed := time.monotonic() - started) < _DRIVE_MOTION.duration:
+            client.command_rate(float(_DRIVE_MOTION.rate_at(np.array(elapsed))))
             _wait(bar, 0.02)
         client.command_rate(0.0)
         _wait(bar, 0.5)
     return begin
 
 
-def calibrate(client: DemoClient, bar: tqdm) -> None:
+def calibrate(client: _DemoClient, bar: tqdm) -> None:
     """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
-    for attempt in range(1, MAX_ATTEMPTS + 1):
+    for attempt in range(1, _MAX_ATTEMPTS + 1):
         try:
             client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
             return
-        except CallRefused as refusal:
-            if attempt == MAX_ATTEMPTS:
+        except _CallRefused as refusal:
+            if attempt == _MAX_ATTEMPTS:
                 raise
             bar.total += CALIBRATION_MOTION.duration + 4.0
             bar.write(f'{refusal}; the run is repeated', file=sys.stderr)
@@ -277,7 +277,7 @@ def _wait(bar: tqdm, seconds: float) -> None:
     bar.update(seconds)
 
 
-def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float,
+def _evaluate(out: Path, robot: _SimulatedRobot, client: _DemoClient, begin: float,
               seed: int) -> Answer:
     """Compare five headings of the drive with the truth, with the values of Hong and Park."""
     clock, truth = np.array(robot.true_headings).T

@@ -36,7 +36,7 @@ import numpy as np
 #: Ranges of the numbers of a file; the largest stand for any.
 _POSITIVE, _NOT_NEGATIVE = (0.01, 1e9), (0.0, 1e9)
 #: Name of a limit in a file -> its name in `RobotLimits`, and the range of its numbers.
-LIMIT_FIELDS = {
+_LIMIT_FIELDS = {
     'maximum_rate_dps': ('rate', _POSITIVE),
     'maximum_acceleration_dps2': ('acceleration', _POSITIVE),
     'maximum_jerk_dps3': ('jerk', _POSITIVE),
@@ -46,7 +46,7 @@ LIMIT_FIELDS = {
     'rest_s': ('rest', (0.1, 100.0)),
 }
 #: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
-COMPARED_DURATIONS, MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
+COMPARED_DURATIONS, _MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -69,10 +69,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    if given.seconds > MAX_DURATION:
-        raise InputError(f'--seconds {given.seconds:g} is above {MAX_DURATION:g}; '
+    if given.seconds > _MAX_DURATION:
+        raise InputError(f'--seconds {given.seconds:g} is above {_MAX_DURATION:g}; '
                          'plan a shorter motion and repeat it')
-    robot = read_limits(given.limits)
+    robot = _read_limits(given.limits)
     noise = read_model(given.model).noise if given.model else XV3500.noise
     if not noise.angle_random_walk:
         raise InputError(f'{given.model}: has no angle_random_walk; '
@@ -102,7 +102,7 @@ def run(given: argparse.Namespace) -> Answer:
     return _answer(given, plan, rows, longer, can_follow(robot, CALIBRATION_MOTION))
 
 
-def read_limits(path: str) -> RobotLimits:
+def _read_limits(path: str) -> RobotLimits:
     """Read the limits of a robot; a `InputError` names what is missing, unknown or wrong."""
     try:
         content = read_settings(path)
@@ -110,14 +110,14 @@ def read_limits(path: str) -> RobotLimits:
         raise InputError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
                          'start with a copy of config/limits.yaml') from error
     try:
-        given = validate('the file', content, dict.fromkeys(LIMIT_FIELDS, _check_limit))
+        given = validate('the file', content, dict.fromkeys(_LIMIT_FIELDS, _check_limit))
     except InvalidValue as error:
         raise InputError(f'{path}: {error}; config/limits.yaml is an example') from None
     missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
                if name not in given]
     if missing:
         raise InputError(f'{path}: {missing[0]} is missing; add the limit of the robot')
-    robot = RobotLimits(**{LIMIT_FIELDS[name][0]: value if name == 'rest_s' else value * DEGREE
+    robot = RobotLimits(**{_LIMIT_FIELDS[name][0]: value if name == 'rest_s' else value * DEGREE
                            for name, value in given.items()})
     if robot.slowest > robot.rate:
         raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
@@ -127,7 +127,7 @@ def read_limits(path: str) -> RobotLimits:
 
 def _check_limit(place: str, value: Any) -> float:
     name = place.rpartition('.')[2]
-    return parse_number(name, value, *LIMIT_FIELDS[name][1])
+    return parse_number(name, value, *_LIMIT_FIELDS[name][1])
 
 
 def write_motion(path: str, motion: Motion) -> None:

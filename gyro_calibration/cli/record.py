@@ -123,7 +123,7 @@ def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
 # Files
 
 
-class DiskFull(OSError):
+class _DiskFull(OSError):
     """Nothing more can be written; the written pieces remain."""
 
 
@@ -150,8 +150,8 @@ class _Recorder:
             self.is_full = True
             self._file.truncate(self.size)
             self._file.seek(self.size)
-            raise DiskFull(error.errno,
-                           f'{self.path}: writing has failed ({error.strerror})') from error
+            raise _DiskFull(error.errno,
+                            f'{self.path}: writing has failed ({error.strerror})') from error
         self.size += len(piece)
 
     def flush(self, is_due: bool = False) -> None:
@@ -210,7 +210,7 @@ class McapRecorder(_Recorder):
     def close(self) -> None:
         """Close the file, on a full disk with an end that readers understand."""
         if self.is_full and self.size:
-            with suppress(DiskFull):  # a reader then takes the file for truncated
+            with suppress(_DiskFull):  # a reader then takes the file for truncated
                 self.append(MCAP_END)
         super().close()
 
@@ -267,7 +267,7 @@ class CsvRecorder(_Recorder):
         self._rows.clear()
 
 
-def recording_notes(**details: object) -> dict[str, str]:
+def _recording_notes(**details: object) -> dict[str, str]:
     """Return the notes of a recording: program, date, and details except empty ones."""
     known = {name.replace('_', ' '): str(value)
              for name, value in details.items() if value not in (None, '')}
@@ -298,7 +298,7 @@ def _record(session: _PortSession | _TopicSession, out: str) -> Answer:
                 session.record(on_chunk)
             finally:
                 recorder.close()
-    except DiskFull as error:
+    except _DiskFull as error:
         written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but for '
                    f'the last {_WRITE_INTERVAL:g} s' if recorder.size else 'nothing was written')
         raise DataRefused(f'{error.strerror}; {written}: make room, then record again') from None
@@ -355,7 +355,7 @@ class _PortSession:
             scale['inverted'] = 'yes' if factor < 0.0 else 'no'
             if protocol is not CSV or settings.sensitivity is not None:
                 scale['sensitivity'] = f'{abs(factor)!r} rad/s a unit of the device{angles}'
-        return recording_notes(
+        return _recording_notes(
             port=self._given.port, device=found.path, protocol=protocol and protocol.name,
             baud=found.baud, axis=settings.axis, **scale)
 
@@ -435,7 +435,7 @@ class _TopicSession:
         self._previous, self._intervals, self._clock_steps = (0, 0), Intervals(), 0
         self._given, self._stop, self._start_time = given, stop, time.monotonic()
         self.recorder = McapRecorder(given.out if self._is_mcap else f'{given.out}.mcap',
-                                     lambda: recording_notes(topics=', '.join(self._roles)))
+                                     lambda: _recording_notes(topics=', '.join(self._roles)))
 
     def counts(self) -> tuple[int, int]:
         samples = self._samples or (self._messages if self._is_mcap else 0)

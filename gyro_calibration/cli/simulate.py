@@ -28,7 +28,7 @@ from gyro_calibration.model.motion import motion_by_name, NAMED_MOTIONS, simulat
 import numpy as np
 
 #: Largest number of samples of a simulation, which needs 100 bytes for each.
-MAX_SAMPLES = 20_000_000
+_MAX_SAMPLES = 20_000_000
 
 
 def add_motion_options(parser: argparse.ArgumentParser, **options: Any) -> None:
@@ -61,9 +61,9 @@ def run(given: argparse.Namespace) -> Answer:
 def simulate_log(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
     motion = motion_by_name(given.motion)
-    if motion.duration * given.sample_rate > MAX_SAMPLES:
+    if motion.duration * given.sample_rate > _MAX_SAMPLES:
         raise InputError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
-                         f'{MAX_SAMPLES:g} samples; give a lower rate or a shorter motion')
+                         f'{_MAX_SAMPLES:g} samples; give a lower rate or a shorter motion')
     if round(motion.duration * given.sample_rate) < 1:
         raise InputError(f'{given.motion} at --sample-rate {given.sample_rate:g} has fewer than '
                          'two samples; give a higher rate or a longer motion')

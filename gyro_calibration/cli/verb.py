@@ -114,7 +114,7 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
                         help='deg/s per count, for logs with gyro_counts only')
     parser.add_argument('--invert', action='store_true',
                         help='the gyro reports clockwise turns as positive')
-    parser.add_argument('--columns', dest='names', type=parse_columns, default={},
+    parser.add_argument('--columns', dest='names', type=_parse_columns, default={},
                         metavar='QUANTITY=NAME:UNIT,...',
                         help='columns with other names than in the log format, such as '
                         'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI; '
@@ -141,7 +141,7 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
                         'in a recording; default: the name nearest to the topic of the gyro')
 
 
-def parse_columns(text: str) -> dict[str, str]:
+def _parse_columns(text: str) -> dict[str, str]:
     """Return quantity -> column, or column:unit, of an argument."""
     pairs = [each.partition('=')[::2] for each in text.split(',')]
     if any(not name or not column for name, column in pairs):

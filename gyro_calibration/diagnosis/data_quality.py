@@ -51,7 +51,7 @@ from scipy.special import ndtr
 FALSE_ALARM_CHANCE = 2e-4
 #: Least step of codes that matters, as a share of the white noise; the same for a step of the
 #: reference, as a share of the variance.
-MIN_STEP_NOISE_RATIO, MIN_STEP_VARIANCE_SHARE = 0.2, 0.02
+_MIN_STEP_NOISE_RATIO, _MIN_STEP_VARIANCE_SHARE = 0.2, 0.02
 #: Least number of separate runs of an extreme code, which a repetition fault does not cause.
 _MIN_LIMIT_RUNS = 3
 #: Output of a rest, as a share of the largest; a limit is higher, and a dead band is lower.
@@ -69,12 +69,12 @@ _RARE_SIGMAS = 4.5
 #: Numbers of neighbours on each side with which a sample is compared, of samples between a jolt in
 #: the output and in the reference, of samples in a block of constant scatter, and of consecutive
 #: outliers, at most.
-NEIGHBOURS_PER_SIDE, _JOLT_SAMPLES, _SCATTER_BLOCK_SAMPLES, _MAX_OUTLIER_RUN = 3, 10, 256, 2
+_NEIGHBOURS_PER_SIDE, _JOLT_SAMPLES, _SCATTER_BLOCK_SAMPLES, _MAX_OUTLIER_RUN = 3, 10, 256, 2
 
 
 # codes
 
-def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
+def _local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
     """
     Return an upper bound of the step of codes near each value, shape (n,).
 
@@ -99,7 +99,7 @@ def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class DeadBand:
+class _DeadBand:
     """A frequent value without other values near it."""
 
     value: float  # rad/s
@@ -119,12 +119,12 @@ class DeadBand:
         return ndtr((reach - off) / deviation) - ndtr((-reach - off) / deviation)
 
 
-def find_dead_band(codes: QuantizationCodes, output: Array) -> DeadBand | None:
+def _find_dead_band(codes: QuantizationCodes, output: Array) -> _DeadBand | None:
     """Return the dead band of an output, or None where it shows none."""
     counts = np.where(np.abs(codes.values) < _rest_rate_limit(output), codes.counts, 0)
     place = int(np.argmax(counts))
     away = np.abs(np.delete(codes.values, place) - codes.values[place])
-    band = DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
+    band = _DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
     runs = np.count_nonzero(np.diff(band.contains(output), prepend=False, append=False)) // 2
     return (band if counts[place] > 1 and runs > 1
             and band.half_width > 1.5 * codes.step else None)
@@ -136,7 +136,7 @@ def _rest_rate_limit(output: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Limit:
+class _Limit:
     """Largest and smallest code of a saturated output."""
 
     # low, high: the limit on each side, infinite where there is none
@@ -155,8 +155,8 @@ class Limit:
         return (output >= self.high - slack) | (output <= self.low + slack)
 
 
-def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
-               level: float) -> Limit | None:
+def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
+                level: float) -> _Limit | None:
     """
     Return the limit of an output, or None, by a test of this level on each side.
 
@@ -166,11 +166,11 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
     """
     chances, (low, high) = {}, codes.values[[0, -1]].tolist()
     deviation, noise = comparison.deviation, comparison.noise_deviation
-    fine = codes.step < MIN_STEP_NOISE_RATIO * noise
+    fine = codes.step < _MIN_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
         values, counts = ((codes.values, codes.counts) if sign > 0.0
                           else (-codes.values[::-1], codes.counts[::-1]))
-        extreme, step = values[-1], float(local_code_steps(codes, sign * values[-1:])[0])
+        extreme, step = values[-1], float(_local_code_steps(codes, sign * values[-1:])[0])
         # the chance of as many samples at the last code, if the density falls towards it
         reach = max(4.0 * step, 0.05 * noise)
         near = int(counts[:-1][values[:-1] > extreme - reach - 0.5 * step].sum())
@@ -180,7 +180,7 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
             continue
         at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
         # a limit on either side counts the runs of both
-        both = (Limit(low, high, chance).is_reached(comparison.output)
+        both = (_Limit(low, high, chance).is_reached(comparison.output)
                 if abs(low + high) < 1.5 * step else at_extreme)
         expected = (np.array([]) if comparison.expected is None
                     else sign * comparison.expected[at_extreme])
@@ -192,14 +192,14 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
             chances[sign] = (sign * extreme, chance)
     if not chances:
         return None
-    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
-                 min(chance for _, chance in chances.values()))
+    return _Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
+                  min(chance for _, chance in chances.values()))
 
 
 # repeated samples
 
 @dataclass(frozen=True)
-class SampleFault:
+class _SampleFault:
     """Faulty samples."""
 
     is_faulty: Mask  # mask of the samples, shape (n,)
@@ -207,8 +207,9 @@ class SampleFault:
     sigmas: float = 0.0  # largest deviation of outliers in standard deviations
 
 
-def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
-                          band: DeadBand | None, valid: Mask, level: float) -> SampleFault | None:
+def _find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
+                           band: _DeadBand | None, valid: Mask,
+                           level: float) -> _SampleFault | None:
     """Find repeated samples among valid ones, or return None."""
     known, change = valid[1:] & valid[:-1], np.diff(comparison.output)
     same = (change == 0.0) & known
@@ -216,7 +217,7 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
                 else np.nan_to_num(np.diff(comparison.expected)))
     if not same.any():
         return None
-    width = local_code_steps(codes, comparison.output[:-1])
+    width = _local_code_steps(codes, comparison.output[:-1])
     chance = _repeat_chances(change, expected, width, known)
     if band is not None:  # a sample in it repeats while the next is due in it
         within = band.contains(comparison.output[:-1])
@@ -246,7 +247,7 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
             by_run = min(by_run, unlikely * len(valid))
     if not repeats.any():
         return None
-    return SampleFault(repeats, min(by_run, p_value))
+    return _SampleFault(repeats, min(by_run, p_value))
 
 
 def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) -> Array:
@@ -256,7 +257,7 @@ def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) ->
     That of a change by less than a step for the scatter of changes of similar expectation, and no
     less than the share of changes by one code or two, each way.
     """
-    chances, classes = np.ones(len(change)), motion_classes(np.abs(expected))
+    chances, classes = np.ones(len(change)), _motion_classes(np.abs(expected))
     for each in np.unique(classes):
         members = np.flatnonzero((classes == each) & known)
         if len(members):
@@ -270,7 +271,7 @@ def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) ->
     return chances
 
 
-def motion_classes(motion: Array) -> NDArray[np.intp]:
+def _motion_classes(motion: Array) -> NDArray[np.intp]:
     """Return the class of each sample, with as many samples in each class, by its motion."""
     edges = np.quantile(motion, np.linspace(0.0, 1.0, _MOTION_CLASSES + 1)[1:-1])
     return np.searchsorted(np.unique(edges), motion, side='left')
@@ -283,8 +284,8 @@ def _robust_quantile(off: Array) -> float:
 
 # outliers
 
-def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
-                  level: float) -> SampleFault | None:
+def _find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
+                   level: float) -> _SampleFault | None:
     """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
     measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     # more for very long logs
@@ -295,9 +296,11 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
     if comparison.expected is not None and np.isfinite(comparison.expected).any():
         expected = bridge_gaps(comparison.expected)
         output = output - expected
-        padded = np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge')
-        expected_change = np.ptp(sliding_window_view(padded, 4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
-        jumps = maximum_filter1d(_distance_to_cubic(expected), 2 * _JOLT_SAMPLES + 1)
+        padded = np.pad(expected, 2 * _NEIGHBOURS_PER_SIDE, mode='edge')
+        expected_change = np.ptp(sliding_window_view(padded, 4 * _NEIGHBOURS_PER_SIDE + 1), axis=1)
+        # from the cubic through two samples on each side
+        by_cubic = np.abs(np.diff(np.pad(expected, 2, mode='edge'), 4)) / 6.0
+        jumps = maximum_filter1d(by_cubic, 2 * _JOLT_SAMPLES + 1)
     off = _distance_to_median(output)
     sigmas = _outlier_sigmas(output, off, expected_change, valid, min_scatter)
     # an outlier is one among samples of the same rate too, and in the output itself
@@ -307,7 +310,7 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
     # near a jump of the reference of half the size: a jolt, or the reference is outlying
     sigmas[jumps > 0.5 * off] = 0.0
     missing = np.count_nonzero(_neighbour_samples(~valid), axis=1)
-    tested = valid & (missing < NEIGHBOURS_PER_SIDE)
+    tested = valid & (missing < _NEIGHBOURS_PER_SIDE)
     outlying = (sigmas > limit) & tested
     for run in find_runs(outlying):
         outlying[run] = run.stop - run.start <= _MAX_OUTLIER_RUN
@@ -317,14 +320,14 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
     if not count or near > 0.5 * count + usual:
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
-    return (SampleFault(outlying, p_value, float(sigmas[outlying].max())) if p_value < level
+    return (_SampleFault(outlying, p_value, float(sigmas[outlying].max())) if p_value < level
             else None)
 
 
 def _windows(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp]]:
     """Return the seven samples about each one, the outer ones at the ends, and its place there."""
-    size, index = 2 * NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
-    first = np.clip(index - NEIGHBOURS_PER_SIDE, 0, len(values) - size)
+    size, index = 2 * _NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
+    first = np.clip(index - _NEIGHBOURS_PER_SIDE, 0, len(values) - size)
     return sliding_window_view(values, size)[first], index - first
 
 
@@ -355,11 +358,6 @@ def _distance_to_parabola(values: Array) -> Array:
     return np.abs((window * weights[place]).sum(axis=1))
 
 
-def _distance_to_cubic(values: Array) -> Array:
-    """Return how far each sample is from the cubic through two on each side of it."""
-    return np.abs(np.diff(np.pad(values, 2, mode='edge'), 4)) / 6.0
-
-
 def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Mask,
                     min_scatter: float) -> Array:
     """Return distances from neighbours in standard deviations, local ones and those by motion."""
@@ -371,7 +369,7 @@ def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Ma
     of_blocks = [_robust_quantile(part[own]) for part, own in zip(parts, kept)]
     local = np.repeat(maximum_filter1d(of_blocks, 3, mode='nearest'),
                       [len(part) for part in parts])
-    by_motion, classes = np.zeros(len(off)), motion_classes(expected_change)
+    by_motion, classes = np.zeros(len(off)), _motion_classes(expected_change)
     for each in np.unique(classes):
         members = off[(classes == each) & valid]
         # by far ones too if there are enough, for rough motion
@@ -438,8 +436,11 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     lost, remarks = _check_stamps(log.time, has_output)
     expected = (None if rate is None or line is None
                 else factor * (line.factor * rate + line.offset))
+    heading = log.reference_heading if log.reference_rate is None else None
+    step = (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
+            else encoder_step(heading))
     found = DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
-                        heading_step=_reference_step(log))
+                        heading_step=step)
     return _check_samples(found, compare_output(output * factor, expected), model, log)
 
 
@@ -513,34 +514,27 @@ def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[st
                            stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
-def _reference_step(log: Log) -> float:
-    """Return the step of a reference heading, rad; 0 without one."""
-    heading = log.reference_heading if log.reference_rate is None else None
-    return (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
-            else encoder_step(heading))
-
-
 def _check_samples(found: DataQuality, comparison: OutputComparison, model: GyroModel | None,
                    log: Log) -> DataQuality:
     """Check the samples of the gyro for quantization, limits, repeats and outliers."""
     has_output = found.usable
     codes, output = find_codes(comparison.output[has_output]), comparison.output
-    limit = find_limit(codes, comparison, FALSE_ALARM_CHANCE)
+    limit = _find_limit(codes, comparison, FALSE_ALARM_CHANCE)
     at_limit = (np.zeros(len(output), dtype=bool) if limit is None
                 else limit.is_reached(output))
-    valid, band = has_output & ~at_limit, find_dead_band(codes, output)
-    repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
+    valid, band = has_output & ~at_limit, _find_dead_band(codes, output)
+    repeated = _find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     if repeated is not None and len(find_runs(at_limit)) == 1 and np.count_nonzero(
             at_limit) - 1 <= 2 * max(run.stop - run.start
                                      for run in find_runs(repeated.is_faulty)):
         # one run at a limit that is like the others is one of repeats
         limit, at_limit, valid = None, np.zeros_like(at_limit), has_output
-        repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
+        repeated = _find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     valid = valid if repeated is None else valid & ~repeated.is_faulty
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(
-        band.contains(output), iterations=NEIGHBOURS_PER_SIDE)
-    outlying = find_outliers(comparison, tested, 0.5 * codes.step, FALSE_ALARM_CHANCE)
+        band.contains(output), iterations=_NEIGHBOURS_PER_SIDE)
+    outlying = _find_outliers(comparison, tested, 0.5 * codes.step, FALSE_ALARM_CHANCE)
     valid = valid if outlying is None else valid & ~outlying.is_faulty
     away_from_limit = np.ones(len(output), dtype=bool)
     if limit is not None and comparison.expected is not None:
@@ -551,7 +545,7 @@ def _check_samples(found: DataQuality, comparison: OutputComparison, model: Gyro
     findings = (*found.findings, *_code_findings(codes, comparison, limit, at_limit, model),
                 *_sample_findings(repeated, outlying, log, found.heading_step,
                                   comparison.noise_deviation))
-    matters = codes.step >= MIN_STEP_NOISE_RATIO * comparison.noise_deviation
+    matters = codes.step >= _MIN_STEP_NOISE_RATIO * comparison.noise_deviation
     return replace(found, findings=findings, usable=valid & away_from_limit,
                    limit=None if limit is None else limit.size,
                    output_step=codes.step if matters else 0.0)
@@ -564,10 +558,10 @@ def _is_in_model(model: GyroModel | None, name: str, value: float) -> bool:
                for term in terms)
 
 
-def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit: Limit | None,
+def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit: _Limit | None,
                    at_limit: Mask, model: GyroModel | None) -> Iterator[Finding]:
     """Give quantization and saturation of the output, unless they are in the model."""
-    if (codes.step >= MIN_STEP_NOISE_RATIO * comparison.noise_deviation and codes.step
+    if (codes.step >= _MIN_STEP_NOISE_RATIO * comparison.noise_deviation and codes.step
             and not _is_in_model(model, 'quantization', codes.step)):
         chance = float(np.exp(-min(codes.counts.sum() * codes.alignment ** 2, 700.0)))
         yield _sized_finding(
@@ -583,7 +577,7 @@ def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit
                              f'{" or ".join(sides)}')
 
 
-def _sample_findings(repeated: SampleFault | None, outlying: SampleFault | None, log: Log,
+def _sample_findings(repeated: _SampleFault | None, outlying: _SampleFault | None, log: Log,
                      reference_step: float, noise_deviation: float) -> Iterator[Finding]:
     """Give repeated samples, outliers, and the step of the reference if it adds much variance."""
     assert log.time is not None
@@ -603,7 +597,7 @@ def _sample_findings(repeated: SampleFault | None, outlying: SampleFault | None,
     interval = float(np.median(np.diff(log.time)))
     noise = interval * noise_deviation
     if reference_step and (
-            not noise or reference_step ** 2 / 6.0 / noise ** 2 > MIN_STEP_VARIANCE_SHARE):
+            not noise or reference_step ** 2 / 6.0 / noise ** 2 > _MIN_STEP_VARIANCE_SHARE):
         yield _sized_finding('reference_quantization', reference_step, 0.0, 0.0,
                              'the reference heading comes in steps of '
                              f'{reference_step / DEGREE:.4g} deg: its rate over one sample is '

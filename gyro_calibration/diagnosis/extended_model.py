@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student
 
 #: Limits of a plausible scale factor error and its standard deviation.
-SCALE_FACTOR_LIMITS = RunLimits()
+_SCALE_FACTOR_LIMITS = RunLimits()
 #: Effects with a reference value -> the effect that compensates a change of that value.
 _COMPENSATING_EFFECTS: Mapping[str, Effect] = {
     'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
@@ -166,8 +166,8 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
     measure.
     """
     scale = fit.scale_factor_error
-    return _has_motion(fit) and (scale.value < -SCALE_FACTOR_LIMITS.max_scale_factor_error
-                                 or scale.deviation > SCALE_FACTOR_LIMITS.max_scale_deviation)
+    return _has_motion(fit) and (scale.value < -_SCALE_FACTOR_LIMITS.max_scale_factor_error
+                                 or scale.deviation > _SCALE_FACTOR_LIMITS.max_scale_deviation)
 
 
 def _has_motion(fit: RegressionFit) -> bool:

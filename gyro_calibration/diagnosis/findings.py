@@ -26,7 +26,7 @@ from gyro_calibration.model.noise import Noise
 #: whether the time limit is near, so that the search ends and no gain is measured.
 OnProgress: TypeAlias = Callable[[float | None, str], object]
 
-SCHEMA = 'gyro_calibration/diagnosis/2'
+_SCHEMA = 'gyro_calibration/diagnosis/2'
 TIME_LIMIT_REMARK = ('The time limit was reached: there may be more causes, and the gain of the '
                      'model was not measured.')
 #: Why a model is not offered.
@@ -38,6 +38,8 @@ MIN_PROBABILITY = 1e-4
 SUSPECTED_RATE_FACTOR = 5.0
 #: Shares of the false-alarm rate: for the search for causes, and for each value or noise figure.
 SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE = 0.6, 0.05
+#: Probability that an effect of the minimum detectable size is found.
+DETECTION_POWER = 0.95
 #: Least deficit in log-likelihood, relative to the best cause, of a cause that is ruled out (2.5
 #: sigma).
 RULED_OUT_DEFICIT = 3.2
@@ -298,5 +300,5 @@ class Diagnosis(Record):
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        return {'schema': SCHEMA, 'verdict': self.verdict,
+        return {'schema': _SCHEMA, 'verdict': self.verdict,
                 'false_alarm_rate': self.false_alarm_rate, **super().to_dict()}

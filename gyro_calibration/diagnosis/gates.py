@@ -33,7 +33,7 @@ from gyro_calibration.calibration.own_instants import (
     interpolate_by_splines, is_slow, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
     heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
-from gyro_calibration.calibration.run_faults import fit_scale
+from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
@@ -54,8 +54,6 @@ _COMMON_FACTORS: Mapping[str, float] = {
 #: And powers of two instead of powers of ten.
 UNIT_FACTORS: Mapping[str, float] = {
     **_COMMON_FACTORS, **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)}}
-#: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
-MAX_GYRO_RATIO = 1.1
 #: Largest relative difference between a factor and that of a unit.
 _MAX_FACTOR_ERROR = 0.005
 #: Largest standard deviation of a factor as a share of its distance to 1, and of a delay as a
@@ -85,7 +83,7 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     if matches:
         return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]))
     distant_matches = [name for name, value in _COMMON_FACTORS.items()
-                       if _factor_ratio(factor, value) < MAX_GYRO_RATIO]
+                       if _factor_ratio(factor, value) < UNIT_TOLERANCE]
     return (distant_matches[0] if distant_matches and deviation < _MAX_DEVIATION * abs(factor)
             else None)
 
@@ -239,13 +237,13 @@ def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
 
 #: Least number of samples and least duration, s, of a log in time, least number of rows of a rate
 #: table, and least share of samples with values.
-MIN_SAMPLES, MIN_DURATION, MIN_TABLE_ROWS, MIN_VALID_SHARE = 100, 20.0, 8, 0.1
+MIN_SAMPLES, _MIN_DURATION, _MIN_TABLE_ROWS, MIN_VALID_SHARE = 100, 20.0, 8, 0.1
 #: Largest number of rows of a rate table; more are samples whose time is missing.
-MAX_TABLE_ROWS = 5000
+_MAX_TABLE_ROWS = 5000
 #: Longest log, s: three years; a longer one has stamps in another unit.
-MAX_DURATION = 1e8
+_MAX_DURATION = 1e8
 #: Largest deviation of means over 1 s from their median at rest, without a reference, rad/s.
-REST_RATE_SPREAD = 3.0 * DEGREE
+_REST_RATE_SPREAD = 3.0 * DEGREE
 #: Largest plausible ratios of the noise and of the rates of a log to those of the model.
 _MAX_NOISE_RATIO, _MAX_RATE_RATIO = 1000.0, 20.0
 
@@ -323,7 +321,7 @@ def is_at_rest(log: Log) -> bool:
     second = np.floor(log.time - log.time[0]).astype(np.int64)
     second = np.unique(second, return_inverse=True)[1]
     means = np.bincount(second, bridge_gaps(log.output)) / np.bincount(second)
-    return float(np.abs(means - np.median(means)).max()) < REST_RATE_SPREAD
+    return float(np.abs(means - np.median(means)).max()) < _REST_RATE_SPREAD
 
 
 def _is_reference_noise(log: Log, rate: Array) -> bool:
@@ -348,23 +346,23 @@ def _log_problems(log: Log) -> Iterator[str]:
                      else np.isfinite(reference))
     both = int(np.count_nonzero(known & has_reference))
     if log.time is None:
-        if both < MIN_TABLE_ROWS:
+        if both < _MIN_TABLE_ROWS:
             yield (f'the log has no time_s, and {both} rows with output and reference_rate_dps; '
-                   f'as a rate table it needs at least {MIN_TABLE_ROWS}, and as samples in time '
+                   f'as a rate table it needs at least {_MIN_TABLE_ROWS}, and as samples in time '
                    'it needs time_s: add rows, or give --rate')
-        if both > MAX_TABLE_ROWS:
+        if both > _MAX_TABLE_ROWS:
             yield (f'the log has no time_s, and {both} rows, where a rate table has at most '
-                   f'{MAX_TABLE_ROWS}: add time_s, or give the sample rate with --rate')
+                   f'{_MAX_TABLE_ROWS}: add time_s, or give the sample rate with --rate')
     else:
         count, duration = int(np.count_nonzero(known)), log.time[-1] - log.time[0]
         if count < max(MIN_SAMPLES, MIN_VALID_SHARE * len(known)):
             yield (f'the gyro has a value in {count} of {len(known)} samples; at least '
                    f'{MIN_SAMPLES} and a tenth are needed: record again, and repair the line if '
                    'it loses samples')
-        if duration < MIN_DURATION:
+        if duration < _MIN_DURATION:
             yield (f'the log lasts {duration:.4g} s; a diagnosis needs at least '
-                   f'{MIN_DURATION:g} s: record longer')
-        if duration > MAX_DURATION:
+                   f'{_MIN_DURATION:g} s: record longer')
+        if duration > _MAX_DURATION:
             yield (f'the log lasts {duration:.3g} s by its stamps; check that time_s is in s, or '
                    'give --rate')
         if reference is None and not is_at_rest(log):
@@ -394,7 +392,7 @@ def _copy_problems(log: Log, output: Array) -> Iterator[str]:
         rates += [before, after, 0.5 * (before + after)]
     for rate in rates:
         known = np.isfinite(rate) & np.isfinite(output)
-        if np.count_nonzero(known) < MIN_TABLE_ROWS or not np.var(rate[known]) > 0.0:
+        if np.count_nonzero(known) < _MIN_TABLE_ROWS or not np.var(rate[known]) > 0.0:
             continue
         spread, slope = float(np.std(output[known])), fit_scale(output[known], rate[known])[1]
         offset = float(output[known].mean() - slope * rate[known].mean())
@@ -450,8 +448,6 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: Least residual over the longest spans, and least rotation of the reference, rad, for which
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
-#: Relative difference of mean rates over spans that is rounding.
-_EQUAL_RATES = 1e-9
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
 _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 
@@ -573,7 +569,7 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         yield Gate('sense', False, evidence,
                    'give or omit --invert, or change the sign of the column of the gyro', known)
     elif (name is None and power and log.reference_rate is None
-            and 1.0 / MAX_GYRO_RATIO < abs(factor) / slower < MAX_GYRO_RATIO
+            and 1.0 / UNIT_TOLERANCE < abs(factor) / slower < UNIT_TOLERANCE
             and _SAMPLE_INTERVAL_RANGE[0] < interval / slower < _SAMPLE_INTERVAL_RANGE[1]):
         yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
                    f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '
@@ -609,11 +605,6 @@ def reference_angle(log: Log) -> Array:
             else integrate(log.time, bridge_gaps(values)))
 
 
-def _are_equal(rates: Array) -> bool:
-    """Tell whether mean rates over spans differ by rounding alone."""
-    return not np.ptp(rates) > _EQUAL_RATES * np.abs(rates).max()
-
-
 def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     """Compare the changes of heading over spans of each length; none if there are too few."""
     assert log.time is not None and log.output is not None
@@ -630,7 +621,7 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     chosen = known[np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0)]
     at, heading = log.time[chosen], reference[chosen]
     rates = np.diff(heading) / np.diff(at)
-    if _are_equal(rates):
+    if not np.ptp(rates) > 1e-9 * np.abs(rates).max():  # they differ by rounding
         return []
     white = white_noise_deviation(output) ** 2 * float(np.median(np.diff(log.time)))
     return [_regress_at_best_lag(log.time, turned, at[::together], heading[::together], span,
@@ -745,15 +736,14 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
         return Reference('odometry', 'it stands in the rests, and in motion drifts by '
                          f'{drift[0] / DEGREE:.2g} +- {drift[1] / DEGREE:.2g} deg/s against them')
     step = encoder_step(heading)
-    if step >= MAX_ROUNDING_STEP or step and not _is_decimal(step):
+    if 0.0 < step < MAX_ROUNDING_STEP:
+        # a power of ten of a rad or a deg is the last digit of a file
+        powers = np.log10([step, step / DEGREE])
+        if np.abs(powers - np.rint(powers)).min() < 1e-4:
+            step = 0.0
+    if step:
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
     return Reference('motion_capture', 'the heading has no steps of an encoder')
-
-
-def _is_decimal(step: float) -> bool:
-    """Tell whether a step is a power of ten of a rad or a deg, as the last digit of a file."""
-    powers = np.log10([step, step / DEGREE])
-    return bool(np.abs(powers - np.rint(powers)).min() < 1e-4)
 
 
 def is_reference_limiting(log: Log, reference: Reference) -> bool:

@@ -34,8 +34,8 @@ from gyro_calibration.diagnosis.extended_model import (
     heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
     unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
-    Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
-    probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
+    DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED,
+    OnProgress, probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
     VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.gates import (
     check_gates, check_model_units, classify_reference, identify_sample_offset, is_at_rest,
@@ -62,8 +62,6 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import mannwhitneyu, norm
 
-#: Probability that an effect of the minimum detectable size is found.
-_DETECTION_POWER = 0.95
 _SETTLED_REMARK = (
     'Between the dwells, gyro and reference differ by more than the causes explain, as where a '
     'robot follows its command with a lag and overshoot; the log is diagnosed by its dwells '
@@ -219,7 +217,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
-                     (*unexplained_structures(search, found, selection.unnamed),
+                     (*_unexplained_structures(search, found, selection.unnamed),
                       *searched.unexplained), noise, simulated, gain, before, after,
                      _untestable_causes(search, logs, searched.hidden),
                      residual_curves(left, shown), heading_error_curve(left, shown),
@@ -356,12 +354,12 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
     for place, members in enumerate(selection.alternatives):
         evidence = evidence_for(search, (*fit.causes, *selection.unnamed), place)
-        yield cause_finding(search, fit, place, evidence, members)
+        yield _cause_finding(search, fit, place, evidence, members)
     for known in selection.suspected:
         everything = refine_jointly(search, (*fit.causes, *selection.unnamed, known))
         place = len(everything) - 1
-        yield mark_suspected(cause_finding(search, fit_causes(search.problem, everything), place,
-                                           evidence_for(search, everything, place)))
+        yield mark_suspected(_cause_finding(search, fit_causes(search.problem, everything), place,
+                                            evidence_for(search, everything, place)))
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
@@ -477,8 +475,8 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 
 # findings
 
-def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
-                  alternatives: Sequence[Scored] = ()) -> Finding:
+def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
+                   alternatives: Sequence[Scored] = ()) -> Finding:
     """Return the finding of a named cause with its evidence and alternatives."""
     known, replays = fit.causes[cause_index], fit.problem.replays
     name, parameters = known.cause, _cause_parameters(fit, cause_index)
@@ -494,7 +492,7 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence
     # the evidence of a size of n standard deviations is n² / 2
     threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
     detectable_sigmas = (math.sqrt(2.0 * max(threshold, 0.0))
-                         + float(norm.isf(1.0 - _DETECTION_POWER)))
+                         + float(norm.isf(1.0 - DETECTION_POWER)))
     log = ('' if known.log_index is None or len(replays) == 1
            else f'in log {known.log_index + 1}, ')
     where = None
@@ -555,8 +553,8 @@ def _amplitude_and_phase(fit: RegressionFit, cause_index: int, coefficients: Seq
             'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
 
 
-def unexplained_structures(search: Search, fit: RegressionFit,
-                           unnamed: Sequence[Candidate]) -> list[Unexplained]:
+def _unexplained_structures(search: Search, fit: RegressionFit,
+                            unnamed: Sequence[Candidate]) -> list[Unexplained]:
     """Return the structures without a name with the share of the residual that each explains."""
     causes = (*fit.causes, *unnamed)
     variables: dict[str, list[int]] = {}

@@ -43,9 +43,8 @@ import numpy as np
 
 #: Parts of a curve of which only the extremes are drawn.
 _THINNED_PARTS = 90
-_DEG_PER_HOUR = 3600.0 / DEGREE
 #: The variable of the curve of amplitudes instead of means.
-SPECTRUM_VARIABLE = 'frequency'
+_SPECTRUM_VARIABLE = 'frequency'
 
 _METHOD_TEXT = (
     '{logs} replayed through the simulation, with motion and temperature as recorded. The '
@@ -213,8 +212,7 @@ def _before_and_after(before: Array, after: Array, deviation: Array | None = Non
 def _rate_unit(values: Array) -> tuple[str, float]:
     """Return the unit in which people read rates up to these, and the factor to it."""
     largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
-    return (('deg/h', _DEG_PER_HOUR) if 0.0 < largest < 2e-3 * DEGREE
-            else ('deg/s', 1.0 / DEGREE))
+    return display_unit('rad/s', 'bias_instability' if 0.0 < largest < 2e-3 * DEGREE else '')
 
 
 def _time_unit(time: Array) -> tuple[str, float]:
@@ -226,7 +224,7 @@ def _time_unit(time: Array) -> tuple[str, float]:
 
 def _error_charts(curve: Curve, place: int) -> Iterator[Chart]:
     """Give the error of the gyro as simulated and as measured, where it is known."""
-    if curve.simulated is None or curve.along == SPECTRUM_VARIABLE:
+    if curve.simulated is None or curve.along == _SPECTRUM_VARIABLE:
         return
     measured = curve.simulated + curve.before
     unit, factor = _rate_unit(measured)
@@ -247,7 +245,7 @@ def _horizontal(curve: Curve) -> tuple[str, str, Array]:
 
 def _residual_chart(curve: Curve, place: int) -> Chart:
     name, title = f'residual-{place}', f'Residual along {readable_name(curve.along)}'
-    if curve.along == SPECTRUM_VARIABLE:
+    if curve.along == _SPECTRUM_VARIABLE:
         lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE),
                  Line('usual', 'simulated', curve.deviation / DEGREE)]
         return Chart(name, title, 'Largest amplitude of the residual in bands of frequency, and '
@@ -269,14 +267,15 @@ def _heading_chart(curve: HeadingCurve) -> Chart:
 
 
 def _allan_chart(curve: NoiseCurve) -> Chart:
-    lines = [Line('residual', 'measured', _DEG_PER_HOUR * curve.measured, draw_dots=True),
-             Line('noise as found', 'after', _DEG_PER_HOUR * curve.fitted)]
+    unit, factor = display_unit('rad/s', 'bias_instability')
+    lines = [Line('residual', 'measured', factor * curve.measured, draw_dots=True),
+             Line('noise as found', 'after', factor * curve.fitted)]
     if curve.simulated is not None:
-        lines.append(Line('noise of the simulation', 'simulated', _DEG_PER_HOUR * curve.simulated))
+        lines.append(Line('noise of the simulation', 'simulated', factor * curve.simulated))
     return Chart('noise', 'Allan deviation of the residual',
                  'Allan deviation over averaging time, of the residual and of the noise that is '
                  'simulated.', 'averaging time', 's', curve.averaging_time, 'Allan deviation',
-                 'deg/h', lines, is_logarithmic=True)
+                 unit, lines, is_logarithmic=True)
 
 
 def _thin_points(at: Array, *values: Array) -> list[Array]:

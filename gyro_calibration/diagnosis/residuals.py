@@ -45,8 +45,8 @@ NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 _MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
 #: Index of a figure -> lowest and highest logarithm of its square.
 Limits: TypeAlias = Mapping[int, tuple[float, float]]
-#: Bins of a curve, and points of a line over time.
-CURVE_BINS, CURVE_POINTS = 40, 600
+#: Bins of a curve.
+_CURVE_BINS = 40
 
 
 @dataclass(frozen=True)
@@ -310,13 +310,13 @@ def _binned_curve(name: str, unit: str, parts: Sequence[Array], values: Sequence
     low, high = np.quantile(at, [0.001, 0.999])
     if not high > low:
         return Curve(name, unit, *(np.empty(0) for _ in range(5)))
-    bins = [np.clip(((part - low) / (high - low) * CURVE_BINS).astype(int), 0, CURVE_BINS - 1)
+    bins = [np.clip(((part - low) / (high - low) * _CURVE_BINS).astype(int), 0, _CURVE_BINS - 1)
             for part in parts]
     place = np.concatenate(bins)
-    count = np.bincount(place, minlength=CURVE_BINS)
+    count = np.bincount(place, minlength=_CURVE_BINS)
     enough = count > 9
-    middle, left, mended, simulated = (np.bincount(place, each, CURVE_BINS)[enough] / count[enough]
-                                       for each in (at, *values))
+    middle, left, mended, simulated = (
+        np.bincount(place, each, _CURVE_BINS)[enough] / count[enough] for each in (at, *values))
     return Curve(name, unit, middle, left, mended,
                  np.sqrt(_bin_variances(after, bins)[enough]) / count[enough], simulated)
 
@@ -328,15 +328,15 @@ def _bin_variances(fit: RegressionFit, bins: Sequence[NDArray[np.intp]]) -> Arra
     Slow noise is correlated between samples; its cosine transform is not. Noise that averages out
     among the samples of one grid point is white.
     """
-    problem, total = fit.problem, np.zeros(CURVE_BINS)
+    problem, total = fit.problem, np.zeros(_CURVE_BINS)
     relative = (fit.noise_probability * fit.residual_squares
                 / fit.degrees_of_freedom) @ (1.0 / problem.weights)
     variances = problem.split_by_log(problem.deviation ** 2 * problem.by_coefficient(relative))
     for each, residual, variance, place in zip(problem.replays, fit.residuals, variances, bins):
         point = np.minimum(each.grid_index // each.decimation, each.point_count - 1)
         counts = np.bincount(place * each.point_count + point,
-                             minlength=CURVE_BINS * each.point_count).astype(float)
-        counts = counts.reshape(CURVE_BINS, each.point_count)
+                             minlength=_CURVE_BINS * each.point_count).astype(float)
+        counts = counts.reshape(_CURVE_BINS, each.point_count)
         squares = (counts ** 2).sum(axis=1)
         unresolved = np.maximum(counts.sum(axis=1) - squares / each.decimation, 0.0)
         total += (cosine_transform(counts) ** 2 @ variance
@@ -351,7 +351,7 @@ def _amplitude_spectrum(before: Sequence[Array], after: RegressionFit) -> Curve:
     amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values)
                  for values in series]
     frequency = np.fft.rfftfreq(len(series[0]), each.point_interval)[1:]
-    limits = np.geomspace(frequency[0], frequency[-1], CURVE_BINS + 1)
+    limits = np.geomspace(frequency[0], frequency[-1], _CURVE_BINS + 1)
     edges = np.unique(np.searchsorted(frequency, limits))[:-1]
     largest = [np.maximum.reduceat(values, edges) for values in amplitude]
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
@@ -365,8 +365,7 @@ def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Headin
     each = after.problem.replays[0]
     lines = [np.cumsum(each.resample(left[0])) * each.point_interval
              for left in (before, after.unbiased_residuals)]
-    some = np.unique(np.linspace(0, each.point_count - 1, CURVE_POINTS).astype(int))
-    return HeadingCurve(some * each.point_interval, lines[0][some], lines[1][some])
+    return HeadingCurve(np.arange(each.point_count) * each.point_interval, *lines)
 
 
 def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> NoiseCurve:

@@ -38,7 +38,7 @@ from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
     gain_from_squares, HEADING_WINDOW, origin_notes, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
+    Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -87,22 +87,22 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
                           'bias; record several rates, both ways')
     record = resolve_unit(inspect_record(log, model))
     dwells = replace(dwells, output=dwells.output * record.unit_factor)
-    named = name_causes(dwells, model, FALSE_ALARM_RATE)
-    structures, gains = find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
+    named = _name_causes(dwells, model, FALSE_ALARM_RATE)
+    structures, gains = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
     # structure along the variable of a cause, above a tenth of what that explains
     withdrawn = frozenset(
         effect for effect in named.causes if effect not in BASIC_EFFECTS
         and any(gain > 0.1 * named.misfit_reduction(effect) for name, gain in gains.items()
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
-        named = NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
-        structures, _ = find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
+        named = _NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
+        structures, _ = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
     gain = (_cross_validated_gain(dwells, model, FALSE_ALARM_RATE, withdrawn, on_progress)
             if named.causes else None)
     on_progress(0.97, 'findings')
     before = model or named.plain_model
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
-    after = assemble_model(model, named.fit) if offered else before
+    after = _assemble_model(model, named.fit) if offered else before
     strongest_first = sorted(named.causes, key=lambda each: -named.misfit_reduction(each))
     outliers = _outlier_findings(named.fit, 0.05 * FALSE_ALARM_RATE)
     findings = add_remedies([*record.findings, *outliers, *(
@@ -113,7 +113,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     return Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
-        error_curves(named.fit, before, after),
+        _error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
                  *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
         method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE))
@@ -135,12 +135,12 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
         hidden = groups == number
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:
-            named = name_causes(rest, model, false_alarm_rate, withdrawn)
-            models = (model or GyroModel(), named.plain_model, assemble_model(model, named.fit))
+            named = _name_causes(rest, model, false_alarm_rate, withdrawn)
+            models = (model or GyroModel(), named.plain_model, _assemble_model(model, named.fit))
         except DataRefused:
             continue
         for each, error in zip(models, errors.values()):
-            error[hidden] = left_out.output - simulate_output(each, left_out)
+            error[hidden] = left_out.output - _simulate_output(each, left_out)
     known = np.isfinite(errors['extended'])
     if not known.any():
         return None
@@ -174,7 +174,7 @@ def _outlier_findings(fit: Calibration, level: float) -> Iterator[Finding]:
 # causes that dwells support
 
 @dataclass(frozen=True)
-class NamedCauses:
+class _NamedCauses:
     """Causes that dwells support on top of a model."""
 
     fit: Calibration  # of causes, bias and scale factor to the dwells
@@ -183,7 +183,7 @@ class NamedCauses:
 
     @classmethod
     def of(cls, fit: Calibration, model: GyroModel | None, false_alarm_rate: float,
-           withdrawn: Collection[Effect] = ()) -> NamedCauses:
+           withdrawn: Collection[Effect] = ()) -> _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
         named = cls(fit, (), false_alarm_rate)
@@ -224,8 +224,8 @@ class NamedCauses:
         return fit_effects(self.fit.dwells, basic, self.fit.scatter).model
 
 
-def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                withdrawn: Collection[Effect] = ()) -> NamedCauses:
+def _name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
+                 withdrawn: Collection[Effect] = ()) -> _NamedCauses:
     """
     Find the causes that dwells support on top of a model, or of an ideal gyro.
 
@@ -240,10 +240,10 @@ def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float
     technology = model.gyro.get('technology') if model else None
     fit, _ = resolve_confounders(find_supported_effects(dwells, 0.65 * false_alarm_rate, model),
                                  technology if technology in TECHNOLOGY_EFFECTS else None)
-    return NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
+    return _NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
 
 
-def simulate_output(model: GyroModel, dwells: Dwells) -> Array:
+def _simulate_output(model: GyroModel, dwells: Dwells) -> Array:
     """Return the output that a model has for the dwells, rad/s, shape (n,)."""
     known = replace(model, terms=tuple(static_terms(model)))
     return np.zeros(len(dwells)) + known.output_from_channels(
@@ -263,7 +263,7 @@ def _is_slope_by_origin(fit: Calibration) -> bool:
                 < np.ptp(temperature))
 
 
-def assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
+def _assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
     """Return a model with the values of a fit in place of its own, or in addition to them."""
     if model is None:
         return fit.model
@@ -297,8 +297,8 @@ def _combined_covariance(model: GyroModel, fit: Calibration,
 _MAX_CURVE_COLUMNS, _MIN_DWELLS_PER_COLUMN = 9, 4
 
 
-def find_structure(fit: Calibration, false_alarm_rate: float,
-                   ) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
+def _find_structure(fit: Calibration, false_alarm_rate: float,
+                    ) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
     """
     Search for structure in the residual of a fit; errors by the model's values are none.
 
@@ -378,8 +378,8 @@ def _rate_columns(dwells: Dwells) -> Array:
 
 # findings
 
-def _cause_finding(named: NamedCauses, effect: Effect) -> Finding:
-    others, separate_by = find_alternatives(named.fit, effect)
+def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
+    others, separate_by = _find_alternatives(named.fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
     own = _given_values(named.fit, effect)
     # what is added to the model's values
@@ -404,7 +404,7 @@ def _given_values(fit: Calibration, effect: Effect) -> tuple[float, ...]:
                 (0.0,) * len(effect.parameters))
 
 
-def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
+def _minimum_detectable(named: _NamedCauses, effect: Effect) -> float | None:
     """
     Return the size of an effect that is found with 95 %, in the unit of its first value.
 
@@ -416,7 +416,7 @@ def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
         return None
     place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
     size = float(uncertainty.half_width(1.0 - named.level(effect))[place]
-                 + norm.ppf(0.95) * math.sqrt(uncertainty.covariance()[place, place]))
+                 + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
     own = _given_values(fit, SINE_RESPONSE)[0]
     return size if fitted is effect else math.sqrt(own ** 2 + 6.0 * size) - own
 
@@ -424,7 +424,7 @@ def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
 # remarks
 
 
-def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
+def _remarks(dwells: Dwells, model: GyroModel | None, named: _NamedCauses,
              structures: Sequence[Unexplained], withdrawn: Collection[Effect], gain: Gain | None,
              offered: bool) -> Iterator[str]:
     scatter = named.fit.scatter
@@ -480,7 +480,7 @@ def _untestable_causes(dwells: Dwells) -> dict[str, str]:
 
 # curves
 
-def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
+def _error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
     """Return the errors of dwells, without outliers, along rate, temperature and their order."""
     used, scatter = fit.used, fit.scatter
     ones = np.ones(len(used))
@@ -491,7 +491,7 @@ def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple
         # errors count in the sense of the turn.
         variables += [('temperature', 'degC', used.temperature, ones),
                       ('temperature_while_turning', 'degC', used.temperature, np.sign(used.rate))]
-    outputs = [simulate_output(model, used) for model in (before, after)]
+    outputs = [_simulate_output(model, used) for model in (before, after)]
     errors = np.array([used.output - outputs[0], used.output - outputs[1],
                        outputs[0] - used.rate])
     found = []
@@ -513,7 +513,7 @@ def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple
 _ALWAYS_CONFOUNDED = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
 
 
-def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
+def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
     """Return the alternatives of an effect, and the experiment that would distinguish them."""
     experiment = CAUSES[effect.name].separate_by
     if effect in _ALWAYS_CONFOUNDED:

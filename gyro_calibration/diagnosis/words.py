@@ -19,7 +19,7 @@ import textwrap
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
-    Change, Diagnosis, Estimate, Finding, MIN_PROBABILITY, Unexplained)
+    Change, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects
@@ -33,8 +33,8 @@ _UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0),
 #: Parameters with another displayed unit than others of the same SI unit.
 _PARAMETER_UNITS = {
     'bias_instability': ('deg/h', _HOUR / DEGREE), 'rate_ramp': ('deg/s/h', _HOUR / DEGREE),
-    'k': ('s', 1.0), 'unit_error': ('', 1.0), 'outliers': ('', 1.0), 'stuck_samples': ('', 1.0),
-    'dropped_samples': ('', 1.0)}
+    'k': ('s', 1.0),
+    **dict.fromkeys(['unit_error', 'outliers', 'stuck_samples', 'dropped_samples'], ('', 1.0))}
 #: Unit -> (value below which a finer unit is used, finer unit, factor to it).
 _FINER_UNITS = {'s': (0.5, 'ms', 1e3), '%': (0.01, 'ppm', 1e4)}
 _NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
@@ -246,7 +246,7 @@ def _gain_sentence(diagnosis: Diagnosis) -> str:
     what, change, unit = gain.rows()[0]
     if not diagnosis.model.terms:
         model = 'A model with the best bias and scale factor error is not offered: it'
-    return (f'{model} {change_phrase(change, unit, f"the {what}")}, measured on '
+    return (f'{model} {_change_phrase(change, unit, f"the {what}")}, measured on '
             f'{to_printable(gain.held_out)}.')
 
 
@@ -259,7 +259,7 @@ def _model_values_phrase(model: GyroModel) -> str:
         for half in [NORMAL_QUANTILE_975 * deviation if math.isfinite(deviation) else 0.0])
 
 
-def change_phrase(errors: Change, unit: str, what: str) -> str:
+def _change_phrase(errors: Change, unit: str, what: str) -> str:
     """Return the change of an error, as the end of a sentence."""
     before, after = (format_amount(value, unit) for value in (errors.before, errors.after))
     if errors.interval is None:
@@ -318,7 +318,10 @@ def _alternatives(found: Finding) -> str:
 def lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
     """Give titles with sentences: structure without a name, shares, what cannot be shown."""
     if diagnosis.unexplained:
-        yield 'Structure that no cause explains', list(map(_structure, diagnosis.unexplained))
+        yield 'Structure that no cause explains', [
+            f'Along {readable_name(each.along)}: {_format_share(each.share_of_variance)} of the '
+            'variance of the residual; probability by noise alone: '
+            f'{format_probability(each.p_value)}.' for each in diagnosis.unexplained]
     if shares := diagnosis.heading_shares:
         names = {'reference': 'errors of the reference', 'left': 'not explained'}
         yield ('Shares of the mean square heading error over 60 s'
@@ -333,12 +336,6 @@ def lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
                                          for reason, names in reasons.items()]
     if diagnosis.remarks:
         yield 'Remarks', list(map(as_sentence, diagnosis.remarks))
-
-
-def _structure(each: Unexplained) -> str:
-    return (f'Along {readable_name(each.along)}: {_format_share(each.share_of_variance)} of the '
-            f'variance of the residual; probability by noise alone: '
-            f'{format_probability(each.p_value)}.')
 
 
 def noise_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:

@@ -63,9 +63,9 @@ from gyro_calibration.model.settings_file import read_settings
 import numpy as np
 
 #: Fields of a log in a table, in addition to its path.
-ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
+_ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
-LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
+_LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
@@ -94,7 +94,7 @@ class FleetLog:
 
     def fill_missing(self, stated: Mapping[str, str]) -> FleetLog:
         new: dict[str, Any] = {name: to_printable(text.strip())
-                               for name, text in stated.items() if name in ENTRY_KEYS
+                               for name, text in stated.items() if name in _ENTRY_KEYS
                                and text.strip() and getattr(self, name) in ('', None)}
         if 'temperature' in new:
             text = new['temperature']
@@ -114,7 +114,7 @@ class FleetLog:
 
     def merge(self, other: FleetLog) -> FleetLog:
         """Return the fields of one log by two tables; raise `InputError` where they differ."""
-        new = {name: getattr(other, name) for name in ENTRY_KEYS
+        new = {name: getattr(other, name) for name in _ENTRY_KEYS
                if getattr(other, name) not in ('', None)}
         for name, value in new.items():
             if getattr(self, name) not in ('', None, value):
@@ -140,7 +140,7 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
                                     if absolute_path in found else entry)
     if not found:
         raise InputError(f'{", ".join(map(str, paths))}: holds no log; logs end in '
-                         f'{", ".join(LOG_SUFFIXES)}, or are the folder of a ROS 2 recording')
+                         f'{", ".join(_LOG_SUFFIXES)}, or are the folder of a ROS 2 recording')
     return list(found.values())
 
 
@@ -155,7 +155,7 @@ def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
             yield FleetLog(path)  # a recording
             return
         for inner in sorted(folder.iterdir()):
-            if (inner.is_dir() or inner.name.lower().endswith(LOG_SUFFIXES)
+            if (inner.is_dir() or inner.name.lower().endswith(_LOG_SUFFIXES)
                     and not inner.name.startswith('.')):
                 yield from _expand_path(str(inner), visited)
     elif not os.path.exists(path) and glob(path, recursive=True):
@@ -187,7 +187,7 @@ def _read_header(path: str) -> list[str]:
         return []
     columns = [name.strip().strip('"').lower() for name in line.split(find_delimiter(line))]
     is_log = any(name.startswith(('time', 'gyro')) for name in columns)
-    return columns if 'log' in columns or set(ENTRY_KEYS) & set(columns) and not is_log else []
+    return columns if 'log' in columns or set(_ENTRY_KEYS) & set(columns) and not is_log else []
 
 
 def _resolve_log_path(path: str, log: str) -> str:
@@ -197,10 +197,10 @@ def _resolve_log_path(path: str, log: str) -> str:
 
 
 def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
-    if not set(columns) <= {'log', *ENTRY_KEYS} or 'log' not in columns or len(set(columns)) < len(
-            columns):
+    if (not set(columns) <= {'log', *_ENTRY_KEYS} or 'log' not in columns
+            or len(set(columns)) < len(columns)):
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
-                         f'{", ".join(ENTRY_KEYS)}, each once')
+                         f'{", ".join(_ENTRY_KEYS)}, each once')
     first, *lines = _read_text(path).splitlines()
     for number, row in enumerate(csv.reader(lines, delimiter=find_delimiter(first)), 2):
         if not any(map(str.strip, row)):
@@ -217,10 +217,10 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
 def compile_file_pattern(text: str) -> re.Pattern[str]:
     """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `InputError`."""
     parts = re.split(r'\{(\w*)\}', text)
-    unknown = [name for name in parts[1::2] if name not in ENTRY_KEYS]
+    unknown = [name for name in parts[1::2] if name not in _ENTRY_KEYS]
     if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
         raise InputError(f'{text}: wanted a file name with {{unit}}, and perhaps '
-                         f'{", ".join(f"{{{name}}}" for name in ENTRY_KEYS[1:])}, each once')
+                         f'{", ".join(f"{{{name}}}" for name in _ENTRY_KEYS[1:])}, each once')
     return re.compile(''.join(f'(?P<{part}>.+?)' if place % 2 else re.escape(part)
                               for place, part in enumerate(parts)))
 
@@ -228,7 +228,7 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
 def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -> FleetLog:
     """Return an entry with its empty fields filled from file name, notes or metadata."""
     # in order of precedence: table, pattern of the user, notes and metadata, usual file names
-    stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',
+    stem = re.sub(f'({"|".join(map(re.escape, sorted(_LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
         entry = entry.fill_missing(found.groupdict())
@@ -277,7 +277,7 @@ _MIN_LOG_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Schema of the records; records of another one are not read.
-SCHEMA = 'gyro_calibration/fleet_log/2'
+_SCHEMA = 'gyro_calibration/fleet_log/2'
 
 
 def _fit_spans(log: Log, time_offset: float, heading: tuple[Array, Array] | None) -> tuple[
@@ -383,7 +383,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
             {'type': task.default_type})
         content = sha256_digest(*list_recording_files(task.entry.log))
         state = None if task.generator is None else task.generator.bit_generator.state
-        identity = [SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log,
+        identity = [_SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log,
                     content, state]  # all that the record depends on
         key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
         found = None
@@ -391,7 +391,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
             kept = json.loads(task.record_path.read_bytes())
             found = kept if kept['key'] == key else None
         if found is None:
-            found = {'schema': SCHEMA, 'key': key, 'sha256': content,
+            found = {'schema': _SCHEMA, 'key': key, 'sha256': content,
                      **_calibrate_and_diagnose(task)}
             write_atomically(task.record_path, json.dumps(found, allow_nan=False).encode())
         stated = _stated_fields(entry)
@@ -403,7 +403,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
 
 def make_refused_record(entry: FleetLog, reason_text: str) -> dict[str, Any]:
-    return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated_fields(entry),
+    return {'schema': _SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated_fields(entry),
             'status': NO_EVIDENCE, 'reason': reason_text}
 
 
@@ -423,7 +423,7 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
     path = task.entry.log
     log = (read_recording(path, rate=task.sample_rate) if is_recording(path)
            else read_log(path, rate=task.sample_rate))
-    method, model, offset = calibrate_log(log, task.technology)
+    method, model, offset = _calibrate_log(log, task.technology)
     # by parameter where it is named as its effect
     values = {parameter.name if parameter.name == effect else f'{effect}.{parameter.name}':
               _value_record(value, deviation, parameter.unit)
@@ -450,8 +450,8 @@ def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
     return {'value': float(value), 'deviation': float(deviation), 'unit': unit}
 
 
-def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
-                                                               tuple[float, float] | None]:
+def _calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
+                                                                tuple[float, float] | None]:
     """
     Return the method of calibration of a log, its model, and the time offset of its reference.
 

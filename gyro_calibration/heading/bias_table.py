@@ -48,7 +48,7 @@ from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 
 #: Width of a temperature bin, K; a run has one entry in each.
-BIN_WIDTH = 1.5
+_BIN_WIDTH = 1.5
 #: Largest number of entries.
 MAX_ENTRIES = 80
 #: Averaging time of a rest, s.
@@ -418,7 +418,7 @@ def _covariance_of_differences(from_origin: Array, pairwise: Array) -> Array:
 
 
 def _bin_number(entry: Entry) -> int:
-    return round(entry.temperature / BIN_WIDTH)
+    return round(entry.temperature / _BIN_WIDTH)
 
 
 def _is_possible(entry: Entry) -> bool:
@@ -433,10 +433,8 @@ def _clip_to_range(temperature: float, time: float) -> tuple[float, float]:
     return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
 
 
-FORMAT = 'gyro_calibration/bias_table'
-VERSION = 1
-#: A table of `MAX_ENTRIES` entries has a twentieth of this.
-_MAX_FILE_BYTES = 200_000
+_FORMAT = 'gyro_calibration/bias_table'
+_VERSION = 1
 _HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest and before '
            'any self-calibration; times are UTC.\n'
            '# Written by the compensation node. If it is deleted, estimation begins again.\n')
@@ -483,7 +481,7 @@ def write_bias_table(path: str | Path, table: BiasTable,
     message = _keep_aside(Path(path), table.digest)
     entries = [{'temperature': round(each.temperature, 3), 'bias': _round_digits(each.bias),
                 **_common_fields(each)} for each in table.entries]
-    content = {'format': FORMAT, 'version': VERSION, 'model': table.digest, 'entries': entries,
+    content = {'format': _FORMAT, 'version': _VERSION, 'model': table.digest, 'entries': entries,
                'jumps': [_common_fields(each) for each in table.jumps]}
     written = write_atomically(path, (_HEADER + format_settings(content)).encode())
     table.mark_written(now)
@@ -501,11 +499,11 @@ def _keep_aside(path: Path, digest: str) -> str:
 
 def _read_file(path: Path) -> tuple[str, list[Entry], list[Jump]]:
     """Return digest, entries and jumps of a file."""
-    content = read_settings(path, _MAX_FILE_BYTES)
-    if not isinstance(content, dict) or content.get('format') != FORMAT:
-        raise ValueError(f'it has no line format: {FORMAT}')
-    if content.get('version') != VERSION:
-        raise ValueError(f'its version is {content.get("version")!r:.40}, wanted {VERSION}')
+    content = read_settings(path)
+    if not isinstance(content, dict) or content.get('format') != _FORMAT:
+        raise ValueError(f'it has no line format: {_FORMAT}')
+    if content.get('version') != _VERSION:
+        raise ValueError(f'its version is {content.get("version")!r:.40}, wanted {_VERSION}')
     entries = [_entry_from_row(row, float(row['temperature']), float(row['bias']))
                for row in _rows(content, 'entries')]
     jumps = [Jump(int(each.run), each.variance, each.time)

@@ -65,7 +65,7 @@ class Assumptions:
         return (self.scale_factor_error ** 2, 0.0), (0.0, self.bias ** 2)
 
 
-def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroModel:
+def _with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroModel:
     """Return the model with an assumed covariance in its self-calibration if it has none."""
     calibration = model.self_calibration
     if calibration is None:
@@ -163,7 +163,7 @@ class HeadingEstimator:
     def _restart(self, now: float, is_fresh: bool = False) -> None:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
         self._calibration_message = ''
-        self.current_model, age = ((with_assumed_covariance(self.model, self._assumptions), 0.0)
+        self.current_model, age = ((_with_assumed_covariance(self.model, self._assumptions), 0.0)
                                    if is_fresh else self._propagated_model(now))
         self.covariance: Array = block_diag(self._assumptions.bias_temperature_coefficient ** 2,
                                             uncertainty_covariance(self.current_model))
@@ -209,7 +209,7 @@ class HeadingEstimator:
 
     def _propagated_model(self, now: float) -> tuple[GyroModel, float | None]:
         """Return the model to compensate with, and the age of its self-calibration, s, or None."""
-        model = with_assumed_covariance(self.model, self._assumptions)
+        model = _with_assumed_covariance(self.model, self._assumptions)
         calibration = model.self_calibration
         if calibration is None:
             here = self._known_temperature

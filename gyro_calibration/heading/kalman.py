@@ -33,7 +33,7 @@ import numpy as np
 from scipy.linalg import pinvh
 
 #: Indices of heading, random walk and first flicker component in the state.
-HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = 0, 1, 2
+HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = range(3)
 
 
 #: Possible variances of the rotation in a rest, rad², and their probabilities: it is none.
@@ -82,8 +82,8 @@ class RateIntegral:
 
 
 @dataclass(frozen=True)
-class Transition:
-    """Transition of the state over some time, without the rotation itself."""
+class _Transition:
+    """_Transition of the state over some time, without the rotation itself."""
 
     observation: Array  # of each component in the integral of the compensated rate, shape (n,)
     retention: Array  # decay factor of each component, shape (n,)
@@ -111,7 +111,7 @@ class HeadingState:
         """Return the index of the first value of the calibration in the state."""
         return _FLICKER_INDEX + len(self.noise.flicker_processes()[0])
 
-    def transition(self, rate_integral: RateIntegral) -> Transition:
+    def transition(self, rate_integral: RateIntegral) -> _Transition:
         """Return the transition of the state over an integral of rates."""
         seen, kept, grown = _padded_transition(
             self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved,
@@ -123,7 +123,7 @@ class HeadingState:
         if not rate_integral.is_unobserved:
             grown[HEADING_INDEX, HEADING_INDEX] += (
                 self.noise.angle_random_walk ** 2 * rate_integral.duration)
-        return Transition(seen, kept, grown)
+        return _Transition(seen, kept, grown)
 
     def propagate(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time in motion."""
@@ -334,23 +334,17 @@ def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral]
     """Smooth n + 1 states around n integrals by all later data (Rauch, Tung and Striebel)."""
     later = [states[-1]]
     for state, turn, rest in zip(states[-2::-1], rate_integrals[::-1], resting[::-1]):
-        later.append(_smooth_state(state, turn, rest, later[-1]))
+        if rest:
+            start, after, shared = state.measure_rest(turn)
+        else:
+            start, after = state, state.propagate(turn)
+            shared = state.covariance @ state.transition(turn).matrix.T
+        # the pseudo-inverse of correlations, as variances may be zero and of any size
+        size = np.sqrt(np.diagonal(after.covariance))
+        size = np.where(size > 0.0, size, 1.0)
+        sizes = np.outer(size, size)
+        smoother_gain = shared @ (pinvh(after.covariance / sizes) / sizes)
+        change = smoother_gain @ (later[-1].covariance - after.covariance) @ smoother_gain.T
+        later.append(replace(start, covariance=start.covariance + change,
+                             mean=start.mean + smoother_gain @ (later[-1].mean - after.mean)))
     return later[::-1]
-
-
-def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: bool,
-                  later: HeadingState) -> HeadingState:
-    """Return a state updated by the smoothed state after it."""
-    if is_resting:
-        start, after, shared = state.measure_rest(rate_integral)
-    else:
-        step, start, after = state.transition(rate_integral), state, state.propagate(rate_integral)
-        shared = state.covariance @ step.matrix.T
-    # the pseudo-inverse of correlations, as variances may be zero and of any size
-    size = np.sqrt(np.diagonal(after.covariance))
-    size = np.where(size > 0.0, size, 1.0)
-    sizes = np.outer(size, size)
-    smoother_gain = shared @ (pinvh(after.covariance / sizes) / sizes)
-    change = smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T
-    return replace(start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
-                   covariance=start.covariance + change)

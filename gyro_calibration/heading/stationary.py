@@ -94,7 +94,7 @@ def chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     return float(chdtri(degrees_of_freedom, chance))
 
 
-def chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
+def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
     """Return the values that chi squared exceeds with a probability, shape (k,)."""
     return np.array([chi_squared_quantile(max(round(each), 1), chance)
                      for each in degrees_of_freedom.tolist()])
@@ -234,11 +234,11 @@ class EnergyDetector:
             factors.append(factor)
         variance *= np.square(factors)
         # motion is slower than the samples, so that means over blocks show it far better
-        quiet = (energy * freedom < variance * chi_squared_quantiles(
+        quiet = (energy * freedom < variance * _chi_squared_quantiles(
             freedom, self._false_alarm_chance)) & (
             (end - begin < 3) | (means - total * total / count < variance
-                                 * chi_squared_quantiles(end - begin - 1.0,
-                                                         self._false_alarm_chance)))
+                                 * _chi_squared_quantiles(end - begin - 1.0,
+                                                          self._false_alarm_chance)))
         self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
                              in sums[:5, begin[-1]:].T.tolist())
         self._results.extend(

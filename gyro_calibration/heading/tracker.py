@@ -260,25 +260,22 @@ class HeadingTracker:
             self.refused_count += 1
             return ''
         spike, self._held_jump = self._held_jump, None
-        if self._last_sample is not None and self._is_jump(
-                time - self._last_sample[0], rate - self._last_sample[1]):
+        last = self._last_sample
+        # whether the rate changed by more than a robot can
+        if (last is not None and (step := abs(rate - last[1])) > MAX_RATE_STEP
+                and 0.0 <= time - last[0] <= self._settings.maximum_gap
+                and step > MAX_RATE_STEP + MAX_ACCELERATION * (time - last[0])):
             if spike is None:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
             if not self._may_be_erroneous(spike[0]):
-                self._before_jump = self._last_sample[:2]
-            elif abs(spike[1] - self._before_jump[1]) < abs(spike[1] - self._last_sample[1]):
+                self._before_jump = last[:2]
+            elif abs(spike[1] - self._before_jump[1]) < abs(spike[1] - last[1]):
                 self._before_jump = -math.inf, 0.0  # the rate is as before
             self._take_sample(*spike)
         elif spike is not None:
             self.outlier_count += 1
         return self._take_sample(time, rate, sensitivity, wheels, still)
-
-    def _is_jump(self, interval: float, step: float) -> bool:
-        """Tell whether the rate changed by more than a robot can in an interval."""
-        return (abs(step) > MAX_RATE_STEP
-                and abs(step) > MAX_RATE_STEP + MAX_ACCELERATION * interval
-                and 0.0 <= interval <= self._settings.maximum_gap)
 
     def _may_be_erroneous(self, time: float) -> bool:
         """Tell whether the rate has jumped so shortly before that it may be erroneous."""
@@ -828,8 +825,14 @@ class HeadingTracker:
         turn = self._rest_integral - snapshot.rate_integral
         if lag <= WINDOW_DURATION:
             snapshot, turn = self._locate_motion_start(snapshot, turn)
-        self._suspected_turn = (self._slow_turn_since(snapshot, turn)
-                                if lag >= MEAN_LAGS[0] else None)
+        self._suspected_turn = None
+        if lag >= MEAN_LAGS[0]:
+            longest = replace(self._zero_integral, duration=MEAN_LAGS[-1])
+            least = (self._sigmas[MEAN_LAGS[-1]] / MEAN_LAGS[-1]
+                     * math.sqrt(snapshot.state.expected_rest_angle(longest)[1]))
+            turn_rate = (turn.angle - snapshot.state.expected_rest_angle(turn)[0]) / turn.duration
+            if abs(turn_rate) < _SLOW_TURN_FACTOR * least:  # it may be a change of the bias
+                self._suspected_turn = SlowTurn(snapshot, turn_rate, turn + self._zero_integral)
         if len(self._snapshots) > 1 and not self._wheels_stand:
             self._rest_scatter.learn(self._snapshots[-1])
         self._state, self.deleted_heading = snapshot.state, snapshot.deleted_heading
@@ -874,15 +877,6 @@ class HeadingTracker:
                                 + self._corrected_angle(self._block_integral))
         self._advance_at_rest(quiet, turn - quiet)
         return self._snapshots[-1], turn - quiet
-
-    def _slow_turn_since(self, snapshot: Snapshot, turn: RateIntegral) -> SlowTurn | None:
-        """Return the detected turn if it is so slow that it may be a change of the bias."""
-        longest = replace(self._zero_integral, duration=MEAN_LAGS[-1])
-        least = (self._sigmas[MEAN_LAGS[-1]]
-                 * math.sqrt(snapshot.state.expected_rest_angle(longest)[1]) / MEAN_LAGS[-1])
-        rate = (turn.angle - snapshot.state.expected_rest_angle(turn)[0]) / turn.duration
-        return (SlowTurn(snapshot, rate, turn + self._zero_integral)
-                if abs(rate) < _SLOW_TURN_FACTOR * least else None)
 
     def _restart_after_gap(self, interval: float, fastest: float, may_have_turned: bool) -> str:
         """Restart after a gap or a backward jump of the stamps; nothing is integrated over it."""

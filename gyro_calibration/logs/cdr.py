@@ -51,7 +51,7 @@ UNMEASURED_COVARIANCE = z_axis_covariance(UNMEASURED_VARIANCE)
 
 #: Largest number of fields, and length of a definition in characters.
 _MAX_FIELDS, _MAX_DEFINITION_LENGTH = 5000, 100_000
-DEFINITION_SEPARATOR = '=' * 80
+_DEFINITION_SEPARATOR = '=' * 80
 _STRUCT_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
                  'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
                  'float32': 'f', 'float64': 'd', 'string': 's'}
@@ -104,7 +104,7 @@ for _kind, _fields in _MESSAGE_FIELDS.items():
     DEFINITIONS[_kind] = f'std_msgs/Header header\n{_fields}\n'
     for _name, _part in reversed(_NESTED_DEFINITIONS.items()):
         if f'{_name} ' in DEFINITIONS[_kind]:
-            DEFINITIONS[_kind] += f'{DEFINITION_SEPARATOR}\nMSG: {_name}\n{_part}\n'
+            DEFINITIONS[_kind] += f'{_DEFINITION_SEPARATOR}\nMSG: {_name}\n{_part}\n'
 
 
 class MessageError(ValueError):
@@ -127,7 +127,7 @@ def parse_layout(definition: str, axis: str = 'z') -> MessageLayout:
     if len(definition) > _MAX_DEFINITION_LENGTH:
         raise MessageError(f'it has more than {_MAX_DEFINITION_LENGTH} characters')
     parts: dict[str, list[re.Match[str]]] = {}
-    for part in f'MSG: /\n{definition}'.split(f'{DEFINITION_SEPARATOR}\n'):
+    for part in f'MSG: /\n{definition}'.split(f'{_DEFINITION_SEPARATOR}\n'):
         name, _, text = part.partition('\n')
         fields = [found for line in text.split('\n')
                   if (found := _FIELD_PATTERN.match(line.partition('#')[0].strip()))]

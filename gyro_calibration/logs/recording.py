@@ -35,13 +35,13 @@ from numpy.typing import NDArray
 
 _Nanoseconds = NDArray[np.int64]
 
-REFERENCE_TYPES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
+_REFERENCE_TYPES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
 #: Role of a topic -> the option that names it, its possible message types, and the quantities of
 #: which a message of another type must have one.
 _ROLES = {
     'gyro': ('--topic', (cdr.IMU,), {'rate'}),
     'temperature': ('--temperature-topic', (cdr.TEMPERATURE,), {'temperature'}),
-    'reference': ('--reference-topic', REFERENCE_TYPES, {'rate', 'orientation.w'}),
+    'reference': ('--reference-topic', _REFERENCE_TYPES, {'rate', 'orientation.w'}),
 }
 
 #: Largest step back of stamps by messages out of order, s; at a larger one a clock was set.
@@ -196,7 +196,7 @@ class _LogBuilder:
         reference, temperature = None, self._find_temperature(gyro.topic)
         if self._topics.reference is not None:
             reference = self._topic_series(self._find_topic(self._topics.reference, 'reference'))
-        elif possible := self._topics_of_type(set(REFERENCE_TYPES) - {cdr.IMU}):
+        elif possible := self._topics_of_type(set(_REFERENCE_TYPES) - {cdr.IMU}):
             self._notes.append('no reference was asked for; --reference-topic may be '
                                f'{_join_names(possible)}')
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
@@ -233,7 +233,7 @@ class _LogBuilder:
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
         others = self._topics_of_type({
             kind for kind, definition in self._contents.definitions.items()
-            if kind not in REFERENCE_TYPES and 'rate' in cdr.parse_layout(definition).quantities})
+            if kind not in _REFERENCE_TYPES and 'rate' in cdr.parse_layout(definition).quantities})
         remedy = (f'select {_join_names(others, "or")} with --topic' if others
                   else 'record the topic of the gyro')
         raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; {remedy}')
@@ -375,7 +375,7 @@ class _LogBuilder:
             self._notes.append('the rates of the reference are all zero, and were left out')
             rate = None
         found: dict[str, Any] = {
-            name: interpolate_with_gaps(time, at, values)
+            name: _interpolate_with_gaps(time, at, values)
             for name, values in (('reference_heading', heading), ('reference_rate', rate))
             if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
@@ -402,7 +402,7 @@ def _wrapped_headings(series: _TopicSeries) -> Array | None:
     return heading
 
 
-def interpolate_with_gaps(time: Array, known_time: Array, values: Array) -> Array:
+def _interpolate_with_gaps(time: Array, known_time: Array, values: Array) -> Array:
     """Return values at other times; nan in gaps longer than 5 median intervals and 0.1 s."""
     known_time, values = known_time[np.isfinite(values)], values[np.isfinite(values)]
     if len(known_time) < 2:

@@ -27,8 +27,8 @@ from gyro_calibration.model.settings_file import (
     validate)
 import numpy as np
 
-FORMAT = 'gyro_calibration/model'
-VERSION = 1
+_FORMAT = 'gyro_calibration/model'
+_VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
 _NOISE_NAMES = tuple(Noise.__dataclass_fields__)
 _MAX_POLYNOMIAL_ORDER = 20  # highest order of a polynomial
@@ -66,12 +66,12 @@ def parse_model(content: Any, name: str = 'the model') -> GyroModel:
 
 def _parse_content(content: Any) -> GyroModel:
     top = validate('the file', content, None)
-    if top.get('format', FORMAT) != FORMAT:
-        raise InvalidValue('format', top['format'], f'{FORMAT}: this is not a model file')
-    version = top.get('version', VERSION)
-    if not isinstance(version, int) or version > VERSION:
+    if top.get('format', _FORMAT) != _FORMAT:
+        raise InvalidValue('format', top['format'], f'{_FORMAT}: this is not a model file')
+    version = top.get('version', _VERSION)
+    if not isinstance(version, int) or version > _VERSION:
         raise InvalidValue('version', version,
-                           f'at most {VERSION}: install a newer gyro_calibration')
+                           f'at most {_VERSION}: install a newer gyro_calibration')
     if 'effects' not in top:
         raise InvalidValue('effects', None,
                            'the effects with their values, such as {bias: {bias: 0.01}}')
@@ -237,7 +237,7 @@ def format_model(model: GyroModel) -> str:
         run['standard_deviations'] = dict(
             zip(('scale_factor_error', 'bias'), model.self_calibration.standard_deviations))
     content = {
-        'format': FORMAT, 'version': VERSION, 'effects': effects,
+        'format': _FORMAT, 'version': _VERSION, 'effects': effects,
         'covariance': None if model.covariance is None else model.covariance.tolist(),
         'valid': {name: list(values)
                   for name, values in ranges.items() if all(map(math.isfinite, values))},

@@ -30,7 +30,7 @@ from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
 #: Largest motion profile, bytes: twice the size of an hour at 100 Hz.
-MAX_PROFILE_BYTES = 16_000_000
+_MAX_PROFILE_BYTES = 16_000_000
 
 
 class MotionError(InputError):
@@ -156,7 +156,7 @@ def read_motion(path: str | Path) -> Motion:
     Raise `MotionError` for other columns, values that are not finite, times that do not increase.
     """
     try:
-        lines = io.StringIO(read_bytes(path, MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
+        lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
         found = sorted(name for name in _COLUMN_UNITS if name in header)

@@ -27,11 +27,11 @@ import numpy as np
 import yaml
 
 #: Largest file, bytes: twice the size of a model with the covariance of 150 values.
-MAX_SETTINGS_BYTES = 1_000_000
+_MAX_SETTINGS_BYTES = 1_000_000
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
-def read_settings(path: str | Path, max_size: int = MAX_SETTINGS_BYTES) -> Any:
+def read_settings(path: str | Path) -> Any:
     """
     Read a YAML file of names, texts, numbers, true, false, null and lists.
 
@@ -41,7 +41,7 @@ def read_settings(path: str | Path, max_size: int = MAX_SETTINGS_BYTES) -> Any:
     Raise `ValueError` for any other file; its message is part of a sentence.
     """
     try:
-        text = read_bytes(path, max_size).decode('utf-8-sig')
+        text = read_bytes(path, _MAX_SETTINGS_BYTES).decode('utf-8-sig')
         content = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         problem, mark = error, None

@@ -126,9 +126,7 @@ def test_tables_in_several_files_are_one_calibration(run, tmp_path):
     assert code == 0 and answer['sweeps'] == 3 and 'scale_factor_temperature' in answer['effects']
 
 
-def test_of_several_logs_the_one_without_a_reference_is_named(run, tmp_path):
-    table = write(tmp_path / 'table.csv',
-                  Table().measure(GyroModel(SINE), np.random.default_rng(3)))
+def test_of_several_logs_the_one_without_a_reference_is_named(run, table, tmp_path):
     (tmp_path / 'rest.csv').write_text('time_s,gyro_dps\n0,0.1\n1,0.2\n')
     code, _, error = run('fit', table, tmp_path / 'rest.csv')
     assert code == 1 and 'rest.csv: the log has no time or no reference' in error

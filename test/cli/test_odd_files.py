@@ -315,17 +315,15 @@ def refused(path, words, megabytes=60):
 
 PLAIN = (
     'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB')
+VIEW = ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
+        'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n')
 
 
 @pytest.mark.parametrize('messages, more, words', [
     (PLAIN + ' AS (CAST(hex(zeroblob(100000 + id)) AS BLOB)))', '', 'tables of stored columns'),
     (PLAIN + ' AS (CAST(hex(zeroblob(10)) AS BLOB)) STORED)', '', 'tables of stored columns'),
-    ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
-     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n', '',
-     'not a ROS 2 recording'),
-    ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
-     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n',
-     "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE name = "
+    (VIEW, '', 'not a ROS 2 recording'),
+    (VIEW, "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE name = "
      "'messages'", 'cannot be read'),
 ], ids=['generated', 'stored', 'view', 'view called a table'])
 def test_nothing_in_the_schema_of_a_recording_is_computed(messages, more, words, tmp_path):
