@@ -267,8 +267,11 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
     """Search for causes, given the motion that follows where a log follows its reference."""
     def find_settled(fit: RegressionFit, follows: bool) -> tuple[Mask, Unexplained] | None:
         """Return the samples in dwells if the residual is larger between them."""
-        return (_find_settled(logs[0], fit, rate, follows)
-                if len(logs) == 1 and logs[0].reference_rate is not None else None)
+        if len(logs) > 1 or logs[0].reference_rate is None:
+            return None
+        motion = replace(logs[0], reference_rate=fit.problem.replays[0].channels.rate)
+        return (_find_settled(motion, fit, rate, follows)
+                or _find_settled(logs[0], fit, rate, follows))
 
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
@@ -319,8 +322,8 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     Return the samples of a log in dwells if the residual is larger between them; otherwise None.
 
     The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
-    with dynamics that no cause describes. The mean squares of the whitened residual are compared
-    stretch by stretch (Mann and Whitney). Unless the response of the motion is among the causes,
+    with dynamics that no cause describes. The mean squares of the residual, whitened in the second
+    case, are compared stretch by stretch (Mann and Whitney). Unless the response of the motion is among the causes,
     they have to be twice as large between dwells. Dwells of less than half the range of rates,
     such as rests alone, do not show what the motion does.
     """
@@ -333,11 +336,15 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
         return None
     time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
-    white, valid = fit.whitened_series()[0], fit.problem.replays[0].valid
-    at = time[valid][0] + fit.problem.replays[0].point_interval * np.arange(len(white))
-    inside = within[np.clip(np.searchsorted(time, at), 0, len(time) - 1)]
+    replay = fit.problem.replays[0]
+    if follows:  # whitening would spread what is between dwells
+        left, inside = fit.unbiased_residuals[0][replay.valid], within[replay.valid]
+    else:
+        left = fit.whitened_series()[0]
+        at = time[replay.valid][0] + replay.point_interval * np.arange(len(left))
+        inside = within[np.clip(np.searchsorted(time, at), 0, len(time) - 1)]
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
-    squares = np.add.reduceat(white ** 2, begin) / np.diff(np.append(begin, len(white)))
+    squares = np.add.reduceat(left ** 2, begin) / np.diff(np.append(begin, len(left)))
     steady, between = squares[inside[begin]], squares[~inside[begin]]
     if (min(len(steady), len(between)) < MIN_STRETCHES
             or not follows and np.median(between) < 2.0 * np.median(steady)):
@@ -345,9 +352,9 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     chance = float(mannwhitneyu(between, steady, alternative='greater').pvalue)
     if chance > (1.0 if follows else VALUE_ALARM_SHARE) * false_alarm_rate:
         return None
-    excess = white[~inside] ** 2 - np.median(steady)
+    excess = left[~inside] ** 2 - np.median(steady)
     return within, Unexplained(
-        'rate_change', float(max(excess.sum(), 0.0) / (white @ white)), chance)
+        'rate_change', float(max(excess.sum(), 0.0) / (left @ left)), chance)
 
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:

@@ -36,6 +36,7 @@ from gyro_calibration.diagnosis.replay import (
     cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 import numpy as np
+from scipy.optimize import minimize
 from scipy.stats import norm
 
 #: Causes that cannot be told from the dynamics of a motion, which may also vibrate.
@@ -53,6 +54,10 @@ _LAGS_OF_GYRO, _LATE_LEVEL = 4, 0.05
 #: Numbers of time constants and sizes of the prior of a response that are tried; and least
 #: variance of a response by its prior, over that by the noise.
 _TIME_CONSTANTS, _PRIOR_SIZES, _MIN_RATIO = 16, 65, 0.01
+#: Limits of acceleration that are tried at first, rad/s², and share to which they are found;
+#: number of samples; number of lags of the response to the limited command, and the longest, s.
+_FIRST_LIMITS, _LIMIT_STEP, _LIMITED_SAMPLES = 0.25 * 2.0 ** np.arange(7), 0.005, 16384
+_LIMITED_LAGS, _LIMITED_LAG = 24, 2.0
 
 
 @dataclass(frozen=True)
@@ -115,13 +120,21 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
     longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]
     kernels = kernels[longest < _MAX_LAG_SHARE * replay.duration]
+    plain = replace(replay, command=replay.channels.rate)
+    grid, command = plain.held_command
+    limited = plain.with_command(limit_acceleration(
+        command, plain.interval, _likely_limits(plain))[grid])
     # at first the motion follows commands from before the log
-    moved = late = drop_samples(
-        replace(replay, command=replay.channels.rate),
-        replay.channels.time < replay.channels.time[0] + longest[len(kernels) - 1])
-    rate, *seen = [cosine_transform(late.resample(each)) for each in (
-        replay.channels.rate, *late.delayed_commands(kernels),
-        replay.channels.output - replay.reference)]
+    begin = plain.channels.time[0] + longest[len(kernels) - 1]
+    tried = [(each, _response_transforms(each, kernels)) for each in (
+        drop_samples(each, plain.channels.time < begin) for each in (plain, limited))]
+    criteria = [_fit_response(transforms, 1, kernels @ lags).criterion for _, transforms in tried]
+    # Two limits have to be worth their number (Schwarz), by as many independent errors as there
+    # are changes of the command: most errors are after these, and by their time between samples.
+    share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
+    moved, (rate, *seen) = tried[int(
+        share * (criteria[0] - criteria[1]) > 2.0 * math.log(len(command)))]
+    late = moved
     others: list[Array] = []
     for _ in range(2):
         own = [rate, *(cosine_transform(late.resample(each)) for each in others)]
@@ -130,9 +143,9 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
         response = fitted.values @ kernels
         change = next(late.delayed_commands(response[None]))
         # effects along this motion would otherwise pass for a longer response
-        moved = replace(late.with_rate(replay.channels.rate + change),
+        moved = replace(late.with_rate(late.channels.rate + change),
                         responses=fitted.independent @ kernels,
-                        reference=replay.reference + change,
+                        reference=late.reference + change,
                         response_noise=moved.response_noise)
         others = [column for name in _MOTION_EFFECTS
                   for column in effect_candidate(name).columns(moved)]
@@ -142,6 +155,69 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
         float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's')
 
 
+def _response_transforms(replay: Replay, kernels: Array) -> Array:
+    """Return those of command, delayed commands, and residual, shape (k + 2, points - 1)."""
+    return np.array([cosine_transform(replay.resample(each)) for each in (
+        replay.channels.rate, *replay.delayed_commands(kernels),
+        replay.channels.output - replay.reference)])
+
+
+def limit_acceleration(command: Array, interval: float, limits: Sequence[float]) -> Array:
+    """
+    Return a rate that follows a command as fast as two limits allow, rad/s, shape (n,).
+
+    The limits, rad/s², are of a rate that grows, and of one that falls towards 0.
+    """
+    changes = np.flatnonzero(np.diff(command)) + 1
+    now = float(command[0])
+    times, rates = [0.0], [now]
+    for at, end, wanted in zip(changes.tolist(), [*changes[1:].tolist(), len(command)],
+                               command[changes].tolist()):
+        times.append(at)
+        rates.append(now)
+        for target, limit in ((sorted([0.0, now, wanted])[1], limits[1]), (wanted, limits[0])):
+            steps = abs(target - now) / (limit * interval)
+            done = min(steps, end - at)
+            now += done / steps * (target - now) if steps else 0.0
+            at += done
+            times.append(at)
+            rates.append(now)
+    return np.interp(np.arange(len(command)), times, rates)
+
+
+def _likely_limits(replay: Replay) -> Array:
+    """
+    Return the likeliest limits of acceleration of a motion that follows its command, rad/s².
+
+    They are fitted with a coarse response, and in the part of the log with the most commands.
+    """
+    grid, command = replay.held_command
+    output = np.interp(np.arange(len(command)), grid[replay.valid],
+                       replay.channels.output[replay.valid])
+    count = min(_LIMITED_SAMPLES, len(command))
+    changes = np.cumsum(np.diff(command, prepend=command[0]) != 0.0)
+    begin = int(np.argmax(changes[count - 1:] - changes[:len(changes) - count + 1]))
+    command, output = (each[begin:begin + count] for each in (command, output))
+    late = np.geomspace(1.0, _LIMITED_LAG / replay.interval, _LIMITED_LAGS)
+    lags = np.unique(np.rint([*-late[late * replay.interval < LEAD], 0.0, *late])).astype(int)
+    count += lags[0] - lags[-1]
+
+    def cost(limits: Array) -> float:
+        # any response that is linear between lags
+        total = np.cumsum(np.cumsum(limit_acceleration(
+            command, replay.interval, np.exp(limits))))
+        delayed = np.array([total[lags[-1] - each:][:count] for each in lags])
+        columns = np.diff(np.diff(delayed, axis=0) / np.diff(lags)[:, None], axis=0)
+        left = np.linalg.qr(np.array([np.ones(columns.shape[1]), *columns,
+                                      output[lags[-1]:][:count]]).T, mode='r')[-1, -1]
+        return 2.0 * count * math.log(abs(float(left)))
+
+    first = min(_FIRST_LIMITS, key=lambda each: cost(np.log([each, each])))
+    best = minimize(cost, np.log([first, first]), method='Nelder-Mead', options={
+        'xatol': _LIMIT_STEP, 'fatol': 1.0})
+    return np.exp(best.x)
+
+
 class _Response(NamedTuple):
     """A response to a command, as the sizes of k delayed commands."""
 
@@ -149,6 +225,7 @@ class _Response(NamedTuple):
     # sizes of independent responses of one deviation of the prior, in units of the noise: (m, k)
     independent: Array
     lag_deviation: float  # standard deviation of the mean delay, s
+    criterion: float  # -2 times the log-likelihood, but for a constant
 
 
 def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
@@ -189,10 +266,10 @@ def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
                 sizes = np.sqrt(ratios) / (1.0 + ratios) * (along.T @ rest)
                 best = criterion, independent, sizes, ratios, within / count
     assert best is not None
-    _, independent, sizes, ratios, variance = best
+    criterion, independent, sizes, ratios, variance = best
     values = sizes @ independent
     scale = np.linalg.lstsq(own, left[:, 0] - delayed @ values, rcond=None)[0][0]
     deviation = math.sqrt(variance * float(np.sum((independent @ lags) ** 2 / (1.0 + ratios))))
     powers, vectors = np.linalg.svd(delayed @ independent.T, full_matrices=False)[1:]
     return _Response(values / (1.0 + scale), (vectors @ independent)[powers ** 2 > _MIN_RATIO],
-                     deviation)
+                     deviation, criterion)

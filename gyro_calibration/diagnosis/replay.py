@@ -263,13 +263,25 @@ class Replay:
     def delayed_commands(self, kernels: Array) -> Iterator[Array]:
         """Give the change of the commanded rate by each response of gain 1, rad/s, shape (n,)."""
         assert self.command is not None
-        time, first = self.channels.time, -_leading_lags(self.interval)
-        grid = np.rint((time - time[0]) / self.interval).astype(int)
-        known = np.searchsorted(grid, np.arange(grid[-1] + 1), 'right') - 1
+        grid, command = self.held_command
+        first = -_leading_lags(self.interval)
         last = first + kernels.shape[1] - 1
-        padded = np.pad(self.command[known], (last, -first), mode='edge')
+        padded = np.pad(command, (last, -first), mode='edge')
         for kernel in kernels:
             yield oaconvolve(padded, kernel, 'valid')[grid] - kernel.sum() * self.command
+
+    @property
+    def held_command(self) -> tuple[NDArray[np.intp], Array]:
+        """Return the places of all samples on an even grid, and the command on the grid."""
+        assert self.command is not None
+        time = self.channels.time
+        grid = np.rint((time - time[0]) / self.interval).astype(int)
+        return grid, self.command[np.searchsorted(grid, np.arange(grid[-1] + 1), 'right') - 1]
+
+    def with_command(self, command: Array) -> Replay:
+        """Return the log with another command, rad/s, shape (n,), as its reference."""
+        return replace(self.with_rate(command), command=command,
+                       reference=self.reference + command - self.channels.rate)
 
     def response_variance(self) -> Array:
         """Return the variance of coefficients that weights the response, shape (points - 1,)."""
