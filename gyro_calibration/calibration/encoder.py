@@ -533,8 +533,12 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
             yield ('the reference is never lost, as odometry, and stands in no rest: its drift in '
                    'motion has the same effect as a bias, which the intervals do not include; '
                    'rest now and then')
-        yield (f'scale factor error and bias have priors of the technology {technology} '
-               '(--technology) with mean zero, which the intervals include')
+        if abs(s) > NORMAL_QUANTILE_975 * TECHNOLOGY_PRIORS[technology][0]:
+            yield ('the scale factor error is beyond what gyros of the technology '
+                   f'{technology} have: check the units, and the size and distance of wheels')
+        else:
+            yield (f'scale factor error and bias have priors of the technology {technology} '
+                   '(--technology) with mean zero, which the intervals include')
         if not fit.reference_adds_up:
             return
     reference_error = -s / (1.0 + s)

@@ -84,6 +84,11 @@ _BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
 #: The random walk of the bias that is possible beside a course, rad/s/√s; and the cosines of a
 #: wander that one part of noise describes.
 _COURSE_RANDOM_WALK_RANGE, WANDER_COSINES = (1e-7, 1e-4), 8
+#: Largest number of corrections of the rate, and error of the scale by a last one.
+_MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
+#: Prior standard deviations of scale factor error and bias, rad/s, where gyro and course disagree
+#: by more than a gyro errs; and probability of that.
+_WIDE_PRIOR, _WIDE_PROBABILITY = (0.3, 10.0 * DEGREE), 1e-3
 #: Prior standard deviation of the smoothing of a course, s².
 _SMOOTHING_DEVIATION = 0.1
 #: Correlations of the errors of a course over a span that are possible.
@@ -608,13 +613,37 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     A scale factor error that is determined by fewer than `MIN_STRETCHES` stretches cannot be
     separated from errors of the reference; its interval is that of the prior. Rests that the
     motion contradicts are left out where no causes are given.
+
+    Wheels of another size, or a wrong unit, may exceed what a gyro errs by. Beside a course, whose
+    errors otherwise take that up, the prior is wide where this is far likelier.
     """
-    given, causes = causes, spans.all_causes(causes)
+    every, prior = spans.all_causes(causes), spans.treatment.prior
+    _, corrected, point_variances = _correct_rate(spans, every)
+    if not (causes or spans.stands.all()):
+        corrected = _drop_contradicted_rests(corrected, every, point_variances)
+    usual = _fit_with_noise(corrected, every, point_variances)
+    if spans.treatment.is_fine:
+        return usual
+    # with the same rests, without which evidences cannot be compared
+    values, corrected, point_variances = _correct_rate(replace(
+        spans, rests=corrected.rests, stands=corrected.stands, treatment=replace(
+            spans.treatment, prior=(*_WIDE_PRIOR, prior[2]))), every)
+    if abs(values[0]) < NORMAL_QUANTILE_975 * prior[0]:
+        return usual
+    wide = _fit_with_noise(corrected, every, point_variances)
+    exceeds = abs(wide.values[0]) - wide.half_width(0) > NORMAL_QUANTILE_975 * prior[0]
+    return (wide if exceeds and wide.fit.log_evidence + math.log(_WIDE_PROBABILITY)
+            > usual.fit.log_evidence else usual)
+
+
+def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Array, Spans, Array]:
+    """Return first values, the spans with the rate corrected by them, and variances of points."""
     free = spans.prior_deviations(causes)
     count = len(spans.time) - 1
     delayed = replace(spans, delay=spans.delay or _find_delay(spans))
     point_variances: Array = np.ones(count + 1)
-    for _ in range(2):
+    scale = 0.0
+    for number in range(_MAX_CORRECTIONS):
         design = design_matrix(delayed, causes)
         if spans.treatment.is_fine:
             values = _robust_least_squares(design, delayed.observed, free)[0]
@@ -627,10 +656,11 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
                        - corrected.correction(causes, len(values)))
             left = corrected.observed - design_matrix(corrected, causes) @ values
             point_variances = _point_variances(left[:count])
-        delayed = corrected
-    if not (given or spans.stands.all()):
-        delayed = _drop_contradicted_rests(delayed, causes, point_variances)
-    return _fit_with_noise(delayed, causes, point_variances)
+        delayed, change, scale = corrected, values[0] - scale, values[0]
+        # the columns are of the rate by the scale before
+        if number and abs(scale * change) < _SCALE_TOLERANCE:
+            break
+    return values, delayed, point_variances
 
 
 def _find_delay(spans: Spans) -> float:

@@ -109,8 +109,12 @@ def test_fit_and_diagnose_give_the_same_values_of_a_recorded_drive(data, name):
         assert delay.deviation == pytest.approx(fit.time_offset_deviation, rel=1e-6)
 
 
-def odometry_that_slips(seed):
-    """Return 4 min beside wheels that lose or gain 3 % of each turn at random, and the turns."""
+def odometry_that_slips(seed, track=1.0):
+    """
+    Return 4 min beside wheels that lose or gain 3 % of each turn at random, and the turns.
+
+    The distance of the wheels is so many times that which the odometry assumes.
+    """
     generator, time = np.random.default_rng(seed), np.arange(0.0, 240.0, 0.02)
     rate, slip, turns, begin = np.zeros(len(time)), np.ones(len(time)), 0, 0.0
     while begin < 240.0:
@@ -122,7 +126,7 @@ def odometry_that_slips(seed):
         begin, turns = begin + length, turns + 1
     drift = 0.2 * DEGREE * 0.02 ** 0.5 * generator.standard_normal(len(time))
     return Log(time=time, output=SCALE * rate + BIAS + 1e-3 * generator.standard_normal(len(time)),
-               reference_heading=np.cumsum(0.02 * slip * rate + drift)), turns
+               reference_heading=track * np.cumsum(0.02 * slip * rate + drift)), turns
 
 
 def test_slip_of_whole_turns_is_in_the_interval_of_the_scale():
@@ -135,6 +139,17 @@ def test_slip_of_whole_turns_is_in_the_interval_of_the_scale():
         assert abs(found.fit.scale_factor_error - SCALE + 1.0) < 3.0 * math.sqrt(variances[-1])
     assert np.mean(variances) > np.mean(least)
     assert 'same effect as a bias' in found.remarks[0] and 'for 360 deg' in found.remarks[-1]
+
+
+@pytest.mark.parametrize('track', [0.8, 1.2, 1.6])
+def test_wheels_at_another_distance_are_no_slip(track):
+    """The scale is far beyond the prior of a gyro, and nothing else explains the turns."""
+    log, _ = odometry_that_slips(3, track)
+    found = calibrate_encoder(log, 'course')
+    deviation = math.sqrt(found.fit.covariance[0, 0])
+    assert abs((1.0 + found.fit.scale_factor_error) * track / SCALE - 1.0) < 3.0 * deviation
+    assert deviation < 0.02
+    assert 'beyond what gyros of the technology mems have' in ' '.join(found.remarks)
 
 
 def test_a_motion_capture_that_loses_its_markers_is_no_course():
