@@ -38,7 +38,7 @@ from gyro_calibration.calibration.self_calibration import self_calibrate, to_mod
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel
@@ -146,7 +146,7 @@ def errors(drive: Drive, fault: Fault, generator: np.random.Generator) -> tuple[
     sensitivity, still = (rate_sensitivity(drive.model, value, value, 25.0)
                           for value in (rate, 0.0))
     found = track(stamps, rate, sensitivity, drive.model.noise,
-                  uncertainty_covariance(drive.model), Settings(), still=still)
+                  uncertainty_covariance(drive.model), TrackerSettings(), still=still)
     looks = np.searchsorted(drive.time[comes], np.arange(LOOK, drive.time[-1] + 0.5 * LOOK,
                                                          LOOK)).clip(max=len(rate) - 1)
     return (found.heading - drive.heading[comes])[looks], found.variance[looks]

@@ -27,7 +27,7 @@ import time
 from typing import Any
 
 from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.fleet.logs import find_logs, fit_slow_effects, LogTask, process_log
 from gyro_calibration.fleet.pooling import (
     DRIVES, Observations, PooledValue, POWER_ONS, SLOPES, UNITS)

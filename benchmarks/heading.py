@@ -47,7 +47,7 @@ from gyro_calibration.calibration.self_calibration import (
     fit_heading, self_calibrate, to_model_record)
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.heading.log_compensation import smooth_track
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
@@ -119,7 +119,8 @@ def _tracked(known: Known, factor: float = 1.0, wheels: bool = False) -> tuple[E
     rate = np.asarray(known.likely.correct(drive.output))
     sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0)
                           for value in (rate, 0.0))
-    tracker = HeadingTracker(noise, uncertainty_covariance(model), Settings(), keeps_steps=True)
+    tracker = HeadingTracker(noise, uncertainty_covariance(model), TrackerSettings(),
+                             keeps_steps=True)
     heading, variance, *_ = tracker.follow(
         drive.time, rate, np.ascontiguousarray(sensitivity.T),
         drive.moving.tolist() if wheels else None, still).T

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import math
 
 from bounds import CONSTANTS, prior, RATIO, told_rests
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise
@@ -179,7 +179,7 @@ def program(one: Gyro, output: np.ndarray, hindsight: bool) -> tuple[np.ndarray,
     rate = np.asarray(model.self_calibration.correct(rest))
     time = np.arange(len(rest)) * one.interval
     found = track(time, rate, rate_sensitivity(model, rest, rate, 25.0), noise,
-                  uncertainty_covariance(model), Settings(), None, hindsight, 0.0,
+                  uncertainty_covariance(model), TrackerSettings(), None, hindsight, 0.0,
                   rate_sensitivity(model, 0.0, 0.0, 25.0))
     return found.heading, found.variance, found.resting
 

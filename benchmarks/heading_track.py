@@ -8,17 +8,19 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Follow a whole log by the tracker alone: what benchmarks and tests of the heading share."""
+"""Follow a whole log, by the tracker or a fit: what benchmarks and tests of the heading share."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.heading.integration import Intervals
+from gyro_calibration.calibration.likelihood import ScaleBiasFit
+from gyro_calibration.heading.integration import integrate, Intervals
 from gyro_calibration.heading.log_compensation import smooth_track
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import Array, Mask
+from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
@@ -37,7 +39,8 @@ class Track:
 
 
 def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
-          settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
+          settings: TrackerSettings, wheels: Sequence[bool | None] | None = None,
+          hindsight: bool = False,
           age: float | None = 0.0, still: Array | None = None) -> Track:
     """
     Return the heading over a whole log, with hindsight smoothed by all later data.
@@ -55,3 +58,16 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
         return live
     later, with_hindsight, rested = smooth_track(tracker, time, rate)
     return replace(live, heading=later, variance=with_hindsight, resting=rested)
+
+
+def follow(fit: ScaleBiasFit, time: Array, output: Array, heading: Array,
+           noise: Noise) -> tuple[Array, Array]:
+    """Return error of the heading and its stated deviation, rad, without the last second."""
+    turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
+    turned = np.interp(time + fit.time_offset, time,
+                       turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
+    known = (quadratic_form(fit.covariance, np.array([heading, time]))
+             / (1.0 + fit.scale_factor_error) ** 2)
+    variance = known + noise.heading_variance(time) + fit.start_heading_deviation ** 2
+    kept = time < time[-1] - 1.0
+    return (turned + fit.start_heading - heading)[kept], np.sqrt(variance)[kept]

@@ -43,9 +43,9 @@ from gyro_calibration.calibration.likelihood import fit_likelihood, ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import fit_heading, self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
-from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.motion import motion_from_headings
 from gyro_calibration.model.presets import MPU6050
+from heading_track import follow
 import numpy as np
 
 FOLLOWED = 300.0
@@ -69,22 +69,10 @@ def fits(time: Array, output: Array, heading: Array, seconds: float) -> list[Sca
         return found
 
 
-def follow(fit: ScaleBiasFit, time: Array, output: Array, heading: Array) -> tuple[Array, Array]:
-    """Return the error of the heading and its stated sigma, rad, without the last second."""
-    turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
-    turned = np.interp(time + fit.time_offset, time,
-                       turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
-    known = quadratic_form(fit.covariance,
-                           np.array([heading, time])) / (1.0 + fit.scale_factor_error) ** 2
-    variance = known + NOISE.heading_variance(time) + fit.start_heading_deviation ** 2
-    kept = time < time[-1] - 1.0
-    return (turned + fit.start_heading - heading)[kept], np.sqrt(variance)[kept]
-
-
 def row(given: tuple[Array, Array, Array], seconds: float) -> list[float]:
     """Return rms errors of three, deg, and of the last the sigma of the bias and share inside."""
     found = fits(*given, seconds)
-    followed = [follow(fit, *given) for fit in found]
+    followed = [follow(fit, *given, NOISE) for fit in found]
     errors = [math.sqrt(np.mean(error ** 2)) / DEGREE for error, _ in followed]
     if len(found) < 3:
         return [*errors, *3 * [math.nan]]

@@ -36,7 +36,7 @@ from types import SimpleNamespace
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import Array, read_log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise
@@ -72,7 +72,7 @@ def headings(time: Array, output: Array) -> tuple[dict[str, Array], Array, float
         known) else UNKNOWN
     model = GyroModel(noise=NOISE, self_calibration=SelfCalibration(
         0.0, bias, ((SCALE ** 2, 0.0), (0.0, deviation ** 2))))
-    follower = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
+    follower = HeadingEstimator(model, BiasTable(model), Assumptions(), TrackerSettings(), NOW)
     follower.use_calibration(model, NOW)
     found = follower.follow(time, output, NOW)
     drive = SimpleNamespace(time=time, gyro=SimpleNamespace(

@@ -38,7 +38,7 @@ import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.diagnosis.findings import Finding
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log, select_rows

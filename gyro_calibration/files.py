@@ -24,6 +24,8 @@ import errno
 import fcntl
 import hashlib
 import io
+import json
+import math
 import os
 from pathlib import Path
 import re
@@ -219,6 +221,18 @@ def format_rows(rows: Iterable[Iterable[Any]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator='\n').writerows(rows)
     return text.getvalue()
+
+
+def format_json(value: Any, indent: int | None = None) -> str:
+    """Return a value as JSON, with null for numbers that are not finite."""
+    def finite(part: Any) -> Any:
+        if isinstance(part, dict):
+            return {name: finite(each) for name, each in part.items()}
+        if isinstance(part, (list, tuple)):
+            return [finite(each) for each in part]
+        return None if isinstance(part, float) and not math.isfinite(part) else part
+
+    return json.dumps(finite(value), indent=indent, allow_nan=False)
 
 
 def keep_aside(path: Path) -> str:

@@ -15,7 +15,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
 import json
-import math
 import os
 from pathlib import Path
 import sys
@@ -26,6 +25,7 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
+from gyro_calibration.files import format_json
 from gyro_calibration_bench.cases import Case, make_logs, part_cases, PARTS, random_source
 from gyro_calibration_bench.hidden import FORMS
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
@@ -137,17 +137,7 @@ def score(given: argparse.Namespace) -> None:
 
 
 def _write(path: Path, schema: str, **content: Any) -> None:
-    path.write_text(json.dumps({'schema': schema, **_finite(content)}, indent=1, allow_nan=False)
-                    + '\n')
-
-
-def _finite(value: Any) -> Any:
-    """Return what JSON can hold: null for what is not finite."""
-    if isinstance(value, dict):
-        return {name: _finite(each) for name, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    path.write_text(format_json({'schema': schema, **content}, indent=1) + '\n')
 
 
 def _read(path: Path, schema: str) -> Any:

@@ -40,7 +40,8 @@ ENCODER_STEP = 2.0 * math.pi / 65536
 #: References with errors, and the effects that are hidden in logs with them in turn.
 IMPERFECT_REFERENCES = {
     f'{kind}_{size:g}': ImperfectReference(kind, size)
-    for kind, sizes in (('rate', (0.1, 0.3, 0.5)), ('capture', (0.02, 0.05, 0.1)),
+    for kind, sizes in (('rate', (0.1, 0.3, 0.5)),
+                        ('capture', (0.0005, 0.002, 0.005, 0.02, 0.05, 0.1)),
                         ('encoder', (0.09, 0.5)), ('course', (1.0, 5.0, 10.0)), ('held', (0.2,)),
                         ('lines', (0.2,)), ('heldrate', (0.2,)), ('linesrate', (0.2,)),
                         ('lost', (10.0,))) for size in sizes}

@@ -77,7 +77,7 @@ def known_model(known: KnownModel) -> Any:
 
 def gyro_calibration(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     from gyro_calibration import read_log
-    from gyro_calibration.diagnosis.pipeline import diagnose
+    from gyro_calibration.diagnosis.log_diagnosis import diagnose
     found = diagnose([read_log(path) for path in logs], np.random.default_rng(0),
                      None if known is None else known_model(known))
     return ([answer_of_finding(each) for each in reported_findings(found.findings)],

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from gyro_calibration.diagnosis.findings import Diagnosis, Finding
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import COLUMNS, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration_bench import scores

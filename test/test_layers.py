@@ -69,6 +69,18 @@ def test_a_module_imports_only_what_is_read_before_it():
         assert unknown and not any(unknown.values()), (module, unknown)
 
 
+def test_modules_classes_and_functions_have_names_of_their_own():
+    """But for the functions of `api` and of the verbs, and `main`."""
+    names = [path.stem for path in FILES if path.stem != '__init__']
+    names += [node.name for path in FILES for node in ast.parse(path.read_text()).body
+              if isinstance(node, ast.ClassDef) and not node.name.startswith('_')]
+    assert len(names) > 200 and not [name for name in names if names.count(name) > 1]
+    names = [node.name for path in FILES if path.parent.name != 'cli' and path.stem != 'api'
+             for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)
+             and not node.name.startswith('_') and node.name != 'main']
+    assert len(names) > 200 and not [name for name in names if names.count(name) > 1]
+
+
 @pytest.mark.parametrize('folder', FOLDERS)
 def test_a_file_of_a_folder_imports_only_what_is_read_before_it(folder):
     dotted = f'gyro_calibration.{folder.replace("/", ".")}'

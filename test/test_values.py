@@ -20,7 +20,7 @@ import os
 
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
@@ -115,7 +115,7 @@ ABSURD = st.one_of(
 def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(absurd):
     model = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (1e-3,)),), noise=NOISE,
                       self_calibration=SelfCalibration(0.0, 0.0, ((1e-8, 0.0), (0.0, 1e-8))))
-    live = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
+    live = HeadingEstimator(model, BiasTable(model), Assumptions(), TrackerSettings(), NOW)
     places = {place: rest for place, *rest in absurd}
     rate = 0.5 * np.sin(np.arange(1500) * INTERVAL) + REST
     for place, output in enumerate((rate + 1e-3 * rate ** 3).tolist()):
@@ -131,7 +131,7 @@ def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(
 
 @pytest.mark.parametrize('place', ['sensitivity', 'mean', 'covariance'])
 def test_a_state_that_is_not_finite_is_reported_and_built_anew_with_the_last_heading(place):
-    tracker = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), Settings())
+    tracker = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), TrackerSettings())
     for index in range(500):
         tracker.add(INTERVAL * index, 0.3, np.array([-0.3, -1.0]))
     heading, variance, said = tracker.heading, tracker.variance, []

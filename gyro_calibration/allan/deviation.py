@@ -29,7 +29,7 @@ from gyro_calibration.logs.log import Array, DataRefused, Mask
 from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
-    ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, NoiseTerm, QUANTIZATION, RATE_RAMP,
+    ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, NoiseTerm, QUANTIZATION_NOISE, RATE_RAMP,
     RATE_RANDOM_WALK)
 import numpy as np
 from scipy.special import chdtri
@@ -209,7 +209,7 @@ _BLOCK_SAMPLES = 8192
 _LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
 #: Indices of quantization and ramp among the terms, and of terms whose second differences are
 #: independent over longer times.
-_QUANTIZATION_INDEX, _RAMP_INDEX = NOISE_TERMS.index(QUANTIZATION), NOISE_TERMS.index(RATE_RAMP)
+_QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
 _SHORT_MEMORY_INDICES = [
     place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
 
@@ -313,7 +313,7 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
     for size, part in zip(sizes.tolist(), _select_terms_by_slope(sizes, variance)):
         count = samples + 1 - 2 * size
         # the covariance of quantization is nonzero at single lags only
-        stride = 1 if part is QUANTIZATION else max(1, size // _LAGS_PER_WINDOW)
+        stride = 1 if part is QUANTIZATION_NOISE else max(1, size // _LAGS_PER_WINDOW)
         lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
         squares = (_lag_covariance(part.angle_covariance, size, size, lags) ** 2 * (count - lags)
                    * stride)
@@ -334,7 +334,7 @@ def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
     parts = [min((ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK),
                  key=lambda part: abs(2.0 * part.slope - slope)) for slope in slopes]
     steep = int(np.argmin(np.append(slopes < -1.5, False)))
-    return [QUANTIZATION] * steep + parts[steep:]
+    return [QUANTIZATION_NOISE] * steep + parts[steep:]
 
 
 # covariance of second differences of the angle, and of Allan variances

@@ -27,7 +27,8 @@ from gyro_calibration.allan.deviation import (
     allan_deviation, AllanChart, chi_squared_bounds, covariance_form)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.stamps import Integers
-from gyro_calibration.model.noise import GaussMarkov, Noise, NOISE_TERMS, NoiseTerm, QUANTIZATION
+from gyro_calibration.model.noise import (
+    GaussMarkov, Noise, NOISE_TERMS, NoiseTerm, QUANTIZATION_NOISE)
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
@@ -74,7 +75,7 @@ class OctaveVariances:
     def from_chart(cls, chart: AllanChart) -> OctaveVariances:
         columns = np.column_stack([*(part.allan_variance(chart.size) for part in NOISE_TERMS),
                                    np.zeros(len(chart.size)),
-                                   -QUANTIZATION.allan_variance(chart.size)])
+                                   -QUANTIZATION_NOISE.allan_variance(chart.size)])
         scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.difference_count)
         forms = (_octave_covariance_forms(chart.samples, tuple(chart.size.tolist()))
                  * np.outer(scarcity, scarcity)[:, :, None, None])

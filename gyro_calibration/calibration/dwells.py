@@ -670,7 +670,7 @@ def _find_rounding(output: Array, dwells: Sequence[Numbers]) -> Array:
                                    np.sqrt(noise_before_rounding(variances))])
 
 
-def rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
+def dwell_rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
     """
     Return the covariance of the means of dwells due to the steps of the output, shape (n, n).
 
@@ -715,7 +715,7 @@ def _independent_rounding(rate: Array, output: Array, rounding: Array) -> Array:
     """
     if not len(rounding):
         return np.zeros(len(rate))
-    return np.sqrt(np.maximum(rounding_covariance(rate, output, rounding), 0.0).sum(axis=1))
+    return np.sqrt(np.maximum(dwell_rounding_covariance(rate, output, rounding), 0.0).sum(axis=1))
 
 
 def _encoder_deviation(heading: Array, step: float, duration: float) -> float:

@@ -47,7 +47,8 @@ from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, is_course, rate_noise_share)
 from gyro_calibration.calibration.run_faults import fit_profile, refuse_unit_error, split_run
-from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, select_effects, Selection
+from gyro_calibration.calibration.selection import (
+    FALSE_ALARM_RATE, select_effects, SelectedEffects)
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION, fit_rate, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
 from gyro_calibration.files import InputError
@@ -570,7 +571,7 @@ HEADING_ALONE = ('a reference heading determines bias and scale_factor_error onl
 
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
-              technology: str | None = None) -> Selection | EncoderCalibration:
+              technology: str | None = None) -> SelectedEffects | EncoderCalibration:
     """
     Calibrate by the dwells of logs, by their paths, or by the heading of a single log.
 
@@ -591,7 +592,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                                  for path, log in logs.items()])
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
-                return (Selection(fit_effects(table, effects), (), ()) if effects
+                return (SelectedEffects(fit_effects(table, effects), (), ()) if effects
                         else select_effects(table, technology))
         except NothingSteady:
             if is_settled:

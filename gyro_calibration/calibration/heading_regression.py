@@ -713,8 +713,8 @@ def _point_variances(left: Array) -> Array:
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # a monotonic drift is equal to its median
-    by_steps = float(np.median(np.abs(np.diff(point, 2)))) / math.sqrt(6.0)
-    size = 1.4826 * max(float(np.median(off)), by_steps) + 1e-9
+    by_steps = robust_deviation(np.diff(point, 2)) / math.sqrt(6.0)
+    size = max(robust_deviation(off), by_steps) + 1e-9
     return np.clip(off / (3.0 * size), 1.0, 10.0) ** 2
 
 

@@ -29,7 +29,7 @@ import math
 from gyro_calibration.calibration.noise_grid import bias_wander_columns, TridiagonalMatrix
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
-from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION
+from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, robust_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
@@ -986,8 +986,8 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     noise, interval = estimate.noise, data.columns[:, 1]
     shared = data.columns[:, 4:] @ estimate.values[4:]
     robust = noise.whiten(robust_residual(data.columns[:, :4], data.gyro_increments - shared, 20))
-    noise_deviation = max(float(np.median(np.abs(robust))) / 0.6745
-                          * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
+    noise_deviation = max(
+        robust_deviation(robust) * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
     edges = np.unique(
         np.linspace(0, len(robust), min(len(robust), _MAX_EDGES) + 1).astype(np.intp))
     steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)

@@ -32,10 +32,12 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD, rounding_covariance, select_dwells)
+    dwell_rounding_covariance, Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD,
+    select_dwells)
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.quality import robust_deviation
 from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -220,7 +222,7 @@ def find_inliers(dwells: Dwells) -> Mask:
             columns = extended
     residual = np.abs(robust_residual(columns, dwells.output - dwells.rate, 20))
     # Such a fit passes through as many dwells as it has columns; these are left out of the median.
-    spread = 1.4826 * float(np.median(np.sort(residual)[columns.shape[1]:]))
+    spread = robust_deviation(np.sort(residual)[columns.shape[1]:])
     limit = OUTLIER_THRESHOLD * np.hypot(spread, np.nan_to_num(dwells.deviation)) + 1e-12
     return (residual <= limit) | (len(dwells) < _MIN_DWELLS)
 
@@ -345,7 +347,7 @@ class Uncertainty:
         if len(dwells.rounding):
             # errors by the steps of the output are known: a small residual does not remove them
             whiten = Whitener(dwells, scatter).whiten
-            sizes_known, directions = np.linalg.eigh(rounding_covariance(
+            sizes_known, directions = np.linalg.eigh(dwell_rounding_covariance(
                 dwells.rate, dwells.output, dwells.rounding))
             known = np.linalg.pinv(whiten(columns / lengths)) @ whiten(
                 directions * np.sqrt(np.maximum(sizes_known, 0.0)))

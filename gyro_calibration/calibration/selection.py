@@ -85,7 +85,7 @@ class ConfoundedPair:
 
 
 @dataclass(frozen=True)
-class Selection:
+class SelectedEffects:
     """A calibration with the effects that the data support, the reasons, and confounded pairs."""
 
     calibration: Calibration
@@ -98,7 +98,7 @@ class Selection:
         return self.calibration.model
 
 
-def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
+def select_effects(dwells: Dwells, technology: str | None = None) -> SelectedEffects:
     """
     Fit the effects that the dwells support, each with its reason.
 
@@ -117,9 +117,9 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     best, confounders = resolve_confounders(
         best, technology, None if technology else SINE_RESPONSE)
     tried = len(STATIC_EFFECTS) - len({*BASIC_EFFECTS} & {*best.effects})
-    return Selection(best, tuple(_explain_choice(best, effect, FALSE_ALARM_RATE / tried,
-                                                 confounders)
-                                 for effect in STATIC_EFFECTS.values()), confounders)
+    choices = (_explain_choice(best, effect, FALSE_ALARM_RATE / tried, confounders)
+               for effect in STATIC_EFFECTS.values())
+    return SelectedEffects(best, tuple(choices), confounders)
 
 
 def _add_slopes(fit: Calibration) -> Calibration:

@@ -32,7 +32,7 @@ from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstim
 from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX_GAP, Threshold
 from gyro_calibration.heading.log_compensation import (
     LogCompensation, no_plausible_row_message, plausible_rows, rows_of, smooth_track)
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
@@ -242,7 +242,7 @@ def _make_estimator(model: GyroModel, log: Log,
                  else log.temperature[np.isfinite(log.temperature)])
         if len(known):
             model = with_self_calibration(model, replace(calibration, temperature=float(known[0])))
-    estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), now,
+    estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), TrackerSettings(), now,
                                  keeps_history)
     if not has_dates and calibration is not None:
         when = datetime.fromtimestamp(now, timezone.utc).isoformat()

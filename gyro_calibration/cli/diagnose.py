@@ -26,9 +26,9 @@ from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.extended_model import merge_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis, OnProgress
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
-from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.rate_table import diagnose_table
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.diagnosis.words import is_model_extended, terminal_lines
 from gyro_calibration.files import InputError, write_atomically
 from gyro_calibration.logs.log import Log

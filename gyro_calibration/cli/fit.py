@@ -27,11 +27,11 @@ from gyro_calibration.calibration.dwells import format_list
 from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration, HEADING_ALONE
 from gyro_calibration.calibration.rate_table import bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
-from gyro_calibration.calibration.selection import Selection, TECHNOLOGY_EFFECTS
+from gyro_calibration.calibration.selection import SelectedEffects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress, wrap_line
+from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
-from gyro_calibration.diagnosis.words import as_sentence, display_unit
+from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
 from gyro_calibration.files import InputError, suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -100,20 +100,20 @@ def run(given: argparse.Namespace) -> Answer:
                 'technology': given.technology}
     model = replace(found.model, gyro={name: value for name, value in identity.items() if value},
                     origin=verb.make_origin(given.log))
-    if given.surface and not isinstance(found, Selection):
+    if given.surface and not isinstance(found, SelectedEffects):
         raise InputError(HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
     if given.picture:
         Fitted(model, found).plot(given.picture)
-    lines, data = (_answer_dwells(given, model, found) if isinstance(found, Selection)
+    lines, data = (_answer_dwells(given, model, found) if isinstance(found, SelectedEffects)
                    else _answer_heading(logs, model, found))
     return Answer(lines, {'out': given.out, **_model_data(model), **data},
                   (given.picture, given.surface, given.out))
 
 
 def _answer_dwells(given: argparse.Namespace, model: GyroModel,
-                   found: Selection) -> tuple[list[str], dict[str, Any]]:
+                   found: SelectedEffects) -> tuple[list[str], dict[str, Any]]:
     fit = found.calibration
     if given.surface:
         plots.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range,
@@ -152,17 +152,17 @@ class Fitted(PrintedResult):
 
     model: GyroModel  # with the fitted effects and their covariance
     #: Effects, dwells and residuals; or the fit of a reference heading.
-    found: Selection | EncoderCalibration = field(repr=False)
+    found: SelectedEffects | EncoderCalibration = field(repr=False)
 
     def __str__(self) -> str:
         return '\n'.join(_dwell_lines(self.model, self.found)
-                         if isinstance(self.found, Selection)
+                         if isinstance(self.found, SelectedEffects)
                          else _heading_lines(self.model, self.found))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the errors before and after the fit."""
         found = self.found
-        if isinstance(found, Selection):
+        if isinstance(found, SelectedEffects):
             return plots.draw_residuals(path, found.calibration)
         motion = found.reference
         return plots.draw_reference(
@@ -187,7 +187,7 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
             'technology': model.gyro.get('technology')}
 
 
-def _dwell_data(selection: Selection) -> dict[str, Any]:
+def _dwell_data(selection: SelectedEffects) -> dict[str, Any]:
     fit = selection.calibration
     table, scatter = fit.dwells, fit.scatter
     return {
@@ -215,7 +215,7 @@ def _dwell_data(selection: Selection) -> dict[str, Any]:
                                        ('temperature', 'degc', table.temperature))}}
 
 
-def _dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
+def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
     fit = selection.calibration
     table, sweeps = fit.dwells, len(np.unique(fit.dwells.sweep))
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
@@ -303,7 +303,7 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
                         'unknown: add dwells.')
 
 
-def _choice_lines(selection: Selection) -> Iterator[str]:
+def _choice_lines(selection: SelectedEffects) -> Iterator[str]:
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
     for choice in selection.choices:

@@ -27,14 +27,15 @@ from typing import Any
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress, wrap_line
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.gates import is_degree_ratio
+from gyro_calibration.diagnosis.words import wrap_line
 from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.fleet.logs import (
     compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models, COMPONENT_LABELS, describe_type, render_report, summarize_types, table_files,
+    build_models, COMPONENT_LABELS, describe_type, render_fleet_page, summarize_types, table_files,
     TypeSummary)
 from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.logs.log import DataRefused
@@ -101,7 +102,7 @@ def run(given: argparse.Namespace) -> Answer:
 def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
                    records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
-               'report.html': render_report(types, records).encode(),
+               'report.html': render_fleet_page(types, records).encode(),
                **table_files(types, records)}
     names = list(content)
     for found in types:

@@ -15,8 +15,6 @@ import ast
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
-import json
-import math
 import os
 from pathlib import Path
 import re
@@ -30,9 +28,9 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 # ruff: noqa: E402
 from gyro_calibration import __version__
 from gyro_calibration.cli.verb import print_message
-from gyro_calibration.diagnosis.causes import add_causes
+from gyro_calibration.diagnosis.causes import register_causes
 from gyro_calibration.files import (
-    describe_error, describe_os_error, InputError, suggest_nearest, to_printable)
+    describe_error, describe_os_error, format_json, InputError, suggest_nearest, to_printable)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np
@@ -51,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _load_effects(path)
         answer = given.run(given)
         text = (None if answer is None else answer.text if not given.json
-                else json.dumps(_replace_non_finite(answer.data), allow_nan=False))
+                else format_json(answer.data))
     except DataRefused as error:
         print_message(error)
         return 1
@@ -80,19 +78,11 @@ def _load_effects(path: str) -> None:
     try:
         spec.loader.exec_module(module)
         add_effects(module.EFFECTS)
-        add_causes(module.EFFECTS)
+        register_causes(module.EFFECTS)
     except Exception as error:
         raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
                          f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'
                          'Effect') from None
-
-
-def _replace_non_finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _replace_non_finite(each) for name, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_replace_non_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _print_text(text: str) -> None:

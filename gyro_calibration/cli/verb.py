@@ -20,7 +20,6 @@ import importlib.util
 import math
 import os
 import sys
-import textwrap
 from threading import Event, Thread
 import time
 from typing import Any
@@ -98,12 +97,6 @@ class Answer:
     def text(self) -> str:
         """Return the lines, and a sentence for each file."""
         return '\n'.join([*self.lines, *(f'Written to {each}.' for each in self.files if each)])
-
-
-def wrap_line(text: str, indent: int = 0) -> str:
-    """Return a text wrapped to lines of at most 120 characters."""
-    return textwrap.fill(text, 120, subsequent_indent=' ' * indent, break_long_words=False,
-                         break_on_hyphens=False)
 
 
 def add_picture_option(parser: argparse.ArgumentParser, what: str,

@@ -19,6 +19,6 @@ spectrum of its noise), `candidates` (columns of causes, and of what has no name
 logs on causes, under every noise), `search` (for causes, and their confirmation), `words` (numbers
 and findings for people), `residuals` (their noise and curves), `extended_model` (and its gain on
 what was held out), `noisy_reference` (where the reference limits what is known), `reference_lag`
-(of a motion that follows its reference), `rate_table` (the diagnosis of a rate table), `pipeline`
-(of a diagnosis, in order), `report` (the page).
+(of a motion that follows its reference), `table_diagnosis` (of a rate table), `log_diagnosis` (of
+logs, in order), `report` (the page).
 """

@@ -112,7 +112,7 @@ CAUSES: dict[str, Cause] = {
        for name, sentence, unit, of, needs, along, separate_by in _OTHER_CAUSES}}
 
 
-def add_causes(effects: Iterable[Effect]) -> None:
+def register_causes(effects: Iterable[Effect]) -> None:
     """Add user-defined effects of the catalogue to the causes that a diagnosis searches for."""
     for effect in effects:
         CAUSES[effect.name] = _cause_of_effect(effect)

@@ -115,7 +115,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     if model is not None:
         cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
     plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior, instants))
-    extended, found = search_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
+    extended, found = select_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
                                     on_progress)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
@@ -546,7 +546,7 @@ def _follows_the_rate(cause: str) -> bool:
             and 'rate' in effect.inputs)
 
 
-def search_causes(fit: SpanFit, false_alarm_rate: float,
+def select_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
     fit_with = cache(lambda *causes: fit_spans(fit.spans, causes))

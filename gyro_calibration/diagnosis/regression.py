@@ -92,24 +92,35 @@ class RegressionProblem:
 
 
 def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
-    """Set up the regression of logs with a grid of noises."""
+    """Set up the regression of logs with a grid of noises, and with the white noise of each."""
     logs, rounding_ratio = tuple(replays), 0.0
-    if any(each.heading_step for each in logs):
-        # the most likely variance of the rounding of a heading, relative to white noise
+    if any(each.heading_noise for each in logs):
+        # the most likely variance of the noise of a heading, relative to white noise
         tried = _assemble_problem(logs, NoiseShape(), [
             NoiseShape(walk, rounding_ratio=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))
             for walk in (0.0, 1e-4, 1e-2)])
         rounding_ratio = tried.noise_shapes[fit_causes(tried, []).best_noise].rounding_ratio
-    return _assemble_problem(
-        logs, NoiseShape(rounding_ratio=rounding_ratio),
-        noise_grid(min(each.point_interval for each in logs),
-                   max(each.duration for each in logs), rounding_ratio))
+    shapes = noise_grid(min(each.point_interval for each in logs),
+                        max(each.duration for each in logs), rounding_ratio)
+    problem = _assemble_problem(logs, NoiseShape(rounding_ratio=rounding_ratio), shapes)
+    if len(logs) == 1:
+        return problem
+    fit = fit_causes(problem, [])
+    # most coefficients are of white noise
+    white = [float(np.median((part * factor) ** 2)) for part, factor in zip(
+        fit.residual_transforms(), fit.whitening_factors())]
+    return _assemble_problem(logs, NoiseShape(rounding_ratio=rounding_ratio), shapes,
+                             (np.array(white) / np.mean(white)).tolist())
 
 
 def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
-                      shapes: Sequence[NoiseShape]) -> RegressionProblem:
+                      shapes: Sequence[NoiseShape], white: Sequence[float] = (),
+                      ) -> RegressionProblem:
+    """Set up the regression; given are the variances of white noise in each log, relative to 1."""
     parts = [(coefficient_angles(each.point_count), each.point_interval) for each in replays]
-    plain = np.concatenate([first.variance(angle, step) / step for angle, step in parts])
+    more = [each - 1.0 for each in white or [1.0] * len(parts)]
+    plain = np.concatenate([(first.variance(angle, step) + own) / step
+                            for (angle, step), own in zip(parts, more)])
     deviation = np.sqrt(plain)
     offsets = np.cumsum([0, *(len(angle) for angle, _ in parts)])
     starts = np.concatenate([band_starts(len(angle)) + offset
@@ -119,10 +130,10 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int))
            for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
     angle = np.concatenate([part for part, _ in parts])
-    step = np.concatenate([np.full(len(part), step) for part, step in parts])
+    step, own = np.repeat([[step for _, step in parts], more], np.diff(offsets), axis=1)
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
-    angle, step, plain = angle[chosen], step[chosen], plain[chosen]
-    sums = [np.add.reduceat(shape.variance(angle, step) / step / plain, first_of)
+    angle, step, own, plain = angle[chosen], step[chosen], own[chosen], plain[chosen]
+    sums = [np.add.reduceat((shape.variance(angle, step) + own) / step / plain, first_of)
             for shape in shapes]
     relative = np.array(sums) / [len(part) for part in few]
     # Each combination of components has the same prior probability, whatever its number of sizes.

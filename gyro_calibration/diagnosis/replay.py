@@ -25,7 +25,6 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 import math
 
-from gyro_calibration.calibration.heading_regression import SPECTRUM_BINS
 from gyro_calibration.diagnosis.gates import (
     heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
     spline_rate)
@@ -39,8 +38,11 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
-from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
+from scipy.linalg import toeplitz
+from scipy.ndimage import binary_opening, maximum_filter1d
 from scipy.signal import oaconvolve
+from scipy.special import ndtri
+from scipy.stats import chi2
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def coefficient_angles(count: int) -> Array:
     return np.arange(1, count) * math.pi / count
 
 
-def band_starts(count: int) -> Array:
+def band_starts(count: int) -> NDArray[np.intp]:
     """Return the first index of each band of coefficients: the lowest 24 alone, then by ratio."""
     edges, ratio = list(range(min(24, count))), 1.12
     while edges and edges[-1] * ratio + 1.0 < count:
@@ -137,14 +139,16 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
-#: Margin of the power of rounding.
-_ROUNDING_POWER_FACTOR = 1.5
+#: Samples in a block of `_without_noise`. The shorter, the less noise is left in a rest next to a
+#: motion; the longer, the slower are the rates that are known.
+_BLOCK_SAMPLES = 16
 #: Samples next to a gap of at least as many whose rate is not used: the error at the end of a
 #: spline is 0.43 times as large from sample to sample. Shorter gaps change the slope by little.
 _GAP_MARGIN_SAMPLES = 6
 #: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
-#: sign are 3 sigma. Largest share of corners.
-_CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
+#: sign are 3 sigma. Share of bends by noise or jitter that pass for corners; 13 samples are left
+#: out at each.
+_CORNER_NOISE_SHARE, _CORNER_CHANCE = 0.1, 1e-3
 
 
 #: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1.
@@ -166,6 +170,8 @@ class Replay:
     fill_noise: Array  # white noise of variance 1 for missing grid points, shape (place[-1] + 1,)
     # quantization step of the heading whose derivative is the reference, rad; 0 without
     heading_step: float
+    # largest likely standard deviation of the white noise of that heading, rad; 0 without
+    heading_noise: float
     available_channels: frozenset[str]  # names of the channels of the log
     # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
@@ -344,7 +350,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     assert log.time is not None and log.output is not None
     time = _even_time(log.time)
     prepared_log = resample_reference(replace(select_reference(log)[0], time=time))
-    reference, smooth = _reference_rates(prepared_log, time, heading_step)
+    is_heading = prepared_log.reference_rate is None and prepared_log.reference_heading is not None
+    reference, smooth = _reference_rates(prepared_log, time)
     kept = usable & np.isfinite(reference) & np.isfinite(log.output)
     if log.reference_rate is None:
         kept &= (~_find_corners(reference, log.output, kept,
@@ -356,6 +363,11 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
                           'turn more slowly, or repair the line, and record again')
     place, interval = grid_indices(time, kept)
     _refuse_gaps(log.time[kept], place)
+    noise = 0.0
+    if is_heading:
+        noise = heading_step / math.sqrt(12.0) or _largest_heading_noise(
+            (log.output - _fit_output(log.output, smooth, kept))[kept], place, interval)
+        smooth = _without_noise(smooth, noise / interval)
     every = max(1, math.ceil((place[-1] + 1) / MAX_POINTS))
     if model is not None and log.temperature is None:  # simulated at the reference temperature
         prepared_log = replace(prepared_log,
@@ -371,10 +383,9 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     has = frozenset(name for name, known in (
         ('temperature', log), ('specific_force', log), ('supply', log),
         ('reference_rate', prepared_log)) if getattr(known, name) is not None)
-    rounded = heading_step if prepared_log.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
-    plain = Replay(channels, reference, kept, place, interval, every, filling, rounded, has,
-                   np.zeros(len(time)),
+    plain = Replay(channels, reference, kept, place, interval, every, filling,
+                   heading_step if is_heading else 0.0, noise, has, np.zeros(len(time)),
                    max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0))
     if model is None:
         return plain
@@ -409,6 +420,13 @@ def _even_time(time: Array) -> Array:
     return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
 
 
+def _fit_output(output: Array, rate: Array, valid: Mask) -> Array:
+    """Return the output by the line along the rate that fits best, rad/s, shape (n,)."""
+    scale, bias = (np.polyfit(rate[valid], output[valid], 1) if np.ptp(rate[valid]) > 0.0
+                   else (1.0, float(output[valid].mean())))
+    return scale * rate + bias
+
+
 def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> Array:
     """
     Return the mean rounding error of the output, rad/s, shape (n,).
@@ -417,9 +435,7 @@ def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> 
     structure along the rate. It is the Fourier series of a sawtooth, smoothed by the noise before
     the rounding (Widrow, Kollar and Liu 1996).
     """
-    scale, bias = (np.polyfit(rate[valid], output[valid], 1) if np.ptp(rate[valid]) > 0.0
-                   else (1.0, float(output[valid].mean())))
-    expected = scale * rate + bias
+    expected = _fit_output(output, rate, valid)
     variance = max(float(np.var((output - expected)[valid])) - step ** 2 / 12.0, 0.0)
     total = np.zeros(len(output))
     for number in range(1, 8):
@@ -429,12 +445,12 @@ def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> 
     return total
 
 
-def _reference_rates(log: Log, time: Array, heading_step: float) -> tuple[Array, Array]:
-    """Return the reference rate for the comparison, and the smoothed one for effects."""
+def _reference_rates(log: Log, time: Array) -> tuple[Array, Array]:
+    """Return the reference rate for the comparison, and the one without gaps for effects."""
     if log.reference_rate is not None:
         return log.reference_rate, _interpolate_gaps(time, log.reference_rate)
     if log.reference_heading is not None:
-        return _heading_rates(time, log.reference_heading, heading_step)
+        return _heading_rates(time, log.reference_heading)
     return np.zeros(len(time)), np.zeros(len(time))
 
 
@@ -481,8 +497,8 @@ def grid_indices(time: Array, valid: Mask) -> tuple[NDArray[np.intp], float]:
     return place - place[0], float((time[valid][-1] - time[valid][0]) / (place[-1] - place[0]))
 
 
-def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Array, Array]:
-    """Return the rate of a heading by splines, nan where lost; and a smooth one without steps."""
+def _heading_rates(time: Array, heading: Array) -> tuple[Array, Array]:
+    """Return the rate of a heading by splines, nan where it is lost; and without gaps."""
     lost = ~np.isfinite(heading)
     rate = spline_rate(time, heading)
     long = binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES))
@@ -493,10 +509,51 @@ def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Ar
     # a spline errs at the ends of a log as it does at a gap
     near = maximum_filter1d(lost, 3) | maximum_filter1d(
         np.pad(long, 1, constant_values=True), 2 * _GAP_MARGIN_SAMPLES + 1)[1:-1]
-    raw = np.where(near, np.nan, rate)
-    if heading_step:
-        rate = _filter_rounding(rate, heading_step, float(np.median(np.diff(time))))
-    return raw, rate
+    return np.where(near, np.nan, rate), rate
+
+
+def _largest_heading_noise(residual: Array, grid_index: NDArray[np.intp],
+                           interval: float) -> float:
+    """
+    Return the largest likely standard deviation of the white noise of a heading, rad.
+
+    It is the upper limit of an interval of 95 % by the likelihood of a residual of its rate,
+    rad/s, with white noise and a random walk of the output.
+    """
+    energy = cosine_transform(_bridge_gaps(residual, grid_index, 1)) ** 2
+    angle, starts = coefficient_angles(len(energy) + 1), band_starts(len(energy))
+    count = np.diff(np.append(starts, len(energy)))
+    energy, walk, heading = (np.add.reduceat(each, starts) / count for each in (
+        energy, NoiseShape(1.0).variance(angle, 1.0) - 1.0, spline_derivative_gain(angle)))
+    ratios, walks = np.append(0.0, np.geomspace(1e-4, 1e4, 100)), np.geomspace(1e-10, 1.0, 21)
+    variance = 1.0 + ratios[:, None, None] * heading + walks[:, None] * walk
+    white = energy / variance @ count / len(angle)
+    cost = len(angle) * np.log(white) + np.log(variance) @ count
+    likely = ratios * np.take_along_axis(white, cost.argmin(1)[:, None], 1)[:, 0]
+    return interval * math.sqrt(likely[cost.min(1) < cost.min() + chi2.isf(0.05, 1)].max())
+
+
+def _without_noise(rate: Array, noise: float) -> Array:
+    """
+    Return the rate of a heading without white noise, where the motion does not exceed it.
+
+    The noise is that of the heading over the interval, rad/s. In the cosine transform of blocks,
+    coefficients that it reaches are 0 (Donoho and Johnstone 1994), in a mean over the places of
+    the blocks. Fast motion remains, and in rests no noise is left, which would pass for a motion
+    that the gyro does not show.
+    """
+    size, count = _BLOCK_SAMPLES, len(rate)
+    gain = spline_derivative_gain(np.arange(8 * size) * math.pi / (8 * size - 1))
+    basis = dct(np.eye(size), norm='ortho', axis=0)
+    variance = np.diag(basis @ toeplitz(idct(gain, type=1)[:size]) @ basis.T)
+    largest = noise * np.sqrt(2.0 * math.log(count) * variance)
+    total = np.zeros(count)
+    for shift in range(0, size, size // 4):
+        padded = np.pad(rate, (shift, -(count + shift) % size), mode='edge')
+        blocks = dct(padded.reshape(-1, size), norm='ortho', axis=1)
+        blocks[np.abs(blocks) < largest] = 0.0
+        total += idct(blocks, norm='ortho', axis=1).ravel()[shift:shift + count]
+    return total / 4.0
 
 
 def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> Mask:
@@ -505,26 +562,14 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
 
     At a corner, a spline through the heading and the trapezoidal integral of the output differ by
     a 72nd of the sixth difference, which passes for a dead zone or a slip. That of a smooth
-    motion is small at any acceleration; where a noisy reference has bends everywhere, none are
-    excluded.
+    motion is small at any acceleration; that of a noisy reference, or of a motion that jitters, is
+    everywhere, and a corner differs from it by more than chance.
     """
     bend = np.abs(np.diff(np.pad(rate, 3, mode='edge'), 6)) / 72.0
     white = white_noise_deviation((output - rate)[valid])
-    sharp = maximum_filter1d(bend > _CORNER_NOISE_SHARE * white + rounding, 7)
+    usual = white_noise_deviation(rate, 6) * math.sqrt(math.comb(12, 6)) / 72.0
+    sharp = maximum_filter1d(bend > max(_CORNER_NOISE_SHARE * white + rounding,
+                                        -float(ndtri(0.5 * _CORNER_CHANCE)) * usual),
+                             2 * _GAP_MARGIN_SAMPLES + 1)
     rounded = rounding > math.sqrt(6.0) * white  # most of what looks white is of the steps
-    return np.zeros_like(sharp) if rounded or sharp[valid].mean() > _MAX_CORNER_SHARE else sharp
-
-
-def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
-    """
-    Return the rate of a heading with its rounding error removed by a Wiener filter.
-
-    Each frequency is weighted by the share of its power above that of the rounding, so that fast
-    motion remains.
-    """
-    coefficients = dct(rate, norm='ortho')
-    rounding = ((step / interval) ** 2 / 12.0
-                * spline_derivative_gain(np.arange(len(rate)) * math.pi / len(rate)))
-    power = uniform_filter1d(coefficients ** 2, SPECTRUM_BINS, mode='nearest')
-    weight = 1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300)
-    return idct(coefficients * np.clip(weight, 0.0, 1.0), norm='ortho')
+    return np.zeros_like(sharp) if rounded else sharp

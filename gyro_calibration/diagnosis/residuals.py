@@ -99,24 +99,27 @@ class BandEnergies:
         usual = self.energy / self.count
         logarithms = np.clip(start if start is not None else np.log(
             (usual[:, None] / self.unit_variances).min(axis=0)), low, high)
-        free = np.flatnonzero(low < high)
+        free, total = np.flatnonzero(low < high), float(self.count.sum())
 
         def cost(some: Array) -> tuple[float, Array]:
             logarithms[free] = some
             variance = self.variance(logarithms)
-            slope = (self.count - self.energy / variance) / variance
-            return (float((self.count * np.log(variance) + self.energy / variance).sum()),
+            slope = (self.count - self.energy / variance) / variance / total
+            # the mean, of which a first step along the slope is not too large
+            return (float((self.count * np.log(variance) + self.energy / variance).sum() / total),
                     (slope @ self.unit_variances[:, free]) * np.exp(some))
 
         if not len(free):
-            return logarithms, cost(logarithms[free])[0]
+            return logarithms, total * cost(logarithms[free])[0]
         begin = logarithms[free]
         shifts = [0.0, *(-3.0 * (free == place) for place in free[1:])]
         best = min((minimize(cost, begin + shift, jac=True, method='L-BFGS-B',
-                             bounds=list(zip(low[free], high[free]))) for shift in shifts),
+                             bounds=list(zip(low[free], high[free])),
+                             options={'ftol': 0.0, 'gtol': 1e-4 / total})
+                    for shift in shifts),
                    key=lambda one: one.fun)
         logarithms[free] = best.x
-        return logarithms, float(best.fun)
+        return logarithms, total * float(best.fun)
 
 
 def fit_noise_parameters(fit: RegressionFit, is_rounding_modelled: bool = False) -> Noise:

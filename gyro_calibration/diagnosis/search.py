@@ -207,8 +207,8 @@ def find_strongest(search: Search, causes: Sequence[Candidate],
         # The screening fits a free size at the first shape; after refinement a cause may explain
         # less than its penalty.
         steps = [(each, score) for each, score in steps if score > fit.log_likelihood]
-        best = next((each for each, score in steps if p_value(
-            each.cause, score - fit.log_likelihood) < search.rate), None)
+        best = next((each for each, score in steps if p_value(each.cause, min(
+            score - fit.log_likelihood, _evidence_alone(fit, each))) < search.rate), None)
     search.step_cache[key] = best, steps
     return best, steps
 
@@ -568,13 +568,29 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
             is_rate_distortion(each.cause) for each in rest):
         without = max(without, fit_causes(
             search.problem, refine_jointly(search, rest)).log_likelihood)
-    return fit.log_likelihood - without - complexity_penalty(causes[cause_index])
+    evidence = fit.log_likelihood - without - complexity_penalty(causes[cause_index])
+    return min(evidence, _evidence_alone(fit_causes(search.problem, rest), causes[cause_index]))
 
 
-def eliminate_backward(search: Search, causes: Causes) -> Causes:
+def _evidence_alone(rest: RegressionFit, event: Candidate) -> float:
+    """
+    Return the evidence for a single event by the noise of its log alone, given other causes.
+
+    The slow noise of a log may be larger than that of the others. Infinite for lasting causes.
+    """
+    if len(rest.problem.replays) == 1 or event.log_index is None or not is_named(event):
+        return math.inf
+    own, left = rest.problem.replays[event.log_index], rest.residuals[event.log_index]
+    alone = fit_causes(build_problem([replace(own, channels=replace(
+        own.channels, output=own.reference + left))]), [])
+    return (likelihood_with(alone, replace(event, log_index=0)) - alone.log_likelihood
+            - complexity_penalty(event))
+
+
+def eliminate_backward(search: Search, causes: Causes, beside: Causes = ()) -> Causes:
     """Remove causes that are not significant given the others, the weakest first."""
     while causes:
-        chances = [p_value(each.cause, evidence_for(search, causes, place))
+        chances = [p_value(each.cause, evidence_for(search, (*causes, *beside), place))
                    for place, each in enumerate(causes)]
         weakest = int(np.argmax(chances))
         if chances[weakest] < search.rate:
@@ -728,7 +744,7 @@ def _size_sigmas(search: Search, causes: Causes) -> list[float]:
 def choose_simplest(search: Search, named: Causes,
                     unnamed: Causes) -> tuple[Causes, list[list[Scored]]]:
     """
-    Replace each cause by its simplest alternative.
+    Replace each cause by its simplest alternative, and remove those that are not significant then.
 
     Return the causes, and for each itself and its alternatives, with deficits in log-likelihood.
     """
@@ -738,7 +754,8 @@ def choose_simplest(search: Search, named: Causes,
         if simplest is not named[place]:
             named = refine_jointly(search, (*named[:place], simplest, *named[place + 1:]))
         sets.append(members)
-    return named, sets
+    kept = eliminate_backward(search, named, unnamed)
+    return (named, sets) if kept is named else choose_simplest(search, kept, unnamed)
 
 
 def _alternatives(search: Search, named: Causes, place: int,

@@ -351,17 +351,18 @@ def noise_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 def terminal_lines(diagnosis: Diagnosis) -> Iterator[str]:
     """Give the diagnosis for a terminal: the finding in two sentences, then a short list."""
-    yield from map(_wrap_line, headline(diagnosis))
+    yield from map(wrap_line, headline(diagnosis))
     for place, found in enumerate(diagnosis.findings, 1):
         mark = f'{place}. '
         yield ''
-        yield _wrap_line(f'{mark}{cause_title(found)}', len(mark))
+        yield wrap_line(f'{mark}{cause_title(found)}', len(mark))
         for text in cause_paragraphs(found, diagnosis):
-            yield _wrap_line(' ' * len(mark) + text, len(mark))
+            yield wrap_line(' ' * len(mark) + text, len(mark))
     for title, texts in lists(diagnosis):
-        yield from ('', f'{title}:', *(_wrap_line(f'- {text}', 2) for text in texts))
+        yield from ('', f'{title}:', *(wrap_line(f'- {text}', 2) for text in texts))
 
 
-def _wrap_line(text: str, indent: int = 0) -> str:
+def wrap_line(text: str, indent: int = 0) -> str:
+    """Return a text wrapped to lines of at most 120 characters."""
     return textwrap.fill(text, 120, subsequent_indent=' ' * indent, break_long_words=False,
                          break_on_hyphens=False)

@@ -40,13 +40,13 @@ from gyro_calibration import __version__
 from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns, fit_noise_grid, heading_noise)
-from gyro_calibration.calibration.selection import Selection
+from gyro_calibration.calibration.selection import SelectedEffects
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.gates import (
     is_at_rest, is_implausible_factor, refuse_mismatch, refuse_unusable)
-from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.rate_table import diagnose_table
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.files import (
     describe_error, InputError, open_regular_file, read_bytes, sha256_digest, to_printable,
     write_atomically)
@@ -476,7 +476,7 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
         raise DataRefused(f'{found.findings[0].evidence}: correct the unit or the sign of the '
                           'column of the gyro')
     fitted = calibrate({'': log}, technology=technology)
-    if isinstance(fitted, Selection):
+    if isinstance(fitted, SelectedEffects):
         return 'dwells', fitted.model, None
     offset = fitted.fit.time_offset, fitted.fit.time_offset_deviation
     return fitted.method, fitted.model, None if math.isnan(offset[0]) else offset

@@ -488,8 +488,8 @@ class Alarm:
         return {'name': self.name, **size, 'chance': self.p_value}
 
 
-def find_outliers(pooled: PooledValue, kind: str, names: Sequence[str],
-                  significance: float) -> list[Alarm]:
+def find_outlying_groups(pooled: PooledValue, kind: str, names: Sequence[str],
+                         significance: float) -> list[Alarm]:
     """Return the outlying units or drives; the significance is the probability of a false one."""
     number = pooled.observed.unit if kind == UNITS else pooled.observed.drive
     groups = np.unique(number[number >= 0]).tolist()

@@ -31,8 +31,8 @@ from gyro_calibration.diagnosis.words import (
     as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
-    Alarm, DRIVES, find_changes, find_outliers, IntegerArray, Interval, Observations, OWN_SHARE,
-    PooledValue, POWER_ONS, SLOPES, UNITS)
+    Alarm, DRIVES, find_changes, find_outlying_groups, IntegerArray, Interval, Observations,
+    OWN_SHARE, PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -43,7 +43,7 @@ from scipy.stats import binom
 
 COMPONENT_LABELS = {UNITS: 'between units', POWER_ONS: 'between power-ons',
                     DRIVES: 'common to a drive'}
-Record = Mapping[str, Any]
+LogRecord = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ValueSummary:
     name: str
     unit: str  # of the value, in SI
     is_slow: bool  # an effect that one log does not distinguish from the wander of the bias
-    records: Sequence[Record]  # of the logs that hold it
+    records: Sequence[LogRecord]  # of the logs that hold it
     components: Mapping[str, Interval]  # standard deviations
     mean: Interval  # of the type
     p_value: float  # of the mean against zero
@@ -91,12 +91,12 @@ class TypeSummary:
     units: Sequence[str]  # names in natural order
     drives: Sequence[str]
     dates: Sequence[str]
-    records: Sequence[Record]  # of the logs
+    records: Sequence[LogRecord]  # of the logs
     values: Mapping[str, ValueSummary]
     significance: float  # probability of a false alarm of each kind and value
 
 
-def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
+def summarize_types(records: Sequence[LogRecord]) -> list[TypeSummary]:
     """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
@@ -122,13 +122,13 @@ def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
     return summaries
 
 
-def _names(records: Sequence[Record], key: str) -> list[str]:
+def _names(records: Sequence[LogRecord], key: str) -> list[str]:
     """Return the names of units, drives or dates; 2 comes before 10."""
     return sorted({str(each[key]) for each in records} - {''},
                   key=lambda text: (len(text) if text.isdigit() else 0, text))
 
 
-def _summarize_value(name: str, slow: bool, records: Sequence[Record],
+def _summarize_value(name: str, slow: bool, records: Sequence[LogRecord],
                      significance: float) -> ValueSummary:
     key = 'slow' if slow else 'values'
     records = [each for each in records if name in each[key]]
@@ -161,8 +161,8 @@ def _summarize_value(name: str, slow: bool, records: Sequence[Record],
         {over: of_units(row, part=part)
          for part, (over, row) in enumerate(zip(columns, slopes), 1)
          if SLOPES[part - 1] in pooled.variance_names},
-        find_outliers(pooled, UNITS, units, significance),
-        find_outliers(pooled, DRIVES, drives, significance),
+        find_outlying_groups(pooled, UNITS, units, significance),
+        find_outlying_groups(pooled, DRIVES, drives, significance),
         find_changes(pooled, day, units, dates, significance))
 
 
@@ -171,7 +171,7 @@ def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
             for name, *parts in zip(names, *vars(found).values())}
 
 
-def _covariates(records: Sequence[Record], unit: IntegerArray) -> dict[str, Array]:
+def _covariates(records: Sequence[LogRecord], unit: IntegerArray) -> dict[str, Array]:
     """Return age, years, and temperature, K, less their means, where they vary within units."""
     days = [date.fromisoformat(each['date']).toordinal() for each in records if each['date']]
     temperatures = [float(each['temperature'])
@@ -374,7 +374,7 @@ _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 're
             'samples', 'duration_s', 'sha256', 'page')
 
 
-def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
+def render_fleet_page(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '

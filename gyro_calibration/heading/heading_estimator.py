@@ -29,7 +29,7 @@ from gyro_calibration.heading.bias_table import (
     AGE_TOLERANCE, BiasTable, OUTLIER_SIGMAS, Prior, REST_DURATION, TemperatureCorrection, YEAR)
 from gyro_calibration.heading.integration import TIME_TOLERANCE
 from gyro_calibration.heading.stationary import BLOCK_DURATION
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MAX_TIME, Number
 from gyro_calibration.model.compensation import (
     compensate, CompensatedSamples, quadratic_form, rate_sensitivity, uncertainty_covariance)
@@ -100,7 +100,7 @@ class HeadingEstimator:
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
-                 settings: Settings, now: float, keep: bool = False):
+                 settings: TrackerSettings, now: float, keep: bool = False):
         """Begin at heading zero, now, s since 1970; `keep` steps for `smooth_track`."""
         self._assumptions, self._settings, self._keeps_steps = assumptions, settings, keep
         self.temperature: float | None = None
@@ -130,7 +130,7 @@ class HeadingEstimator:
         self.is_calibrated_this_run = False
         self._restart(now)
 
-    def configure(self, settings: Settings) -> None:  # noqa: A003
+    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
         """Use other settings of the tracker."""
         self._settings = settings
         self.tracker.configure(settings)

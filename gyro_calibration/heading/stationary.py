@@ -27,7 +27,7 @@ import math
 from gyro_calibration.heading.integration import block_ends, TIME_TOLERANCE
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX, heading_variances, HeadingState, RateIntegral, TrackStep)
-from gyro_calibration.logs.log import Array, Mask, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -109,14 +109,14 @@ class EnergyDetector:
 
     def __init__(self, noise: Noise, false_alarms: float):
         """Begin with an empty window."""
-        # ratio of the noise of the samples to that of the model, by the quietest windows
-        self.noise_factor = 1.0
+        # ratio of the noise of the samples to that of the model, by the quietest windows, and the
+        # largest deviation of a single sample at rest, rad/s
+        self.noise_factor, self.sudden_limit = 1.0, math.inf
         self._blocks = deque[Block]()
         self._ratios = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
-        self._since_last_window, self._interval = 0.0, BLOCK_DURATION
+        self._since_last_window = 0.0
         # of the next blocks: quiet, noise factor, and limit of the samples after it, rad/s
         self._results = deque[tuple[bool | None, float, float]]()
-        self._sudden_limit: float | None = None
         self.configure(noise, false_alarms)
 
     def configure(self, noise: Noise, false_alarms: float) -> None:
@@ -134,7 +134,7 @@ class EnergyDetector:
     def add(self, block: Block) -> bool | None:
         """Add a block; tell whether the window contains only noise; None until it is full."""
         if self._results:
-            quiet, self.noise_factor, self._sudden_limit = self._results.popleft()
+            quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
             return quiet
         blocks = self._blocks
         blocks.append(block)
@@ -155,12 +155,13 @@ class EnergyDetector:
         if (duration < WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
                 or count < _MIN_WINDOW_SAMPLES):
             return None
-        self._interval, self._sudden_limit = duration / count, None
-        model_variance = self._noise.rate_variance(self._interval)
+        model_variance = self._noise.rate_variance(duration / count)
         energy = (squares - total * total / count) / (count - 1)
-        self._update_noise_factor(block.duration, count, energy / model_variance,
-                                  0.5 * differences / count / model_variance)
+        self.noise_factor = self._next_noise_factor(
+            self.noise_factor, block.duration, count, energy / model_variance,
+            0.5 * differences / count / model_variance)
         model_variance *= self.noise_factor ** 2
+        self.sudden_limit = self._sample_limit(duration / count, model_variance)
         if energy >= model_variance * chi_squared_quantile(
                 count - 1, self._false_alarm_chance) / (count - 1):
             return False
@@ -169,30 +170,27 @@ class EnergyDetector:
         return bool(freedom < 2 or means - total * total / count
                     < model_variance * chi_squared_quantile(freedom, self._false_alarm_chance))
 
-    def _update_noise_factor(self, duration: float, count: int, energy: float,
-                             differences: float) -> None:
-        """Update the noise of the samples by the quietest tenth of the windows."""
+    def _next_noise_factor(self, factor: float, duration: float, count: float, energy: float,
+                           differences: float) -> float:
+        """Return the noise of the samples by the quietest tenth of the windows, after a block."""
         # Vibration in a straight drive is not noise; it contributes less to differences of
         # neighbours.
         self._since_last_window += duration
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
-            return
+            return factor
         self._since_last_window = 0.0
         self._ratios.append((energy, differences))
-        if len(self._ratios) >= _MIN_WINDOWS:
-            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
-            quietest *= (count - 1) / chi_squared_quantile(count - 1, 0.9)
-            self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
+        if len(self._ratios) < _MIN_WINDOWS:
+            return factor
+        quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
+        quietest *= (count - 1) / chi_squared_quantile(round(count) - 1, 0.9)
+        return math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
-    @property
-    def sudden_limit(self) -> float:
+    def _sample_limit(self, interval: float, variance: float) -> float:
         """Return the largest deviation of a single sample at rest, rad/s."""
         # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
-        if self._sudden_limit is None:
-            limit = mean_threshold_sigmas(round(self._interval, 9), self._sample_false_alarms)
-            self._sudden_limit = limit * self.noise_factor * math.sqrt(
-                self._noise.rate_variance(self._interval))
-        return self._sudden_limit
+        return (mean_threshold_sigmas(round(interval, 9), self._sample_false_alarms)
+                * math.sqrt(variance))
 
     @property
     def has_results(self) -> bool:
@@ -207,7 +205,7 @@ class EnergyDetector:
     def skip(self, count: int) -> None:
         """Add blocks that were looked at, without their results."""
         for _ in range(count):
-            _, self.noise_factor, self._sudden_limit = self._results.popleft()
+            _, self.noise_factor, self.sudden_limit = self._results.popleft()
 
     def look_ahead(self, blocks: Array) -> None:
         """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
@@ -228,54 +226,25 @@ class EnergyDetector:
         interval, freedom = duration / count, count - 1.0
         energy = (squares - total * total / count) / np.maximum(freedom, 1.0)
         variance = self._noise.rate_variance(1.0) / interval
-        factor = self._noise_factors(
-            blocks[0], freedom, np.array([energy, 0.5 * differences / count]) / variance, full)
-        variance *= factor ** 2
+        factors, factor = [], self.noise_factor
+        for is_full, *values in zip(*(each.tolist() for each in (
+                full, blocks[0], count, energy / variance,
+                0.5 * differences / count / variance))):
+            factor = self._next_noise_factor(factor, *values) if is_full else factor
+            factors.append(factor)
+        variance *= np.square(factors)
         # motion is slower than the samples, so that means over blocks show it far better
         quiet = (energy * freedom < variance * chi_squared_quantiles(
             freedom, self._false_alarm_chance)) & (
             (end - begin < 3) | (means - total * total / count < variance
                                  * chi_squared_quantiles(end - begin - 1.0,
                                                          self._false_alarm_chance)))
-        limits = np.where(full, self._sample_limits(interval, factor), self.sudden_limit)
         self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
                              in sums[:5, begin[-1]:].T.tolist())
-        self._interval = float(interval[-1]) if full[-1] else self._interval
-        self._results.extend((each if known else None, *others) for known, each, *others in zip(
-            full.tolist(), quiet.tolist(), factor.tolist(), limits.tolist()))
-
-    def _noise_factors(self, durations: Array, freedom: Array, ratios: Array,
-                       full: Mask) -> Array:
-        """Return the noise of the samples by the quietest tenth of the windows, shape (k,)."""
-        # Vibration in a straight drive is not noise; it contributes less to differences of
-        # neighbours: the ratios, shape (2, k), are those of energies and of differences.
-        known, kept = np.flatnonzero(full), len(self._ratios)
-        ends = block_ends(durations[known], WINDOW_DURATION, self._since_last_window)
-        self._since_last_window = float(
-            durations[known[ends[-1] if ends else 0:]].sum()
-            + (0.0 if ends else self._since_last_window))
-        last = known[np.array(ends, int) - 1]
-        ratios = np.hstack([np.array(self._ratios).reshape(-1, 2).T, ratios[:, last]])
-        self._ratios.extend(zip(*ratios[:, kept:].tolist()))
-        if not ends:
-            return np.full(len(full), self.noise_factor)
-        windows = np.lib.stride_tricks.sliding_window_view(
-            np.pad(ratios, ((0, 0), (_MAX_WINDOWS - kept, 0)), constant_values=math.inf),
-            _MAX_WINDOWS, axis=1)[:, 1:]
-        number = np.minimum(kept + 1 + np.arange(len(last)), _MAX_WINDOWS)
-        quietest = np.sort(windows)[:, np.arange(len(last)), number // 10].min(axis=0)
-        quietest *= freedom[last] / chi_squared_quantiles(freedom[last], 0.9)
-        found = np.where(number < _MIN_WINDOWS, self.noise_factor,
-                         np.sqrt(np.clip(quietest, 1.0, _MAX_NOISE_FACTOR ** 2)))
-        return np.append(self.noise_factor, found)[
-            np.searchsorted(last, np.arange(len(full)), side='right')]
-
-    def _sample_limits(self, intervals: Array, factor: Array) -> Array:
-        """Return the largest deviation of a single sample at rest, rad/s, shape (k,)."""
-        # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
-        sigmas = [mean_threshold_sigmas(round(each, 9), self._sample_false_alarms)
-                  for each in intervals.tolist()]
-        return np.asarray(sigmas * factor * np.sqrt(self._noise.rate_variance(1.0) / intervals))
+        self._results.extend(
+            (each, factor, self._sample_limit(*sampled)) if known
+            else (None, factor, self.sudden_limit) for known, each, factor, *sampled in zip(
+                full.tolist(), quiet.tolist(), factors, interval.tolist(), variance.tolist()))
 
 
 @dataclass(frozen=True)
@@ -368,7 +337,7 @@ class SlowTurn:
 
 
 #: Time constant with which a pending correction of the heading is applied in motion, s.
-SETTLING_TIME = 1.0
+CORRECTION_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -443,7 +412,7 @@ class EvenSamples:
         self.block_squares = self.block_angles ** 2 / np.maximum(
             self.block_sums[0], MIN_SAMPLE_INTERVAL)
         self.block_ends = np.array(self.block_stops) - 1
-        self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
+        self._pending_retention = 1.0 - self.intervals / CORRECTION_TIME
         self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
 

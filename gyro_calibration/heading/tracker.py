@@ -30,8 +30,8 @@ from gyro_calibration.heading.integration import (
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, STANDSTILL, TrackStep, WALK_INDEX)
 from gyro_calibration.heading.stationary import (
-    Block, BLOCK_DURATION, BLOCK_RATIOS, ENDING_RATES, EnergyDetector, Epoch, EvenSamples,
-    MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SETTLING_TIME, SlowTurn,
+    Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES, EnergyDetector, Epoch,
+    EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SlowTurn,
     Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
 from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
@@ -68,7 +68,7 @@ _MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 1
 
 
 @dataclass(frozen=True)
-class Settings:
+class TrackerSettings:
     """Settings of the heading tracker."""
 
     #: False detections of motion at rest, 1/h; 0 disables the detection of rest, as does an
@@ -87,7 +87,7 @@ class HeadingTracker:
     are outliers, and both count as lost; `rebuild_count` tells how often the state was not finite.
     """
 
-    def __init__(self, noise: Noise, covariance: Array, settings: Settings,
+    def __init__(self, noise: Noise, covariance: Array, settings: TrackerSettings,
                  age: float | None = 0.0, keeps_steps: bool = False,
                  sensitivity_slope: Array | None = None):
         """
@@ -154,7 +154,7 @@ class HeadingTracker:
     def _new_integral(self) -> RateIntegral:
         return RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
 
-    def configure(self, settings: Settings) -> None:  # noqa: A003
+    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
         """Go on with other settings."""
         self._settings = settings
         self._state = self._state.with_added_variance(HEADING_INDEX, self._filtered_turn ** 2)
@@ -637,7 +637,7 @@ class HeadingTracker:
         deleted = half * (rate - filtered + last_rate - last_filtered)
         self.deleted_heading += deleted
         self._filtered_turn += deleted
-        settled = self._pending_correction * duration / SETTLING_TIME
+        settled = self._pending_correction * duration / CORRECTION_TIME
         self._pending_correction -= settled
         self.heading += corrected + settled
 

@@ -167,10 +167,10 @@ FLICKER = NoiseTerm('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 
                     _flicker_covariance)
 RATE_RANDOM_WALK = NoiseTerm('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
                              lambda time: np.abs(time) ** 3 / 12.0)
-QUANTIZATION = NoiseTerm('quantization', 'Q', 'rad', -1.0, 3.0,
-                         lambda time: (np.asarray(time) == 0.0).astype(float))
+QUANTIZATION_NOISE = NoiseTerm('quantization', 'Q', 'rad', -1.0, 3.0,
+                               lambda time: (np.asarray(time) == 0.0).astype(float))
 RATE_RAMP = NoiseTerm('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
-NOISE_TERMS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
+NOISE_TERMS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION_NOISE, RATE_RAMP)
 
 
 def simulate_noise(noise: Noise, count: int, interval: float,

@@ -27,11 +27,11 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
-    PoseWithCovarianceStamped, Quaternion, Twist, TwistStamped, TwistWithCovarianceStamped)
+    PoseWithCovarianceStamped, Twist, TwistStamped, TwistWithCovarianceStamped)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.logs.cdr import (
-    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, UNMEASURED_COVARIANCE,
-    UNMEASURED_VARIANCE, z_axis_covariance)
+    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading,
+    UNMEASURED_COVARIANCE, UNMEASURED_VARIANCE, z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
 from gyro_calibration.ros.inputs import Clock, Velocity
@@ -138,8 +138,9 @@ class CompensationNode(Node):
     # Subscriptions
 
     def _on_odometry(self, message: Odometry) -> None:
-        heading = quaternion_heading(message.pose.pose.orientation)
-        self._pipeline.add_odometry(_stamp_ns(message.header), heading,
+        turned = message.pose.pose.orientation
+        heading = quaternion_heading(turned.x, turned.y, turned.z, turned.w)
+        self._pipeline.add_odometry(_stamp_ns(message.header), float(heading),
                                     _to_velocity(message.twist.twist))
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -489,13 +490,6 @@ def calibration_status(pipeline: Pipeline) -> Report:
 
 def _stamp_ns(header: Any) -> int:
     return header.stamp.sec * NSEC_PER_SEC + header.stamp.nanosec
-
-
-def quaternion_heading(orientation: Quaternion) -> float:
-    """Return the yaw of an orientation, rad; nan if it is not valid."""
-    # A power of a large number would raise OverflowError; a product is inf.
-    return math.atan2(2.0 * (orientation.w * orientation.z + orientation.x * orientation.y),
-                      1.0 - 2.0 * (orientation.y * orientation.y + orientation.z * orientation.z))
 
 
 def _to_velocity(twist: Twist) -> Velocity:

@@ -30,41 +30,42 @@ from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, TRIS
 from gyro_calibration.driver.timestamps import (
     NodeTimeConverter, read_clock_pair, read_steady_clock)
 from gyro_calibration.logs.cdr import NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, z_axis_covariance
-from gyro_calibration.ros.inputs import Parameter
+from gyro_calibration.ros.inputs import NodeParameter
 from gyro_calibration.ros.runner import (
     call_every, declare_parameters, Diagnostics, ERROR, OK, publish_on, Report, run_node, WARN)
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
 
 PARAMETERS = (
-    Parameter('port', '/dev/ttyUSB0',
-              'Serial port of the gyro, or a pattern that finds it under any name: '
-              '/dev/serial/by-id/*A9003XYZ*.'),
-    Parameter('protocol', 'kvh_dsp3000',
-              f'Wire format of the gyro, see wire formats; {AUTO} finds it by listening.'),
-    Parameter('baud', 0,
-              'Speed of the line; 0 is that of the protocol, or found by listening where that is '
-              'auto.', 'bit/s', (0, MAX_BAUD)),
-    Parameter('frame_id', 'gyro', 'Frame of the gyro, whose z is its input axis.'),
-    Parameter('axis', 'z', 'Axis to read of a gyro with three.', choices=('x', 'y', 'z')),
-    Parameter('invert', 'default',
-              'Whether the gyro counts clockwise turns positive; default is that of the protocol.',
-              choices=tuple(TRISTATE)),
-    Parameter('increments', 'default',
-              'Whether the gyro sends angles, not rates; default is that of the protocol.',
-              choices=tuple(TRISTATE)),
-    Parameter('sensitivity', 0.0, 'Rate of one count of the gyro; 0 is that of the protocol.',
-              'rad/s', (0.0, 100.0)),
-    Parameter('sample_rate', 0.0,
-              'Samples a second that the gyro is set to; 0 is that of the protocol.', 'Hz',
-              (0.0, 100000.0)),
-    Parameter('full_scale', 0.0,
-              'Rate beyond which a sample is refused; 0 is that of the protocol.', 'rad/s',
-              (0.0, 1000.0)),
-    Parameter('columns', Settings().columns,
-              'Columns of the protocol csv, in the words of the log format.'),
-    Parameter('samples_per_message', 1, 'The mean of this many samples is one message.', '',
-              (1, 10000)),
+    NodeParameter('port', '/dev/ttyUSB0',
+                  'Serial port of the gyro, or a pattern that finds it under any name: '
+                  '/dev/serial/by-id/*A9003XYZ*.'),
+    NodeParameter('protocol', 'kvh_dsp3000',
+                  f'Wire format of the gyro, see wire formats; {AUTO} finds it by listening.'),
+    NodeParameter('baud', 0,
+                  'Speed of the line; 0 is that of the protocol, or found by listening where '
+                  'that is auto.', 'bit/s', (0, MAX_BAUD)),
+    NodeParameter('frame_id', 'gyro', 'Frame of the gyro, whose z is its input axis.'),
+    NodeParameter('axis', 'z', 'Axis to read of a gyro with three.', choices=('x', 'y', 'z')),
+    NodeParameter('invert', 'default',
+                  'Whether the gyro counts clockwise turns positive; default is that of the '
+                  'protocol.',
+                  choices=tuple(TRISTATE)),
+    NodeParameter('increments', 'default',
+                  'Whether the gyro sends angles, not rates; default is that of the protocol.',
+                  choices=tuple(TRISTATE)),
+    NodeParameter('sensitivity', 0.0, 'Rate of one count of the gyro; 0 is that of the protocol.',
+                  'rad/s', (0.0, 100.0)),
+    NodeParameter('sample_rate', 0.0,
+                  'Samples a second that the gyro is set to; 0 is that of the protocol.', 'Hz',
+                  (0.0, 100000.0)),
+    NodeParameter('full_scale', 0.0,
+                  'Rate beyond which a sample is refused; 0 is that of the protocol.', 'rad/s',
+                  (0.0, 1000.0)),
+    NodeParameter('columns', Settings().columns,
+                  'Columns of the protocol csv, in the words of the log format.'),
+    NodeParameter('samples_per_message', 1, 'The mean of this many samples is one message.', '',
+                  (1, 10000)),
 )
 
 

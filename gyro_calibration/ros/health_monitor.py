@@ -31,7 +31,7 @@ from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_TURN_RATE
+from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_ODOMETRY_TURN_RATE
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
@@ -59,7 +59,6 @@ class RestResult:
     sigmas: float  # of the mean, by the variance of the model; nan where unknown
     is_bias_normal: bool  # within chance
     bias_deviation: float  # standard deviation of the mean by the noise of this stretch, rad/s
-    is_announced: bool
 
 
 class RepeatedOutputDetector:
@@ -99,7 +98,8 @@ class RepeatedOutputDetector:
                     or self._acceleration > MAX_ANGULAR_ACCELERATION):
                 self.unseen_turn = self._find_unseen_turn(math.hypot(step, self._last_step))
             self._last_step = step
-            self._acceleration = (step - MIN_TURN_RATE) / max(changed_after, MIN_SAMPLE_INTERVAL)
+            self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
+                                  / max(changed_after, MIN_SAMPLE_INTERVAL))
             self._value, self._since, self._until, self._count = output, time, time, 0
             self._changes += 1
             return toggles
@@ -107,7 +107,7 @@ class RepeatedOutputDetector:
         lasts = time - self._since
         if toggles or self._count < 20 or lasts < _MIN_REPEAT_DURATION:
             return toggles
-        if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_TURN_RATE
+        if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
@@ -258,32 +258,32 @@ class HealthMonitor:
         if np.ptp(output) > 0.0:
             self._step = min(self._step, quantization_step(output))
         rest = examine_stretch(time, output, rate, self._noise, self._level, self._step,
-                               bias_variance, age, is_announced)
+                               bias_variance, age)
         if rest is not None:
             self.last_rest, self.examined_count = rest, self.examined_count + 1
             self.has_noise_at_rest = (self.has_noise_at_rest
                                       or rest.is_noise_normal and rest.is_bias_normal)
             self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
-            self._set_alarms(rest)
+            self._set_alarms(rest, is_announced)
         return rest
 
-    def _set_alarms(self, rest: RestResult) -> None:
+    def _set_alarms(self, rest: RestResult, is_announced: bool) -> None:
         last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
         # the mean was the same in the last stretches, unlike in turns
         biases = [each.bias for each in last]
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
         if rest.is_noise_normal:
             self.noise_alarm = ''
-        elif rest.is_announced or several and not any(each.is_noise_normal for each in last):
+        elif is_announced or several and not any(each.is_noise_normal for each in last):
             remedy = ('record a log at rest, and run allan or diagnose on it'
                       if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = ('' if rest.is_announced or rest.noise_ratio < 1.0
+            shaken = ('' if is_announced or rest.noise_ratio < 1.0
                       else ', or the robot vibrates')
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
                                 f'model{shaken}: {remedy}')
         if rest.is_bias_normal:
             self.bias_alarm = ''
-        elif (rest.is_announced or abs(rest.bias) < self.standstill_rate
+        elif (is_announced or abs(rest.bias) < self.standstill_rate
               or several and stays and not any(each.is_bias_normal for each in last)):
             self.bias_alarm = (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
                                f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
@@ -291,8 +291,8 @@ class HealthMonitor:
 
 
 def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level: float,
-                    step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0,
-                    is_announced: bool = False) -> RestResult | None:
+                    step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0
+                    ) -> RestResult | None:
     """
     Test a stretch of samples against noise and bias of a model.
 
@@ -342,7 +342,7 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     return RestResult(
         math.sqrt(measured / claimed), not (too_much or too_little), mean, sigmas,
         not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level,
-        math.sqrt(of_noise + noise.mean_change_variance(duration, duration)), is_announced)
+        math.sqrt(of_noise + noise.mean_change_variance(duration, duration)))
 
 
 def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise, age: float,

@@ -32,7 +32,7 @@ _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', fl
 
 
 @dataclass(frozen=True)
-class Parameter:
+class NodeParameter:
     """One parameter of a node; its type is the type of its default."""
 
     name: str  # groups are separated by a dot, as in ``calibration.maximum_bias``
@@ -79,7 +79,7 @@ class Parameter:
         raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
 
 
-def parameter_values(table: Sequence[Parameter],
+def parameter_values(table: Sequence[NodeParameter],
                      given: Mapping[str, object] | None = None) -> SimpleNamespace:
     """Return the values of a table by attribute: checked given values, else defaults."""
     given = given or {}
@@ -195,7 +195,7 @@ COASTING_DURATION = 0.5
 #: rest, 0.011 deg/s at most.
 STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s: 2.9 deg/s, beyond the bias of a gyro.
-MIN_TURN_RATE = 0.05
+MIN_ODOMETRY_TURN_RATE = 0.05
 #: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
 MAX_ANGULAR_ACCELERATION = 3.2
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
@@ -267,7 +267,7 @@ class TurnComparison:
             del self._at_rest[3:-1]
             self._at_rest.append((time, heading))
         # at slower rates the bias of a gyro may be larger
-        if not is_next or abs(rate) <= MIN_TURN_RATE:
+        if not is_next or abs(rate) <= MIN_ODOMETRY_TURN_RATE:
             return
         self._by_wheels += rate * (time - then)
         self._by_gyro += heading - before
@@ -328,7 +328,7 @@ class AlternateTurns:
             is_alike = abs(share - self._share) <= allowed * abs(share)
             self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
             self._share, self._sense = self._share if is_alike else share, total
-        elif self._duration * MIN_TURN_RATE <= 1.0:
+        elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
             return
         self._turned = self._between = self._duration = 0.0
 

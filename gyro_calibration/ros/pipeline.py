@@ -37,7 +37,7 @@ from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions, HeadingEstimator, MAX_SPECIFIC_FORCE, TEMPERATURE_TIMEOUT)
 from gyro_calibration.heading.integration import MAX_GAP, Threshold
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
@@ -46,49 +46,50 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
-    AlternateTurns, Clock, COMMAND, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE, ODOMETRY,
-    Parameter, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
+    AlternateTurns, Clock, COMMAND, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE, NodeParameter,
+    ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
 from gyro_calibration.ros.state_store import StateStore
 
 PARAMETERS = (
-    Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
-    Parameter('calibration_file', '',
-              'Where self-calibrations are kept, and next to it biases at rest; empty for a file '
-              'in ROS_HOME named after the node.'),
-    Parameter('heading_frame', 'odom', 'Fixed frame in which the heading is given.'),
-    Parameter('wheels', 'none', 'What shows the tracker whether the robot moves.',
-              choices=('none', 'odom', 'cmd_vel', 'both')),
-    Parameter('cmd_vel_stamped', False, 'Whether cmd_vel is a TwistStamped.'),
-    Parameter('maximum_gap', MAX_GAP, 'Over a longer gap in the stamps nothing is integrated.',
-              's', (0.01, 60.0)),
-    Parameter('stationary.method', 'rest',
-              'How standstill is found: by the statistics of the rate, by the threshold filter, '
-              'or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),
-    Parameter('stationary.threshold', Threshold.rate,
-              'Threshold filter: a mean rate over 0.2 s below it is zero; 0 switches it off.',
-              'rad/s', (0.0, 0.1), True),
-    Parameter('assumed.bias', Assumptions.bias,
-              'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
-    Parameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
-              'Standard deviation of the scale factor error without a calibration.', '1',
-              (0.0, 1.0)),
-    Parameter('assumed.bias_temperature_coefficient', Assumptions.bias_temperature_coefficient,
-              'Standard deviation of the change of the bias with temperature; 0 for a gyro that '
-              'compensates it.', 'rad/s/K', (0.0, 0.1)),
-    Parameter('calibration.reference', 'profile', 'What calibrate compares the gyro with.',
-              dynamic=True, choices=('profile', 'odometry', 'turns')),
-    Parameter('calibration.profile_file', '',
-              'Motion profile (CSV); empty for the built-in one of 20 s.'),
-    Parameter('calibration.drive', False, 'Drive the motion profile on cmd_vel.', dynamic=True),
-    Parameter('calibration.duration', 20.0, 'Length of a calibration by odometry.', 's',
-              (5.0, 600.0), True),
-    Parameter('calibration.turns', 0,
-              'Whole turns of a calibration by turns, counter-clockwise positive; 0 takes the '
-              'number that the gyro shows.', '', (-100, 100), True),
-    Parameter('calibration.odometry_scale_deviation', 0.01,
-              'Standard deviation of the scale of turns by odometry.', '1', (0.0, 0.5), True),
-    Parameter('calibration.maximum_bias', RunLimits.max_bias,
-              'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
+    NodeParameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
+    NodeParameter('calibration_file', '',
+                  'Where self-calibrations are kept, and next to it biases at rest; empty for a '
+                  'file in ROS_HOME named after the node.'),
+    NodeParameter('heading_frame', 'odom', 'Fixed frame in which the heading is given.'),
+    NodeParameter('wheels', 'none', 'What shows the tracker whether the robot moves.',
+                  choices=('none', 'odom', 'cmd_vel', 'both')),
+    NodeParameter('cmd_vel_stamped', False, 'Whether cmd_vel is a TwistStamped.'),
+    NodeParameter('maximum_gap', MAX_GAP, 'Over a longer gap in the stamps nothing is integrated.',
+                  's', (0.01, 60.0)),
+    NodeParameter('stationary.method', 'rest',
+                  'How standstill is found: by the statistics of the rate, by the threshold '
+                  'filter, or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),
+    NodeParameter('stationary.threshold', Threshold.rate,
+                  'Threshold filter: a mean rate over 0.2 s below it is zero; 0 switches it off.',
+                  'rad/s', (0.0, 0.1), True),
+    NodeParameter('assumed.bias', Assumptions.bias,
+                  'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
+    NodeParameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
+                  'Standard deviation of the scale factor error without a calibration.', '1',
+                  (0.0, 1.0)),
+    NodeParameter('assumed.bias_temperature_coefficient', Assumptions.bias_temperature_coefficient,
+                  'Standard deviation of the change of the bias with temperature; 0 for a gyro '
+                  'that compensates it.', 'rad/s/K', (0.0, 0.1)),
+    NodeParameter('calibration.reference', 'profile', 'What calibrate compares the gyro with.',
+                  dynamic=True, choices=('profile', 'odometry', 'turns')),
+    NodeParameter('calibration.profile_file', '',
+                  'Motion profile (CSV); empty for the built-in one of 20 s.'),
+    NodeParameter('calibration.drive', False, 'Drive the motion profile on cmd_vel.',
+                  dynamic=True),
+    NodeParameter('calibration.duration', 20.0, 'Length of a calibration by odometry.', 's',
+                  (5.0, 600.0), True),
+    NodeParameter('calibration.turns', 0,
+                  'Whole turns of a calibration by turns, counter-clockwise positive; 0 takes the '
+                  'number that the gyro shows.', '', (-100, 100), True),
+    NodeParameter('calibration.odometry_scale_deviation', 0.01,
+                  'Standard deviation of the scale of turns by odometry.', '1', (0.0, 0.5), True),
+    NodeParameter('calibration.maximum_bias', RunLimits.max_bias,
+                  'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
 _MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits for seconds
@@ -125,13 +126,13 @@ class Journal:
     channels: set[str] = field(default_factory=set)  # further ones in the samples
 
 
-def _tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
+def _tracker_settings(values: SimpleNamespace, noise: Noise) -> TrackerSettings:
     """Return the settings of the tracker; with unknown noise the threshold filter is used."""
     rate = 0.0 if values.stationary_method == 'none' else values.stationary_threshold
     threshold = Threshold(rate, angle_random_walk=noise.angle_random_walk)
     # rests that are taken for motion, 1/h of rest
     alarms = 0.1 if values.stationary_method == 'rest' else 0.0
-    return Settings(alarms, threshold, values.maximum_gap)
+    return TrackerSettings(alarms, threshold, values.maximum_gap)
 
 
 class Pipeline:
@@ -331,18 +332,7 @@ class Pipeline:
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')
             return None
-        if stamp < self._last_stamp:
-            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
-        if frame != self._frame:
-            before, self._frame = self._frame, frame
-            if before is None:
-                self._first_frame = frame
-            else:
-                self._note_jump(now, to_printable(
-                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
-                    'imu/data_raw'))
-        if self.publisher_conflict:
-            self._detect_interleaving(stamp)
+        self._detect_several_gyros(stamp, frame, now)
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
@@ -352,22 +342,8 @@ class Pipeline:
             self._update_host_clock()
             time = self._host_time.convert_sample(time, self._last_time, self._usual_interval,
                                                   silence)
-        if time == self._last_time:
-            counts['repeated_stamps'] += 1
-            first, fastest = self._frozen_stamp or (now, 0.0)
-            self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = (
-                f'the stamp stands still at {time:.3f} s; the sample is not used'
-                if now - first > DRIVE_SAMPLE_TIMEOUT else
-                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
-                'on its arrival; only the first of them is used: stamp when the gyro measures')
+        if self._repeats_stamp(time, output, now):
             return None
-        if self._frozen_stamp is not None:
-            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
-            if now - first > DRIVE_SAMPLE_TIMEOUT:  # add the possible turn meanwhile
-                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
-                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                 'came; turns in this time are not in the heading')
         interval = time - self._last_time
         if 0.0 < interval <= self.values.maximum_gap:
             self._usual_interval = min(interval, self.estimator.tracker.intervals.usual_interval)
@@ -402,6 +378,42 @@ class Pipeline:
             f'the samples on imu/data_raw have the frame {self._frame:.99}, and had '
             f'{self._first_frame:.99}: the calibration may be that of another gyro; restart this '
             'node, and calibrate another gyro')
+
+    def _detect_several_gyros(self, stamp: int, frame: str, now: float) -> None:
+        """Detect stamps that jump back, frames that alternate, and samples that interleave."""
+        if stamp < self._last_stamp:
+            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
+        if frame != self._frame:
+            before, self._frame = self._frame, frame
+            if before is None:
+                self._first_frame = frame
+            else:
+                self._note_jump(now, to_printable(
+                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
+                    'imu/data_raw'))
+        if self.publisher_conflict:
+            self._detect_interleaving(stamp)
+
+    def _repeats_stamp(self, time: float, output: float, now: float) -> bool:
+        """Tell whether a stamp is that of the last sample, and add the turn while it was so."""
+        journal = self.journal
+        if time == self._last_time:
+            journal.counts['repeated_stamps'] += 1
+            first, fastest = self._frozen_stamp or (now, 0.0)
+            self._frozen_stamp = first, max(fastest, abs(output))
+            journal.event = (
+                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                if now - first > DRIVE_SAMPLE_TIMEOUT else
+                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
+                'on its arrival; only the first of them is used: stamp when the gyro measures')
+            return True
+        if self._frozen_stamp is not None:
+            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
+            if now - first > DRIVE_SAMPLE_TIMEOUT:
+                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
+                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
+                                 'came; turns in this time are not in the heading')
+        return False
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""

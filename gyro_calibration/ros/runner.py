@@ -30,7 +30,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gyro_calibration.ros.inputs import Parameter, parameter_values
+from gyro_calibration.ros.inputs import NodeParameter, parameter_values
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 import rclpy
@@ -84,7 +84,7 @@ def subscribe_to(node: Node, kind: type, topic: str,
 
 
 def declare_parameters(
-        node: Node, table: Sequence[Parameter],
+        node: Node, table: Sequence[NodeParameter],
         on_change: Callable[[SimpleNamespace], None] | None = None) -> SimpleNamespace:
     """
     Declare the parameters of a table and return their values as one record.
@@ -128,7 +128,7 @@ def declare_parameters(
     return read_values()
 
 
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+def _descriptor(parameter: NodeParameter) -> ParameterDescriptor:
     unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.description + unit, read_only=not parameter.dynamic,

@@ -16,7 +16,7 @@ import math
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.own_instants import keep_own_instants
 from gyro_calibration.calibration.reference_noise import heading_difference
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 import numpy as np
 import pytest

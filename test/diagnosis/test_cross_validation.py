@@ -12,7 +12,7 @@
 
 from gyro_calibration.diagnosis.extended_model import (
     heading_error_shares, jackknife_change, measure_gain)
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import start_search
 from gyro_calibration.logs.log import Log

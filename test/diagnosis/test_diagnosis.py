@@ -23,7 +23,7 @@ from diagnosed import diagnosis_of, held, judge_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.findings import TIME_LIMIT_REMARK
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.channels import channels_from_log

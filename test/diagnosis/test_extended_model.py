@@ -16,7 +16,7 @@ from diagnosed import log_of
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, merge_self_calibration, unmergeable_causes)
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.words import headline, is_in_extended_model

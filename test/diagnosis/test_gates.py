@@ -16,7 +16,7 @@ import re
 from chance import seeds
 from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, log_from_table, unwrap_heading
 import numpy as np

@@ -15,7 +15,7 @@ from dataclasses import replace
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.gates import is_at_rest, refuse_unusable, select_reference
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, refuse_wrapped, unwrap_heading
 import numpy as np
 import pytest

@@ -18,8 +18,8 @@ from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import (
     CauseTerm, find_drift, fit_spans, lay_out_spans)
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
-from gyro_calibration.diagnosis.noisy_reference import search_causes
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
+from gyro_calibration.diagnosis.noisy_reference import select_causes
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
@@ -255,7 +255,7 @@ def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
         log = Log(time=time, output=rate + 1e-3 * generator.standard_normal(len(time)),
                   reference_heading=heading - size * np.cos(heading)
                   + 1e-3 * generator.standard_normal(len(time)))
-        _, found = search_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
+        _, found = select_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
                                  lambda share, words: None)
         assert named == ('reference_once_per_rev' in {
             each.cause_term.cause for each in found if each.is_established}), size

@@ -10,7 +10,7 @@
 
 
 from attitudes import attitude_log
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DEGREE, Log
 import numpy as np

@@ -17,8 +17,8 @@ import re
 from gyro_calibration.calibration.dwells import join_dwells
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.scatter import rms
-from gyro_calibration.diagnosis import rate_table as diagnosis
-from gyro_calibration.diagnosis.rate_table import diagnose_table
+from gyro_calibration.diagnosis import table_diagnosis as diagnosis
+from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial, STATIC_EFFECTS
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term

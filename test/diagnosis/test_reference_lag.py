@@ -13,7 +13,7 @@
 from chance import seeds
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.reference_noise import rate_noise_share
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DEGREE, Log
 import numpy as np
 import pytest

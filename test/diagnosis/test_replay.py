@@ -11,11 +11,12 @@
 """A log is laid out for the search whatever its reference lost; and what is left of it."""
 
 from dataclasses import replace
+import math
 
 from chance import seeds
 from gyro_calibration.calibration.reference_noise import keep_own_instants
 from gyro_calibration.diagnosis.gates import refuse_unusable
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.residuals import BandEnergies, drop_tone_bands, residual_curves
@@ -23,6 +24,7 @@ from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 LATE = 0.004
 
@@ -140,6 +142,26 @@ def test_the_ends_of_a_fine_encoder_are_no_slips_or_steps(frequency, seed):
     assert {cause.effect for cause in found.findings} == {'reference_quantization'}
 
 
+@pytest.mark.parametrize('dead_zone', [0.0, 0.5])
+@pytest.mark.parametrize('noise', [0.0005, 0.005])
+def test_the_noise_of_a_heading_is_no_dead_zone_and_hides_none(dead_zone, noise):
+    """The rests of a motion have white noise of the heading alone, deg; the zone is in deg/s."""
+    generator = np.random.default_rng(77)
+    time = np.arange(12_000) * 0.05
+    turns = np.repeat(generator.uniform(-0.8, 0.8, 60) * (np.arange(60) % 2), 200)
+    shape = np.hanning(61) / np.hanning(61).sum()
+    rate = np.convolve(turns, shape, 'same')
+    heading = np.cumsum(rate) * 0.05 - 0.025 * (rate + rate[0])
+    output = (np.where(np.abs(rate) < dead_zone * DEGREE, 0.0, 1.005 * rate)
+              + 0.07 * DEGREE * generator.standard_normal(len(time)))
+    log = Log(time=time, output=output, reference_heading=heading + noise * DEGREE
+              * generator.standard_normal(len(time)))
+    found = diagnose([log], np.random.default_rng(0)).findings
+    assert [each.effect for each in found] == ['dead_zone'] * (dead_zone > 0.0)
+    for each in found:
+        assert each.parameters['dead_zone'].estimate == pytest.approx(dead_zone * DEGREE, rel=0.1)
+
+
 @pytest.mark.parametrize('seed', seeds(2))
 def test_single_lost_samples_neither_cost_nor_bias_a_scale_in_a_random_walk(seed):
     """The walk is as large as the white noise after a third of a second."""
@@ -235,3 +257,19 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     assert len(used.energy) == (60 if tone == 1.0 else 59)
     assert np.exp(0.5 * used.fit()[0][0]) == pytest.approx(2.0, rel=0.03)
     assert tone == 1.0 or np.exp(0.5 * bands.fit()[0][0]) > 2.2
+
+
+def test_corners_of_a_motion_that_jitters_are_no_cause():
+    """A rate begins with a corner; in turns it jitters from sample to sample."""
+    generator, interval, fine = np.random.default_rng(2), 0.05, 8
+    step, count = interval / fine, 6000 * fine
+    turns = np.repeat(generator.uniform(-1.0, 1.0, 60), count // 60) * np.tile(
+        np.repeat([0.0, 1.0], count // 60), 30)
+    rate = lfilter([step / 0.3], [1.0, step / 0.3 - 1.0], turns)
+    jitter = lfilter([math.sqrt(2.0 * step / 0.5)], [1.0, step / 0.5 - 1.0],
+                     0.012 * generator.standard_normal(count))
+    rate = rate + jitter * (np.abs(rate) > 0.02)
+    heading = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step))[::fine]
+    log = Log(time=interval * np.arange(6000), reference_heading=heading,
+              output=rate[::fine] + 1e-3 * generator.standard_normal(6000))
+    assert not diagnose([log], generator).findings

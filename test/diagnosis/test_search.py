@@ -16,13 +16,13 @@ import math
 from diagnosed import diagnosis_of, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate, effect_candidate, generic_terms, is_named, propose_candidates)
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, likelihood_without)
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
-    evidence_for, held_out_sigmas, MIN_PREDICTION_SIGMAS, refine_jointly, search_causes,
-    start_search)
+    confirm_causes, evidence_for, held_out_sigmas, MIN_PREDICTION_SIGMAS, p_value, refine_jointly,
+    search_causes, start_search)
 from gyro_calibration.logs.log import Log
 from gyro_calibration_bench.hidden import hide
 import numpy as np
@@ -131,6 +131,29 @@ def test_a_tone_in_each_log_has_a_phase_in_each():
     assert [each.effect for each in findings] == 3 * ['interference_tone']
     assert sorted(each.parameters['phase'].estimate % (2.0 * math.pi)
                   for each in findings) == pytest.approx([0.3, 2.3, 4.3], abs=0.5)
+
+
+@pytest.mark.parametrize('largest', [
+    lambda number, run: NOISE * number * (6.0 if run == 2 else 1.0),
+    lambda number, run: NOISE * number + (run == 2) * 2e-4 * np.cumsum(number)])
+def test_noise_that_is_larger_in_one_of_several_logs_is_no_cause(largest):
+    time = TIME[:4000]
+    for seed in range(3):
+        numbers = np.random.default_rng(seed).standard_normal((3, len(time)))
+        logs = [Log(output=largest(number, run), time=time, moving=np.zeros(len(time)))
+                for run, number in enumerate(numbers)]
+        found = diagnose(logs, np.random.default_rng(0))
+        assert found.verdict == 'adequate'
+
+
+def test_what_is_established_is_significant_given_all_that_is():
+    at = 261.0
+    for size in (7e-5, 1e-4, 1.3e-4, 1.6e-4, 1.9e-4):
+        search = start_search([laid(resting(size * (TIME >= at)))])
+        named = refine_jointly(search, [effect_candidate('bias_step', at, log_index=0)])
+        assert all(p_value(each.cause, evidence_for(search, selected, place)) < search.rate
+                   for selected in [confirm_causes(search, named).named]
+                   for place, each in enumerate(selected))
 
 
 # contradictions

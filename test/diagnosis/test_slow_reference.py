@@ -16,7 +16,7 @@ from chance import seeds
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DEGREE, Log
 import numpy as np
 import pytest

@@ -12,6 +12,7 @@
 
 import csv
 from dataclasses import replace
+from datetime import date, timedelta
 import io
 import json
 import os
@@ -24,14 +25,16 @@ import time
 import fatal_tasks
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
 from gyro_calibration.cli.main import main
-from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.logs import (
     compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
-from gyro_calibration.fleet.pooling import find_changes, find_outliers, Observations, PooledValue
+from gyro_calibration.fleet.pooling import (
+    find_changes, find_outlying_groups, Observations, PooledValue)
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models, count_effects, data, describe_type, render_report, summarize_types, table_files)
+    build_models, count_effects, data, describe_type, render_fleet_page, summarize_types,
+    table_files)
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -53,6 +56,17 @@ def drive(bias, seed):
 
 def run(*arguments):
     return main(['fleet', *map(str, arguments), '--no-diagnosis', '--workers', '1', '--json'])
+
+
+@pytest.fixture
+def pool(tmp_path, capsys):
+    """Return a function that runs the verb and gives its answer, and the reasons by file."""
+    def pool(logs):
+        assert run(logs, '--out', tmp_path / 'out') == 0
+        found = json.loads(capsys.readouterr().out)
+        return found, {os.path.basename(each['log']): each['reason']
+                       for each in found['no_evidence']}
+    return pool
 
 
 # the unit of each log
@@ -157,7 +171,7 @@ def test_workers_end_with_the_program_that_is_killed(tmp_path):
 
 # the verb
 
-def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, capsys):
+def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, pool):
     logs = tmp_path / 'logs'
     for unit, seed in ((1, 0), (2, 1)):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))
@@ -173,10 +187,8 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
     (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n'
                                       + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
-    assert run(logs, '--out', tmp_path / 'out') == 0
-    told = json.loads(capsys.readouterr().out)
-    reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
-    assert told['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
+    found, reasons = pool(logs)
+    assert found['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
     assert 'a_unit2.csv' in reasons.pop('copy.csv')
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
     assert 'gyro_rad_s' in reasons['d_unit1.csv'] and 'in ms' in reasons['d_unit2.csv']
@@ -184,24 +196,22 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
                             'd_unit2.csv'}
     assert not any('\n' in each for each in reasons.values())
     # types are pooled apart
-    assert {each['type']: each['units'] for each in told['types']} == {
+    assert {each['type']: each['units'] for each in found['types']} == {
         '': ['1', '2'], 'FOG': ['3']}
 
 
-def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, capsys):
+def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, pool):
     logs = tmp_path / 'logs'
     for unit in (1, 2, 3):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
     (logs / 'b_unit2.csv').write_bytes((logs / 'a_unit1.csv').read_bytes())
-    assert run(logs, '--out', tmp_path / 'out') == 0
-    found = json.loads(capsys.readouterr().out)
-    reasons = {os.path.basename(each['log']): each['reason'] for each in found['no_evidence']}
+    found, reasons = pool(logs)
     assert set(reasons) == {'a_unit1.csv', 'b_unit2.csv'}
     assert 'of unit 1' in reasons['b_unit2.csv'] and 'of unit 2' in reasons['a_unit1.csv']
     assert found['types'][0]['units'] == ['2', '3']
 
 
-def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, capsys):
+def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, pool):
     """At rest, and on rate tables; deg/s in place of rad/s, and a sign."""
     generator = np.random.default_rng(1)
     rate = np.tile(np.linspace(-1.0, 1.0, 11), 2)
@@ -216,15 +226,13 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, cap
     (tmp_path / 'logs.csv').write_text(
         'log,unit,type\n' + ''.join(f'logs/{kind}_unit{unit}.csv,{unit},{kind}\n'
                                     for kind in ('rest', 'type_2') for unit in range(5)))
-    assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 0
-    told = json.loads(capsys.readouterr().out)
-    reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
+    found, reasons = pool(tmp_path / 'logs.csv')
     assert set(reasons) == {f'{name}.csv'
                             for name in ('rest_unit3', 'type_2_unit0', 'type_2_unit3')}
     assert 'its white noise is 5' in reasons['rest_unit3.csv']
     assert '-1 is -1' in reasons['type_2_unit0.csv']
     assert '180/pi' in reasons['type_2_unit3.csv']
-    assert [each['units'] for each in told['types']] == [list('0124'), list('124')]
+    assert [each['units'] for each in found['types']] == [list('0124'), list('124')]
 
 
 def test_names_may_hold_any_characters(tmp_path):
@@ -313,12 +321,12 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     values = generator.standard_normal((12, 1)) + 0.2 * generator.standard_normal((12, 6))
     date = np.tile(np.arange(6), 12)
     names = [str(number) for number in range(12)]
-    assert find_outliers(PooledValue(crossed(values)), 'units', names, 0.01) == []
+    assert find_outlying_groups(PooledValue(crossed(values)), 'units', names, 0.01) == []
     assert find_changes(PooledValue(crossed(values)), date, names, names, 0.01) == []
     values[3] += 12.0
     values[7, 4:] += 3.0
     pooled = PooledValue(crossed(values))
-    assert [each.name for each in find_outliers(pooled, 'units', names, 0.01)] == ['3']
+    assert [each.name for each in find_outlying_groups(pooled, 'units', names, 0.01)] == ['3']
     (change,) = find_changes(pooled, date, names, names, 0.01)
     assert ((change.name, change.since) == ('7', '4')
             and change.size == pytest.approx(3.0, abs=0.5))
@@ -363,7 +371,7 @@ def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
     assert set(dict(build_models(found))) == {'', *'01234'}
     rows = list(csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines()))
     assert sum(row['unit'] == unit for row in rows) == 1
-    assert unit in render_report([found], [{**each, 'reason': ''} for each in logs])
+    assert unit in render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
 
 
 def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
@@ -381,6 +389,34 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
     told = '; '.join(describe_type(found))
     assert 'hysteresis: established in 20 of 20 logs, of 5 of 5 units: the model' in told
     assert 'reference scale: established in 20 of 20 logs, of 5 of 5 units: the ref' in told
+
+
+def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
+    """Over age all drift alike; the values less those of their units are drawn over the dates."""
+    generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
+    slopes = 1e-4 * (2.0 + generator.standard_normal(8))
+    logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '', 'slow': {},
+             'date': str(date(2026, 1, 1) + timedelta(365.25 * age)), 'temperature': temperature,
+             'values': {'bias': {'value': unit + slope * temperature + 2e-3 * age
+                                 + 1e-4 * generator.standard_normal(), 'deviation': 1e-5,
+                                 'unit': 'rad/s'}}}
+            for unit, slope in enumerate(slopes)
+            for place, (temperature, age) in enumerate(
+                zip(generator.permutation(degc).tolist(), years))]
+    (found,) = summarize_types(logs)
+    shown = data(found)['values']['bias']
+    low, high = shown['between_units_over_temperature']['ci95']
+    assert 0.0 < low < np.std(slopes, ddof=1) < high
+    assert shown['between_units_over_age']['ci95'][0] == 0.0
+    assert shown['slopes']['age']['ci95'][0] < 2e-3 < shown['slopes']['age']['ci95'][1]
+    ends = np.array([shown['units'][str(unit)]['slopes']['temperature']['ci95']
+                     for unit in range(8)])
+    assert np.sum((ends[:, 0] < slopes) & (slopes < ends[:, 1])) >= 6
+    (row, *_) = csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines())
+    assert float(row['temperature_slope_low']) == ends[0, 0]
+    text = render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
+    assert 'bias less that of the unit' in text and f'dates: {", ".join(found.dates)}' in text
+    assert '>drift</th>' in text
 
 
 # models
@@ -434,7 +470,7 @@ def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
             for each in records()]
     left = {'log': 'x/<b>.csv', 'type': '', 'unit': '', 'drive': '', 'date': '',
             'reason': 'holds no gyro'}
-    text = render_report(summarize_types(logs), [*logs, left])
+    text = render_fleet_page(summarize_types(logs), [*logs, left])
     assert all(f'<td data-key="&lt;{unit}&gt;">&lt;{unit}&gt;</td>' in text for unit in range(5))
     assert 'href="logs/a.html"' in text and 'holds no gyro' in text and '<b>' not in text
     assert 'class="sortable"' in text and '1 more logs are excluded' in text

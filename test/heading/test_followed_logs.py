@@ -14,7 +14,7 @@ import math
 
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.effects import BIAS
@@ -80,7 +80,7 @@ def test_whole_blocks_at_once_give_the_heading_of_single_samples(with_wheels):
     sensitivity = rate_sensitivity(model, output, corrected, 25.0).T
     still = rate_sensitivity(model, 0.0, 0.0, 25.0)
     wheels = [bool(each) for each in rate != 0.0] if with_wheels else None
-    single, whole = (HeadingTracker(NOISE, uncertainty_covariance(model), Settings(), 0.0)
+    single, whole = (HeadingTracker(NOISE, uncertainty_covariance(model), TrackerSettings(), 0.0)
                      for _ in range(2))
     expected = by_samples(single, time, corrected, sensitivity, still, wheels)
     found = whole.follow(time, corrected, sensitivity, wheels, still)
@@ -101,7 +101,8 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
     temperature[12500] = 1e9
     time, output, temperature = lossy(time, output, temperature)
     model = GyroModel((Term(BIAS, (0.005,)),), noise=NOISE, self_calibration=calibration)
-    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
+    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), TrackerSettings(),
+                                      NOW)
                      for _ in range(2))
     expected = np.empty((len(time), 6))
     for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
@@ -142,7 +143,7 @@ def test_compensate_and_the_node_give_the_same_heading_while_the_gyro_warms_up(
 @pytest.mark.parametrize('duration', [0.03, 0.2, 1.5, 3.0])
 @pytest.mark.parametrize('detects_rest', [True, False])
 def test_while_a_rate_may_be_erroneous_the_turn_by_it_is_in_the_deviation(duration, detects_rest):
-    tracker = HeadingTracker(NOISE, np.zeros((0, 0)), Settings(0.1 * detects_rest))
+    tracker = HeadingTracker(NOISE, np.zeros((0, 0)), TrackerSettings(0.1 * detects_rest))
     generator, true = np.random.default_rng(6), 0.0
     for index in range(1000):
         time, rate = index * INTERVAL, 0.3 * (index >= 200)
@@ -162,7 +163,7 @@ def test_smooth_ways_without_a_rest_are_within_the_stated_deviation():
         shocks = 0.06 * DEGREE * math.sqrt(1.0 - kept ** 2) * generator.standard_normal(len(time))
         rate = (lfilter([1.0], [1.0, -kept], shocks) * (time > 20.0)
                 + 10.0 * DEGREE * (time % 30.0 > 27.0))
-        found = HeadingTracker(NOISE, np.array([[1e-8]]), Settings(), 0.0).follow(
+        found = HeadingTracker(NOISE, np.array([[1e-8]]), TrackerSettings(), 0.0).follow(
             time, rate + simulate_noise(NOISE, len(time), INTERVAL, generator),
             np.ones((len(time), 1)))
         error = found[:, 0] - np.cumsum(rate) * INTERVAL

@@ -17,11 +17,12 @@ import math
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
-from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.motion import motion_from_headings
 from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.presets import MPU6050
 from gyro_calibration.ros.calibration_session import ODOMETRY
 from gyro_calibration.ros.inputs import Velocity
+from heading_track import follow
 import numpy as np
 import pytest
 from rig import Rig
@@ -29,7 +30,7 @@ from rig import Rig
 FOLLOWED = 300.0
 STARTS = (0.0, 290.0, 580.0, 870.0, 1160.0)
 #: Of the MPU-6050 at rest, with its vibration at 31 Hz.
-NOISE = Noise(0.64 * DEGREE / 60.0)
+NOISE = MPU6050.noise
 #: The gyro is mounted upside down against the encoder in the first two.
 SENSES = {'yaw_slow': -1.0, 'yaw_fast': -1.0, 'pitch_slow': 1.0}
 
@@ -48,18 +49,6 @@ def recording(request, data):
 
 def name_of(path):
     return path.name.partition('.')[0]
-
-
-def follow(fit, time, output, heading):
-    """Return error of the heading and its stated deviation, rad, without the last second."""
-    turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
-    turned = np.interp(time + fit.time_offset, time,
-                       turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
-    known = (quadratic_form(fit.covariance, np.array([heading, time]))
-             / (1.0 + fit.scale_factor_error) ** 2)
-    variance = known + NOISE.heading_variance(time) + fit.start_heading_deviation ** 2
-    kept = time < FOLLOWED - 1.0
-    return (turned + fit.start_heading - heading)[kept], np.sqrt(variance)[kept]
 
 
 def rms(error):
@@ -95,7 +84,7 @@ def test_a_gyro_that_shakes_on_its_mount_is_not_refused_for_being_louder_than_at
 def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(
         recording, seconds):
     name, found = name_of(recording), calibrated(recording, seconds)
-    errors = [(*follow(*run), rms(integrate(run[1], run[2]) - run[3]))
+    errors = [(*follow(*run, NOISE), rms(integrate(run[1], run[2]) - run[3]))
               for run in found if run[0] is not None]
     for error, deviation, raw in errors:
         inside = np.mean(np.abs(error) <= 1.96 * deviation)

@@ -18,7 +18,7 @@ samples, over many drives.
 import math
 
 from gyro_calibration.heading.integration import gap_variances, integrate, Intervals
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -119,7 +119,8 @@ def test_a_vibration_in_a_gap_is_in_the_stated_variance(frequency, many):
         rate, comes = true + simulate_noise(WHITE, len(time), INTERVAL, generator), time > -1.0
         for begin in generator.integers(250, 380, 2):
             comes[begin:begin + 19] = False
-        tracker, inputs = HeadingTracker(WHITE, KNOWN, Settings()), sensitivity_of(rate[comes]).T
+        tracker = HeadingTracker(WHITE, KNOWN, TrackerSettings())
+        inputs = sensitivity_of(rate[comes]).T
         if many:
             tracker.follow(time[comes], rate[comes], inputs)
         else:
@@ -146,7 +147,8 @@ def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
     comes = np.ones(len(time), bool)
     for begin, gap in ((10.0, 0.2), (20.0, 0.45), (30.0, 0.6), (40.0, 0.9), (50.0, 0.8)):
         comes[(time > begin) & (time < begin + gap)] = False
-    found = track(time[comes], rate[comes], sensitivity_of(rate[comes]), WHITE, KNOWN, Settings())
+    found = track(time[comes], rate[comes], sensitivity_of(rate[comes]), WHITE, KNOWN,
+                  TrackerSettings())
     resting = found.resting[(time[comes] > 2.0) & (time[comes] < 50.0)]
     assert resting.all() and not found.resting[time[comes] > 51.0].any()
     assert abs(found.heading[-1] - 0.5 * 9.7) < 3.0 * math.sqrt(found.variance[-1]) < 0.5

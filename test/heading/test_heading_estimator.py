@@ -20,7 +20,7 @@ import math
 
 from gyro_calibration.heading.bias_table import BiasTable, Entry
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
@@ -41,7 +41,7 @@ MODEL = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
 def begun(model=MODEL, table=None, assumptions=None, now=NOW, temperature=25.0):
     """Return a heading that begins; with a temperature, if one is given."""
     live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(),
-                            Settings(), now)
+                            TrackerSettings(), now)
     if temperature is not None:
         live.add_temperature(0.0, temperature)
     return live

@@ -14,7 +14,7 @@ import math
 
 from gyro_calibration.heading.integration import (
     BlockIntegrator, filter_rates, integrate, Threshold, ThresholdFilter)
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import (
     compensate, rate_sensitivity, uncertainty_covariance)
@@ -96,7 +96,7 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
                   for values in noisy_robot())
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
     tracker = HeadingTracker(XV3500, uncertainty_covariance(model),
-                             Settings(false_alarms=0.0, threshold=settings))
+                             TrackerSettings(false_alarms=0.0, threshold=settings))
     headings, variances = [], []
     for index in range(len(time)):
         assert not tracker.add(float(time[index]) + offset, float(rate[index]),

@@ -16,7 +16,7 @@ import math
 from gyro_calibration import Log, read_model, track
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
-from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
@@ -88,7 +88,7 @@ def test_a_turn_at_the_limit_of_the_prior_counts_once():
 
 def estimator():
     model = GyroModel(noise=NOISE)
-    return HeadingEstimator(model, BiasTable(model), ASSUMED, Settings(), 1.7e9)
+    return HeadingEstimator(model, BiasTable(model), ASSUMED, TrackerSettings(), 1.7e9)
 
 
 def test_blocks_have_the_heading_of_single_samples():

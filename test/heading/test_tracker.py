@@ -18,7 +18,7 @@ from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, smooth_states)
 from gyro_calibration.heading.stationary import (
     SCATTER_CORRELATIONS, SCATTER_RATIOS, sum_ratios, update_scatter)
-from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
 from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
@@ -47,7 +47,7 @@ def gyro(motion, generator, noise=XV3500, bias=None):
 
 def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False):
     return track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, KNOWN,
-                 settings or Settings(), wheels, hindsight)
+                 settings or TrackerSettings(), wheels, hindsight)
 
 
 # the filter
@@ -128,7 +128,7 @@ def test_rests_determine_the_bias_as_well_as_stated(motion, before, share, runs)
         generator = np.random.default_rng([6, seed])
         bias = before * generator.standard_normal()
         time, _, _, rate = gyro(motion, generator, white, bias=-bias)
-        tracker = HeadingTracker(white, np.diag([SCALE ** 2, before ** 2]), Settings())
+        tracker = HeadingTracker(white, np.diag([SCALE ** 2, before ** 2]), TrackerSettings())
         for at, value in zip(time, rate):
             tracker.add(at, value, np.array([-value, -1.0]))
         found, deviation = tracker.bias_for(np.array([0.0, -1.0]))
@@ -146,7 +146,7 @@ def test_a_first_rest_is_kept_whatever_the_bias_of_a_quiet_gyro(sigmas):
     time = np.arange(0.0, 10.0, INTERVAL)
     rate = sigmas * 0.5 * DEGREE + simulate_noise(quiet, len(time), INTERVAL,
                                                   np.random.default_rng(8))
-    tracker = HeadingTracker(quiet, wide, Settings())
+    tracker = HeadingTracker(quiet, wide, TrackerSettings())
     for at, value in zip(time, rate):
         tracker.add(at, value, np.array([-value, -1.0]), still=np.array([0.0, -1.0]))
     assert tracker.is_resting and tracker.bias[0] == pytest.approx(sigmas * 0.5 * DEGREE, rel=0.01)
@@ -162,8 +162,8 @@ def test_a_slow_turn_before_the_first_rest_does_not_fix_the_bias(slow):
     for seed in range(3):
         noise = Noise(0.005 * DEGREE)
         time, _, heading, rate = gyro(motion, np.random.default_rng([9, seed]), noise, bias=0.0)
-        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, wide, Settings(),
-                      still=np.array([0.0, -1.0]))
+        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, wide,
+                      TrackerSettings(), still=np.array([0.0, -1.0]))
         error = (found.heading - heading)[::20]
         assert np.all(error ** 2 < 16.0 * found.variance[::20] + (0.05 * DEGREE) ** 2)
         assert abs(error[-1]) < 1.0 * DEGREE
@@ -199,7 +199,7 @@ def test_a_bias_that_jumps_by_more_than_the_model_says_does_not_make_the_heading
 
 @pytest.mark.parametrize('after', [None, False], ids=['silent', 'standing'])
 def test_a_slow_turn_until_the_wheels_stop_is_no_bias(after):
-    tracker = HeadingTracker(XV3500, np.diag([0.03 ** 2, (0.5 * DEGREE) ** 2]), Settings())
+    tracker = HeadingTracker(XV3500, np.diag([0.03 ** 2, (0.5 * DEGREE) ** 2]), TrackerSettings())
     turning = round(20.0 / INTERVAL)
     for index in range(2 * turning):
         rate = 0.2 * DEGREE if index < turning else 0.0
@@ -214,7 +214,7 @@ def test_the_deviation_includes_what_the_threshold_filter_deletes():
     time, _, heading, rate = gyro(constant_rate_motion([(5, 20), (600, 0.1), (5, -20)]),
                                   np.random.default_rng(15))
     sensitivity, threshold = -np.vstack([rate, np.ones(len(rate))]), Threshold()
-    live = follow(time, rate, Settings(0.0, threshold))
+    live = follow(time, rate, TrackerSettings(0.0, threshold))
     _, written, deviation = BlockIntegrator(threshold, XV3500, KNOWN).add(time, rate, sensitivity)
     assert abs(live.heading[-1] - heading[-1]) > 30.0 * DEGREE
     for error, stated in ((live.heading - heading, np.sqrt(live.variance)),
@@ -223,7 +223,7 @@ def test_the_deviation_includes_what_the_threshold_filter_deletes():
 
 
 def test_the_slowest_turn_that_is_noticed_is_noticed():
-    tracker = HeadingTracker(XV3500, KNOWN, Settings())
+    tracker = HeadingTracker(XV3500, KNOWN, TrackerSettings())
     time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
                             np.random.default_rng(6))
     for at, value in zip(time, rate):
@@ -245,7 +245,7 @@ def test_false_alarms_are_as_rare_as_stated():
     for seed in range(3):
         time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 1200.0]), np.zeros(2)),
                                 np.random.default_rng(seed))
-        resting = follow(time, rate, Settings(false_alarms=20.0)).resting
+        resting = follow(time, rate, TrackerSettings(false_alarms=20.0)).resting
         alarms += int(np.sum(np.diff(resting.astype(int)) == -1))
     assert 0 < alarms <= poisson.isf(RARE, 20.0), alarms
 
@@ -253,7 +253,7 @@ def test_false_alarms_are_as_rare_as_stated():
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
 def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, later):
-    tracker = HeadingTracker(noise, KNOWN, Settings(), 3600.0)
+    tracker = HeadingTracker(noise, KNOWN, TrackerSettings(), 3600.0)
     generator, still = np.random.default_rng(11), np.array([0.0, -1.0])
     headings, variances = [], []
     for index, bias in enumerate([0.05 * DEGREE] * 2400 + [later * DEGREE] * 2400):
@@ -276,7 +276,7 @@ def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, la
 @pytest.mark.parametrize('change', [0.001, 0.01, 0.02])
 def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(change):
     noise, generator = Noise(1e-5), np.random.default_rng(13)
-    tracker = HeadingTracker(noise, np.diag([1e-12]), Settings())
+    tracker = HeadingTracker(noise, np.diag([1e-12]), TrackerSettings())
     for index, bias in enumerate([0.0] * 1200 + [change] * 2400 + [0.0] * 2400):
         drawn = noise.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL)
         assert not tracker.add(INTERVAL * index, bias + drawn, np.array([-1.0]), False)
@@ -294,7 +294,7 @@ def test_hindsight_does_not_reach_over_a_gap():
 
 
 def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
-    tracker, doubtful = HeadingTracker(XV3500, KNOWN, Settings()), []
+    tracker, doubtful = HeadingTracker(XV3500, KNOWN, TrackerSettings()), []
     for index, rate in enumerate([10.0 * DEGREE] * 200 + [0.0] * 1200 + [0.055 * DEGREE] * 8000):
         tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]))
         if index > 1400 and not tracker.is_resting:
@@ -307,7 +307,7 @@ def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
 
 def test_another_calibration_at_rest_keeps_the_correction_that_waits_for_motion():
     unknown, bias = np.diag([1e-4, (0.5 * DEGREE) ** 2]), 0.3 * DEGREE
-    tracker = HeadingTracker(XV3500, unknown, Settings())
+    tracker = HeadingTracker(XV3500, unknown, TrackerSettings())
     for index, rate in enumerate([5.0 * DEGREE] * 400 + [0.0] * 400 + [5.0 * DEGREE] * 400):
         if index == 799:
             assert (tracker.is_resting

@@ -20,7 +20,7 @@ from dataclasses import replace
 import itertools
 import math
 
-from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
+from gyro_calibration.logs.cdr import quaternion_heading, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 import numpy as np
@@ -97,13 +97,10 @@ def test_what_is_published(hold, tmp_path):
     assert imus[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
 
 
-def test_an_orientation_that_is_none_has_no_yaw_and_raises_nothing(ros):
-    from geometry_msgs.msg import Quaternion
-    from gyro_calibration.ros.compensation_node import quaternion_heading
-    turned = Quaternion(z=math.sin(0.3), w=math.cos(0.3))
-    assert quaternion_heading(turned) == pytest.approx(0.6)
-    for value in (1e200, -1.7e308, math.inf, math.nan):
-        quaternion_heading(Quaternion(x=value, y=value, z=value, w=value))
+def test_an_orientation_that_is_none_has_no_heading_and_raises_nothing():
+    assert quaternion_heading(0.0, 0.0, math.sin(0.3), math.cos(0.3)) == pytest.approx(0.6)
+    for value in (0.0, 1e200, -1.7e308, math.inf, math.nan):
+        assert math.isnan(quaternion_heading(value, value, value, value))
 
 
 def test_names_types_and_qualities_are_those_of_the_documents(hold):
