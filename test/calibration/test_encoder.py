@@ -184,8 +184,7 @@ def test_single_wrong_values_of_the_reference_are_left_out(size):
     found = calibrate_encoder(replace(CLEAN, reference_heading=heading))
     assert 'single values, which are left out' in found.remarks[0]
     assert '20.00 s, 50.00 s' in found.remarks[0]
-    # the steps of the encoder, the same in each period, look like an error of the shaft
-    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=1e-4)
+    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
 
 
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
