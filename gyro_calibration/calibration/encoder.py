@@ -359,18 +359,27 @@ def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:
 
 def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:
     """Fit by the rate of the encoder; the stamps are taken as exact."""
-    inside = (time >= 0.0) & (time <= motion.duration)
-    time, output = time[inside], output[inside]
-    fit = fit_rate(time, output, motion)
+    noise, interval = white_noise_deviation(output), float(np.median(np.diff(time)))
+    at = motion.time[(motion.time >= time[0]) & (motion.time <= time[-1])]
+    heading = motion.heading_at(at)
+    if motion.rate is None:
+        # differences of headings are means of rates, which the output is averaged to as well: by
+        # the trapezoid rule with the next term of Euler and Maclaurin
+        angle = integrate(time, output) - interval ** 2 / 12.0 * np.gradient(output, time)
+        output, rate = (np.gradient(each, at) for each in (np.interp(at, time, angle), heading))
+        noise *= math.sqrt(interval / (2.0 * float(np.median(np.diff(at)))))
+    else:
+        output, rate = np.interp(at, time, output), motion.rate_at(at)
+    fit = fit_rate(at, output, Motion(at, heading, rate))
     scale = 1.0 / (1.0 + fit.scale_factor_error)
     offset = -fit.bias / (1.0 + fit.scale_factor_error)
     columns = np.column_stack([output, np.ones(len(output))])
-    scores = columns * (columns @ (scale, offset) - motion.rate_at(time))[:, None]
+    scores = columns * (columns @ (scale, offset) - rate)[:, None]
     jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
     influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
     # the noise of the output, the regressor, biases the scale factor error by its share
-    return replace(fit, influence=np.column_stack([influence, time]), time_offset=math.nan,
-                   response_deviation=white_noise_deviation(output) ** 2 / float(np.var(output)))
+    return replace(fit, influence=np.column_stack([influence, at]), time_offset=math.nan,
+                   response_deviation=noise ** 2 / float(np.var(output)))
 
 
 def _number_pieces(time: Array) -> NDArray[np.intp]:

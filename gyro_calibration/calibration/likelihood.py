@@ -658,7 +658,7 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
     Return the average over all ratios of the noises and factors of the priors, (m, k).
 
     An error of the shaft is included only where the likelihoods show it: over less than a
-    revolution it has nearly the effect of a scale factor error.
+    revolution it has nearly the effect of a scale factor error. Errors that repeat count once.
 
     Returns
     -------
@@ -673,15 +673,39 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
     logarithms, values, covariances = (
         np.array([getattr(each, name) for each in estimates])
         for name in ('log_likelihood', 'values', 'covariance'))
-    if has_shaft:
+    if has_shaft and len(prior_factors) > 1:
         has_error = np.tile(prior_factors[:, 4] > prior_factors[0, 4], len(noises))
+        repeated = _repetition(data, estimates[int(logarithms.argmax())])
         # by the chi-squared distribution of two degrees of freedom
-        if math.exp(logarithms[~has_error].max() - logarithms.max()) > MIN_FIT_PROBABILITY:
+        if math.exp((logarithms[~has_error].max() - logarithms.max()) / repeated) > (
+                MIN_FIT_PROBABILITY):
             logarithms[has_error] = -math.inf
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     return (weights @ values, np.tensordot(weights, covariances, 1)
             + np.cov(values.T, aweights=weights, ddof=0), estimates[int(weights.argmax())])
+
+
+def _repetition(data: _Increments, estimate: _Estimate) -> float:
+    """
+    Return how many times the same errors occur: 1 if all are independent.
+
+    They may be the same in all passes through a place of the shaft in one sense, as the steps of
+    an encoder in an even swing. There are as many groups, by place and sense, as a pass has
+    blocks. It is the mean square of a group's mean, times its number of blocks, over that of all
+    (analysis of variance).
+    """
+    turned, white = data.columns[:, 0], estimate.noise.whiten(estimate.residual)
+    heading = np.cumsum(turned) - 0.5 * turned
+    extent = min(max(float(np.ptp(heading)), 1e-9), math.tau)
+    count = max(math.ceil(0.5 * len(white) * extent / float(np.abs(turned).sum())), 1)
+    place = np.mod(np.floor((heading - heading.min()) / extent * count), count)
+    group = np.unique(place + count * (turned > 0.0), return_inverse=True)[1]
+    sums, counts = np.bincount(group, white), np.bincount(group)
+    free = len(counts) - 5  # scale, lag, delay, and the two of the shaft
+    if free < 1:
+        return len(white) / len(counts)
+    return max(float(np.sum(sums ** 2 / counts)) / free / float(np.mean(white ** 2)), 1.0)
 
 
 def _min_rate_variance(data: _Increments) -> float:

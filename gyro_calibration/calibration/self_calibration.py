@@ -22,15 +22,14 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.likelihood import (
-    ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_BLOCK_DURATION,
-    MAX_NOISE_SIGMAS, MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
+    ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_NOISE_SIGMAS,
+    MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
 from gyro_calibration.calibration.run_faults import (
     fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
     RunPieces, split_run)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.logs.quality import (
-    noise_before_rounding, quantization_step, refuse_dead, refuse_saturated, rounding_product,
-    white_noise_deviation)
+    quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion, motion_from_rates
@@ -199,9 +198,9 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     """
     Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
 
-    By least squares on blocks of half a second or ten samples. At one code, as at all rests, the
-    steps cause one error, which is no noise of a fit; between codes the errors are independent.
-    Changes within a block average them out, as noise does. Zeros without steps.
+    By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
+    error, which is no noise of a fit; between codes the errors are independent, of the sizes of
+    `rounding_errors`. Ramps within a block average them out. Zeros without steps.
 
     Parameters
     ----------
@@ -216,20 +215,29 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     step = quantization_step(output)
     if not step:
         return np.zeros((2, 2)), 0.0
-    length = max(MAX_BLOCK_DURATION, 10.0 * float(np.median(np.diff(time))))
+    length = 5.0 * float(np.median(np.diff(time)))
     block = np.unique(np.floor((time - time[0]) / length), return_inverse=True)[1]
     count = np.bincount(block)
-    mean = np.bincount(block, output) / count
-    variance = np.bincount(block, ((output - mean[block]) / step) ** 2) / count
-    quiet = variance <= max(0.25, variance.min())
-    variance[quiet] = variance[quiet].mean()
-    error = step * np.sqrt(rounding_product(noise_before_rounding(variance), np.zeros(1)))
-    rate = (mean - fit.bias) / (1.0 + fit.scale_factor_error)
+    mean = np.bincount(block, output / step) / count
+    variance = np.bincount(block, (output / step - mean[block]) ** 2) / count
+    if not (quiet := variance <= 0.25).any():
+        return np.zeros((2, 2)), 0.0
+    near = np.abs(np.diff(mean)) < 1.0
+    before, after = np.append(False, near), np.append(near, False)
+    change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
+    local = mean + (change - np.roll(change, 1)) / (1.0 + before + after)
+    code = np.unique(np.rint(local), return_inverse=True)[1]
+    # a ramp may begin within a block: those next to one are no evidence of the noise
+    weight = count * np.where(quiet & before & after, 1.0, 1e-6)
+    total: Array = np.bincount(code, weight).astype(float)
+    squares = rounding_errors(np.bincount(code, weight * np.minimum(variance, 1.0)) / total, total)
+    error = step * np.sqrt(np.where(quiet, squares[code], 0.0))
+    rate = (step * mean - fit.bias) / (1.0 + fit.scale_factor_error)
     root = np.sqrt(count)[:, None]
     weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) * root.T
-    code = np.unique(np.rint(mean / step), return_inverse=True)[1]
     sums = np.array([np.bincount(code, each * error) for each in weights])
-    return sums @ sums.T, float(error[quiet][0] ** 2)
+    slowest = np.where(quiet, np.abs(rate), math.inf).argmin()
+    return sums @ sums.T, float(error[slowest] ** 2)
 
 
 def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) -> None:

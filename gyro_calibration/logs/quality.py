@@ -17,7 +17,7 @@ import math
 from gyro_calibration.logs.columns import ROTATIONS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 #: Standard deviation of the misalignment of the axes of gyro and reference, rad, as the cross-axis
 #: sensitivity in data sheets of MEMS gyros (MPU-6050: 2 %).
@@ -177,6 +177,37 @@ def noise_before_rounding(variance: Array) -> Array:
     """
     noise = np.linspace(0.0, 1.0, 1001)
     return np.interp(variance, noise + 1.0 / 12.0 - rounding_product(noise, np.zeros(1)), noise)
+
+
+def rounding_errors(variance: Array, count: Array) -> Array:
+    """
+    Return the mean square errors of means of rounded values, by their variances, steps², (n,).
+
+    All values have normal noise of one size. That size, uniform in its logarithm from 0.01 to 1
+    step, and the places of the means in their steps, uniform, are weighted by how well they give
+    the variances: few means show hardly how large the noise is.
+
+    Parameters
+    ----------
+    variance, count : of the values of each mean, steps² and 1, shape (n,); a count below 1 is no
+        evidence
+
+    """
+    place, code = np.linspace(0.0, 0.5, 26)[:, None], np.arange(-4, 5)
+    variance, count = variance[:, None], count[:, None]
+    chances, squares = [], []
+    for noise in np.geomspace(0.01, 1.0, 25):
+        shares = ndtr((code + 0.5 - place) / noise) - ndtr((code - 0.5 - place) / noise)
+        mean = shares @ code
+        spread = shares @ code ** 2 - mean ** 2
+        # of values of two codes the variance has about this one, with that of the grid
+        width = spread / count + 1.0 / count ** 2 + 1e-4
+        chance = np.exp(-0.5 * (variance - spread) ** 2 / width) / np.sqrt(width) + 1e-12
+        chances.append(chance.mean(axis=1))
+        squares.append((chance @ (mean - place[:, 0]) ** 2) / chance.sum(axis=1))
+    logarithm = np.log(chances).sum(axis=1)
+    weights = np.exp(logarithm - logarithm.max())
+    return np.asarray(weights @ squares / weights.sum())
 
 
 #: Least share of the changes of an encoder heading that are not collinear with the two before; in

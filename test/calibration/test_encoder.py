@@ -18,7 +18,7 @@ from dataclasses import replace
 import math
 
 from chance import fewest
-from encoder_intervals import run, run_eccentric, run_smoothing
+from encoder_intervals import run, run_eccentric, run_motion, run_smoothing
 from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import calibrate, calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
@@ -239,6 +239,13 @@ def test_an_eccentric_encoder_leaves_the_intervals_true(kind, size):
     assert (np.abs(found[:, 0]) < 3.0 * found[:, 1]).all()
 
 
+@pytest.mark.parametrize('hertz', ['0.2', '0.8'])
+def test_steps_that_are_the_same_in_each_period_are_no_error_of_a_shaft(hertz):
+    error, stated = run_motion((hertz, 'encoder', 0.0, 50))[:, 0]
+    assert abs(error) < 1e-3
+    assert abs(error) < 2.0 * stated
+
+
 def test_less_than_a_revolution_is_stated():
     assert 'turns by 198 deg in all' in ' '.join(calibrate_encoder(CLEAN).remarks)
     turned = motion_from_rates(SWING.time, 2.0 * SWING.rate)
@@ -253,6 +260,16 @@ def test_turns_in_one_direction_leave_the_bias_as_uncertain_as_the_scale():
     s, b = np.sqrt(np.diag(found.fit.covariance))
     assert b > 0.9 * s * rate.mean()
     assert abs(found.fit.scale_factor_error - S) < 2.5 * s
+
+
+@pytest.mark.parametrize('every', [1, 5])
+def test_the_rate_of_an_encoder_is_compared_with_means_of_the_gyro(every):
+    """Differences of a heading over 0.1 s at 3 s a period are 0.7 % less than the rate."""
+    time, turn = np.arange(2400) * 0.05, 2.0 * math.pi / 3.0
+    heading = np.where(np.arange(len(time)) % every == 0, np.cos(turn * time), np.nan)
+    rate = -turn * np.sin(turn * time)
+    log = Log(time=time, output=(1.0 + S) * rate + B, reference_heading=heading)
+    assert calibrate_encoder(log, 'rate').fit.scale_factor_error == pytest.approx(S, abs=5e-4)
 
 
 def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():
