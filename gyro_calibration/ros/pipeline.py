@@ -159,6 +159,7 @@ class Pipeline:
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
         self.conflict = ''  # why samples cannot be used
+        self.output_conflict = ''  # which other nodes publish on the topics of the results
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -375,9 +376,9 @@ class Pipeline:
         if self._frame == self._first_frame:
             return ''
         return to_printable(
-            f'the samples on imu/data_raw have the frame {self._frame:.99}, and had '
-            f'{self._first_frame:.99}: the calibration may be that of another gyro; restart this '
-            'node, and calibrate another gyro')
+            f"the samples on imu/data_raw have the frame '{self._frame:.99}', and had "
+            f"'{self._first_frame:.99}': the calibration may be that of another gyro; restart "
+            'this node, and calibrate another gyro')
 
     def _detect_several_gyros(self, stamp: int, frame: str, now: float) -> None:
         """Detect stamps that jump back, frames that alternate, and samples that interleave."""
@@ -389,7 +390,7 @@ class Pipeline:
                 self._first_frame = frame
             else:
                 self._note_jump(now, to_printable(
-                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
+                    f"samples of the frames '{before:.99}' and '{frame:.99}' alternate on "
                     'imu/data_raw'))
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
@@ -438,8 +439,11 @@ class Pipeline:
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
-            journal.event = (f'a rate of {output:g} rad/s is beyond the range of this gyro: '
-                             'the sample is not used')
+            journal.event = (
+                'a sample without a rate (nan, or -1 in its covariance) is not used'
+                if math.isnan(output) else
+                f'a rate of {output:g} rad/s is beyond the range of this gyro: the sample is not '
+                'used')
             return False
         journal.last_received, tracker = now, estimator.tracker
         counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)

@@ -149,7 +149,7 @@ def test_noise_that_is_larger_in_one_of_several_logs_is_no_cause(largest):
 def test_what_is_established_is_significant_given_all_that_is():
     at = 261.0
     for size in (7e-5, 1e-4, 1.3e-4, 1.6e-4, 1.9e-4):
-        search = start_search([laid(resting(size * (TIME >= at)))])
+        search = start_search([laid(resting(size * (at <= TIME)))])
         named = refine_jointly(search, [effect_candidate('bias_step', at, log_index=0)])
         assert all(p_value(each.cause, evidence_for(search, selected, place)) < search.rate
                    for selected in [confirm_causes(search, named).named]

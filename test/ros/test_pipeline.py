@@ -421,7 +421,7 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     for _ in range(100):
         rig.feed([0.5])
         rig.pipeline.add_sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
-    assert 'samples of the frames  and other alternate' in rig.pipeline.conflict
+    assert "samples of the frames '' and 'other' alternate" in rig.pipeline.conflict
     assert rig.outputs[-1].heading < 0.5 * 0.2
     rig.feed(np.full(150, 0.5))
     assert not rig.pipeline.conflict
@@ -431,7 +431,7 @@ def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, report
     """The calibration may be that of another gyro, or of another mount."""
     rig = Rig(tmp_path)
     for frame, fault, is_known in (('gyro', '', True), ('gyro', '', True),
-                                   ('other\n', 'the frame other\\n, and had gyro', False),
+                                   ('other\n', "the frame 'other\\n', and had 'gyro'", False),
                                    ('gyro', '', False)):
         for _ in range(250):
             rig.clock.now += INTERVAL
