@@ -404,7 +404,7 @@ class CompensationReport:
                 yield (f'the model needs the {channel.replace("_", " ")}, which no message '
                        'contains; that effect is left out')
         yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-                    pipeline.alternation_fault, pipeline.turn_fault,
+                    pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
                     pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
                     store.calibration_hint, store.shared_hint, monitor.bias_alarm,
                     monitor.noise_alarm, estimator.calibration_message, estimator.bias_message,
