@@ -209,9 +209,12 @@ class CompensationNode(Node):
 
     def _poll_graph(self) -> None:
         """Poll publishers, receivers, clocks and the level of the report."""
-        names = [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
-                 for each in self.get_publishers_info_by_topic(self._samples.topic_name)]
-        self._pipeline.update_publishers(names)
+        self._pipeline.update_publishers(self._publishers_on(self._samples.topic_name))
+        outputs = (each.topic_name for each in (self._imu, self._heading, self._yaw_rate))
+        self._pipeline.output_conflict = next((
+            f'several nodes publish on {each} ({", ".join(sorted(self._publishers_on(each)))}), '
+            'and a receiver cannot distinguish them: end or remap the other'
+            for each in outputs if self.count_publishers(each) > 1), '')
         self._has_subscribers = {each: each.get_subscription_count() > 0
                                  for each in self._has_subscribers}
         self._count_receivers()
@@ -228,6 +231,10 @@ class CompensationNode(Node):
             self._pipeline.run_periodic_tasks()
         if second or self._report.level() > (self._diagnostics.level or OK):
             self._diagnostics.publish()
+
+    def _publishers_on(self, topic: str) -> list[str]:
+        return [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
+                for each in self.get_publishers_info_by_topic(topic)]
 
     # Services
 
@@ -397,8 +404,8 @@ class CompensationReport:
                 yield (f'the model needs the {channel.replace("_", " ")}, which no message '
                        'contains; that effect is left out')
         yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-                    pipeline.alternation_fault, pipeline.turn_fault,
-                    pipeline.odometry_fault, pipeline.standstill_fault,
+                    pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
+                    pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
                     store.calibration_hint, store.shared_hint, monitor.bias_alarm,
                     monitor.noise_alarm, estimator.calibration_message, estimator.bias_message,
                     store.table_hint)

@@ -107,7 +107,14 @@ def node_time(clock: Clock) -> float:
 
 
 class StampDelay:
-    """Delay of stamps behind the clock of a node, and a test whether both advance equally."""
+    """
+    Delay of stamps behind the clock of a node, and tests whether both advance equally.
+
+    `unknown_turn` is the largest error of a heading by the stamps so far, rad. Transport and a
+    busy computer delay samples, but the least delay in the longest duration follows the stamps.
+    Its changes, less the mean one so far since the clock of a gyro may drift, are time that the
+    heading has missed or counted twice, at the rate of that moment.
+    """
 
     def __init__(self, clock: Clock, window: float, *tolerances: tuple[float, float]):
         """
@@ -117,20 +124,46 @@ class StampDelay:
         shortest one first, in which some samples are not late, and a change of their delay, s.
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
-        # Time of arrival and delay, s, of samples with less delay than any after them.
-        self._min_delays = deque[tuple[float, float]]()
+        # Time of arrival and delay, s, and heading, rad, of samples with less delay than any after
+        # them; those of the least delay when the first duration was over, and at present.
+        self._min_delays = deque[tuple[float, float, float]]()
+        self._begin: tuple[float, float, float] | None = None
+        self._least = -math.inf, math.nan, math.nan
+        self.unknown_turn = self._false_turn = 0.0
+        self._first_time, self._last_check = math.inf, -math.inf  # s
         # Times, s, and the least delays at these times for each tolerance, s.
         self._earlier = deque[tuple[float, list[float]]]()
 
-    def add(self, time: float) -> float:
-        """Add the stamp of a sample, s; return its delay beyond the least one, s."""
+    def add(self, time: float, heading: float = 0.0) -> float:
+        """Add a stamp, s, and a heading, rad; return the delay beyond the least one, s."""
         now = node_time(self._clock)
+        if self._min_delays and self._least[0] < self._min_delays[0][0] < now:  # a burst is over
+            self._use_least()
         while self._min_delays and self._min_delays[-1][1] >= now - time:
             self._min_delays.pop()
-        self._min_delays.append((now, now - time))
-        while now - self._min_delays[0][0] > self._tolerances[-1][0]:
-            self._min_delays.popleft()
+        self._min_delays.append((now, now - time, heading))
         return now - time - self.min_delay
+
+    def _drop_past(self) -> None:
+        """Drop samples that were too old at the last call: after a pause, more may wait."""
+        now, before = node_time(self._clock), self._last_check
+        while (len(self._min_delays) > 1
+                and before - self._min_delays[0][0] > self._tolerances[-1][0]):
+            self._min_delays.popleft()
+            self._use_least()
+        self._last_check = now
+
+    def _use_least(self) -> None:
+        """Compare the least delay with that before."""
+        (then, delay, heading), self._least = self._least, self._min_delays[0]
+        now, late, turned = self._least
+        self._first_time = min(self._first_time, now)
+        if self._begin is None and now - self._first_time > self._tolerances[-1][0]:
+            self._begin = self._least
+        if self._begin and self._begin[0] < then < now and self._clock.simulated() is None:
+            drift = (delay - self._begin[1]) / (then - self._begin[0])
+            self._false_turn += (turned - heading) * ((late - delay) / (now - then) - drift)
+            self.unknown_turn = max(self.unknown_turn, abs(self._false_turn))
 
     @property
     def min_delay(self) -> float:
@@ -139,11 +172,12 @@ class StampDelay:
 
     def _least_delay(self, duration: float) -> float:
         """Return the least delay in a duration before the last sample, s."""
-        return next((delay for then, delay in self._min_delays
+        return next((delay for then, delay, _ in self._min_delays
                      if self._min_delays[-1][0] - then <= duration), math.nan)
 
     def find_fault(self) -> str:
         """Return a sentence if stamps and clock advance differently; else ''."""
+        self._drop_past()
         now = node_time(self._clock)
         # In a fast simulation the same delay is more simulated time.
         factor = 1.0 if self._clock.simulated() is None else 4.0

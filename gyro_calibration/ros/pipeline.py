@@ -159,6 +159,7 @@ class Pipeline:
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
         self.conflict = ''  # why samples cannot be used
+        self.output_conflict = ''  # which other nodes publish on the topics of the results
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -189,6 +190,7 @@ class Pipeline:
 
     def _new_stamp_delay(self) -> StampDelay:
         """Return a comparison of stamps and clock, whose tolerance a deviation of 6 % exceeds."""
+        self._stamp_turn = 0.0  # unknown turn by them that is in the variance, rad
         # a busy computer delays all samples by a second for a short time
         return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
 
@@ -262,8 +264,7 @@ class Pipeline:
     def _compare_turns(self, source: str, time: float, rate: float, stands: bool = False) -> None:
         """Compare the heading with a rate by odometry or commands, and add an unknown turn."""
         estimator, turns = self.estimator, self._turns
-        turns.add(source, time, rate,
-                  estimator.heading_before_resets + estimator.tracker.heading, stands=stands)
+        turns.add(source, time, rate, self._heading, stands=stands)
         (duration, turned, least_rate), (known, _) = turns.turn_at_rest, self._false_turn
         if not duration:
             if self._stood and not known:
@@ -277,6 +278,20 @@ class Pipeline:
             unknown = max(turned + least_rate * before, known)
             self._false_turn = unknown, turned
             estimator.tracker.add_unknown_turn(math.sqrt(unknown ** 2 - known ** 2))
+
+    @property
+    def _heading(self) -> float:
+        """Return the heading as without resets, rad."""
+        return self.estimator.heading_before_resets + self.estimator.tracker.heading
+
+    @property
+    def stamp_fault(self) -> str:
+        """Return that the heading may be off by uneven stamps; ''."""
+        turned = self._stamp_delay.unknown_turn
+        return (f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
+                'imu/data_raw advanced faster or slower for a time than before: check that the '
+                'driver stamps by a clock and loses no samples, then reset the heading'
+                if turned > MIN_TURN_ANGLE else '')
 
     @property
     def odometry_fault(self) -> str:
@@ -357,7 +372,7 @@ class Pipeline:
         journal.channels = set() if specific_force is None else {'specific_force'}
         if not self._integrate(time, (interval, silence), output, specific_force, now):
             return None
-        self._stamp_delay.add(time)
+        self._stamp_delay.add(time, self._heading)
         self._check_repeats(time, output, now)
         self._alternate_turns.add(time, output)
         run = self.session.run
@@ -375,9 +390,9 @@ class Pipeline:
         if self._frame == self._first_frame:
             return ''
         return to_printable(
-            f'the samples on imu/data_raw have the frame {self._frame:.99}, and had '
-            f'{self._first_frame:.99}: the calibration may be that of another gyro; restart this '
-            'node, and calibrate another gyro')
+            f"the samples on imu/data_raw have the frame '{self._frame:.99}', and had "
+            f"'{self._first_frame:.99}': the calibration may be that of another gyro; restart "
+            'this node, and calibrate another gyro')
 
     def _detect_several_gyros(self, stamp: int, frame: str, now: float) -> None:
         """Detect stamps that jump back, frames that alternate, and samples that interleave."""
@@ -389,7 +404,7 @@ class Pipeline:
                 self._first_frame = frame
             else:
                 self._note_jump(now, to_printable(
-                    f'samples of the frames {before:.99} and {frame:.99} alternate on '
+                    f"samples of the frames '{before:.99}' and '{frame:.99}' alternate on "
                     'imu/data_raw'))
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
@@ -438,8 +453,11 @@ class Pipeline:
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
-            journal.event = (f'a rate of {output:g} rad/s is beyond the range of this gyro: '
-                             'the sample is not used')
+            journal.event = (
+                'a sample without a rate (nan, or -1 in its covariance) is not used'
+                if math.isnan(output) else
+                f'a rate of {output:g} rad/s is beyond the range of this gyro: the sample is not '
+                'used')
             return False
         journal.last_received, tracker = now, estimator.tracker
         counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)
@@ -588,6 +606,11 @@ class Pipeline:
         before = self._suspected_clock_fault
         self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
+        unknown, tracker = self._stamp_delay.unknown_turn, self.estimator.tracker
+        added = unknown ** 2 - self._stamp_turn ** 2
+        if added > 0.01 * tracker.variance:  # else the deviation changes by less than 0.5 %
+            tracker.add_unknown_turn(math.sqrt(added))
+            self._stamp_turn = unknown
         if (self.clock_fault or self.frame_fault or self.turn_fault
                 or self.alternation_fault):
             self.estimator.tracker.add_unknown_turn(math.tau)
@@ -600,7 +623,7 @@ class Pipeline:
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
-        self._trusted_heading = 0.0, 0.0
+        self._stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
         if self.conflict or self.repeat_fault:  # turns are not measured now
             self.estimator.set_heading(0.0, math.tau ** 2)
         return 'the heading is zero here and now'

@@ -22,6 +22,7 @@ ends some runs in a traceback.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 import faulthandler
 import signal
 import sys
@@ -59,7 +60,8 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Longest time of the shutdown of a node, s; then it is killed.
 SHUTDOWN_TIMEOUT = 10.0
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Of a user, of a system that ends, and of a terminal or a connection that is lost.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values by name
@@ -128,6 +130,17 @@ def declare_parameters(
     return read_values()
 
 
+def warn_of_unused_parameters(node: Node) -> None:
+    """Warn of values that were given for parameters which the node does not have."""
+    # not refused, since a file may give a parameter to all nodes
+    for name in node._parameter_overrides:
+        if not node.has_parameter(name):
+            alike = get_close_matches(name, node._parameters, 1)
+            node.get_logger().warning(
+                f'there is no parameter {name}, and its value is not used'
+                f'{"".join(f": is {each} meant?" for each in alike)}')
+
+
 def _descriptor(parameter: NodeParameter) -> ParameterDescriptor:
     unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
     descriptor = ParameterDescriptor(
@@ -184,14 +197,15 @@ class Diagnostics:
 
 def run_node(node_class: Callable[[], Node]) -> int:
     """
-    Start a node, spin it until SIGINT or SIGTERM, and return the exit code of the process.
+    Start a node, spin it until SIGINT, SIGTERM or SIGHUP, and return the exit code of the process.
 
     It is 0 after a signal, and 2 where an argument or a parameter was refused, with a sentence on
     standard error.
     """
     stop = threading.Event()
     for number in _SIGNALS:
-        signal.signal(number, lambda *_: stop.set())
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # not by nohup
+            signal.signal(number, lambda *_: stop.set())
     try:
         try:
             rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
@@ -201,6 +215,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
         except (ValueError, OSError, RuntimeError, ParameterException) as error:
             print(f'{node_class.__name__}: {error}', file=sys.stderr)
             return 2
+        warn_of_unused_parameters(node)
         spin(node, stop)
         return 0
     finally:

@@ -97,6 +97,17 @@ def test_what_is_published(hold, tmp_path):
     assert imus[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
 
 
+def test_another_node_on_the_topics_of_the_results_is_a_warning(hold):
+    held = hold()
+    held.node.create_publisher(Imu, 'imu/data', 10)
+    held.tick(5)
+    held.send('/imu/data_raw', sample(0, 0.0))
+    held.tick(5)
+    status, = held.sent['/diagnostics'][-1].status
+    assert status.level == status.WARN
+    assert 'several nodes publish on /imu/data (/compensation_node, ' in status.message
+
+
 def test_an_orientation_that_is_none_has_no_heading_and_raises_nothing():
     assert quaternion_heading(0.0, 0.0, math.sin(0.3), math.cos(0.3)) == pytest.approx(0.6)
     for value in (0.0, 1e200, -1.7e308, math.inf, math.nan):

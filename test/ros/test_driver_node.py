@@ -12,6 +12,7 @@
 
 import itertools
 import re
+import signal
 import subprocess
 import sys
 
@@ -262,6 +263,15 @@ def test_an_impossible_parameter_ends_it_with_one_sentence(start_node):
     assert node.wait() == 2
     line, = node.output.strip().splitlines()
     assert line.startswith('DriverNode: sensitivity is not set')
+
+
+def test_a_mistyped_parameter_is_named_and_the_end_of_its_terminal_ends_a_node_as_ctrl_c_does(
+        start_node, wait_until, tmp_path):
+    node = start_node('compensation_node', {'calibration_file': tmp_path / 'own.yaml',
+                                            'wheel': 'odom'})
+    words = 'there is no parameter wheel, and its value is not used: is wheels meant?'
+    wait_until(lambda: words in node.output, what=words)
+    assert node.stop(signal.SIGHUP) == 0, 'it has stopped the robot'
 
 
 BROKEN = """

@@ -421,7 +421,7 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     for _ in range(100):
         rig.feed([0.5])
         rig.pipeline.add_sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
-    assert 'samples of the frames  and other alternate' in rig.pipeline.conflict
+    assert "samples of the frames '' and 'other' alternate" in rig.pipeline.conflict
     assert rig.outputs[-1].heading < 0.5 * 0.2
     rig.feed(np.full(150, 0.5))
     assert not rig.pipeline.conflict
@@ -431,7 +431,7 @@ def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, report
     """The calibration may be that of another gyro, or of another mount."""
     rig = Rig(tmp_path)
     for frame, fault, is_known in (('gyro', '', True), ('gyro', '', True),
-                                   ('other\n', 'the frame other\\n, and had gyro', False),
+                                   ('other\n', "the frame 'other\\n', and had 'gyro'", False),
                                    ('gyro', '', False)):
         for _ in range(250):
             rig.clock.now += INTERVAL
@@ -670,6 +670,33 @@ def test_the_diagnostics_name_what_is_wrong_within_two_seconds(
     rig.go(2.0)
     found, message, _ = reported(rig)
     assert (found, words in message) == (level, True), message
+
+
+@pytest.mark.parametrize('pace, seconds', [(0.8, 2.0), (1.2, 2.0), (0.97, 30.0), (1.03, 30.0)])
+def test_a_turn_while_stamps_advance_unevenly_for_a_time_is_a_warning_and_in_the_variance(
+        tmp_path, reported, pace, seconds):
+    rig = rested(tmp_path, robot=Robot(scale_factor_error=0.0, bias=0.0), seconds=60.0)
+    rig.turn(0.5, 1.0)
+    rig.pace_stamps(pace)
+    rig.go(seconds)
+    rig.pace_stamps(2.0 - pace)
+    rig.turn(0.0, 8.0)
+    error, deviation = rig.error(10)
+    missed = (pace - 1.0) * 0.5 * seconds
+    assert error == pytest.approx(missed, rel=0.5) and abs(error) < 2.0 * deviation
+    level, message, _ = reported(rig)
+    assert level == WARN and 'the heading may be off by' in message
+    rig.pipeline.reset_heading()
+    assert not rig.pipeline.stamp_fault
+
+
+def test_neither_a_clock_that_drifts_nor_a_busy_computer_is_uneven_stamps(tmp_path):
+    rig = Rig(tmp_path)
+    rig.pace_stamps(1.03)
+    rig.hold_up_samples(lambda: 20.0 < rig.clock.now - 1000.0 < 23.0)
+    for rate in (0.5, -1.0, 0.7):
+        rig.turn(rate, 20.0)
+    assert rig.pipeline._stamp_delay.unknown_turn < 0.1 * DEGREE
 
 
 @pytest.mark.parametrize('pace, warns', [(1e-6, True), (0.9, True), (1.1, True), (2.0, True),
