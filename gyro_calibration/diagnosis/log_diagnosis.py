@@ -323,9 +323,9 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
 
     The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
     with dynamics that no cause describes. The mean squares of the residual, whitened in the second
-    case, are compared stretch by stretch (Mann and Whitney). Unless the response of the motion is among the causes,
-    they have to be twice as large between dwells. Dwells of less than half the range of rates,
-    such as rests alone, do not show what the motion does.
+    case, are compared stretch by stretch (Mann and Whitney). Unless the response of the motion is
+    among the causes, they have to be twice as large between dwells. Dwells of less than half the
+    range of rates, such as rests alone, do not show what the motion does.
     """
     try:
         dwells = find_dwells(log)

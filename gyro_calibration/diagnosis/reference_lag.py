@@ -162,7 +162,7 @@ def _response_transforms(replay: Replay, kernels: Array) -> Array:
         replay.channels.output - replay.reference)])
 
 
-def limit_acceleration(command: Array, interval: float, limits: Sequence[float]) -> Array:
+def limit_acceleration(command: Array, interval: float, limits: Array) -> Array:
     """
     Return a rate that follows a command as fast as two limits allow, rad/s, shape (n,).
 
@@ -178,7 +178,7 @@ def limit_acceleration(command: Array, interval: float, limits: Sequence[float])
         for target, limit in ((sorted([0.0, now, wanted])[1], limits[1]), (wanted, limits[0])):
             steps = abs(target - now) / (limit * interval)
             done = min(steps, end - at)
-            now += done / steps * (target - now) if steps else 0.0
+            now = target if done == steps else now + done / steps * (target - now)
             at += done
             times.append(at)
             rates.append(now)
@@ -200,7 +200,9 @@ def _likely_limits(replay: Replay) -> Array:
     command, output = (each[begin:begin + count] for each in (command, output))
     late = np.geomspace(1.0, _LIMITED_LAG / replay.interval, _LIMITED_LAGS)
     lags = np.unique(np.rint([*-late[late * replay.interval < LEAD], 0.0, *late])).astype(int)
-    count += lags[0] - lags[-1]
+    count -= int(np.ptp(lags))
+    if count < 2 * len(lags):
+        return np.full(2, math.inf)
 
     def cost(limits: Array) -> float:
         # any response that is linear between lags
@@ -208,9 +210,9 @@ def _likely_limits(replay: Replay) -> Array:
             command, replay.interval, np.exp(limits))))
         delayed = np.array([total[lags[-1] - each:][:count] for each in lags])
         columns = np.diff(np.diff(delayed, axis=0) / np.diff(lags)[:, None], axis=0)
-        left = np.linalg.qr(np.array([np.ones(columns.shape[1]), *columns,
-                                      output[lags[-1]:][:count]]).T, mode='r')[-1, -1]
-        return 2.0 * count * math.log(abs(float(left)))
+        reduced = np.asarray(np.linalg.qr(np.array([
+            np.ones(count), *columns, output[lags[-1]:][:count]]).T, mode='r'))
+        return 2.0 * count * math.log(abs(float(reduced[-1, -1])) + np.finfo(float).tiny)
 
     first = min(_FIRST_LIMITS, key=lambda each: cost(np.log([each, each])))
     best = minimize(cost, np.log([first, first]), method='Nelder-Mead', options={

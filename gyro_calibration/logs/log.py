@@ -274,8 +274,8 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
                  axis: str) -> tuple[_FileHeader, int]:
     """Return notes and header, and the number of the next line."""
     notes, line = [], next(lines, '')
-    while line.startswith('#'):
-        notes.append(line[1:].strip())
+    while line.startswith(('#', 'sep=')):  # spreadsheets write the delimiter into the first line
+        notes.append(line.removeprefix('#').strip())
         line = next(lines, '')
     delimiter = find_delimiter(line)
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
@@ -411,9 +411,9 @@ def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is not later '
-                       f'than {time[row - 1] if row else previous_time:g} s; sort the rows, or '
-                       'give the sample rate with --rate')
+        raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:.12g} s is not '
+                       f'later than {time[row - 1] if row else previous_time:.12g} s; sort the '
+                       'rows, or give the sample rate with --rate')
     return float(time[-1])
 
 

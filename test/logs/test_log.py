@@ -260,7 +260,8 @@ def test_a_named_column_goes_before_one_of_the_format_and_the_rest_is_kept(tmp_p
 
 @pytest.mark.parametrize('text', [
     'time_s;gyro_dps\n0,0;1,5\n0,5;-2,5\n', 'time_s;gyro_dps;place\n0,0;1,5;a,b\n0,5;-2,5;c\n',
-    'time_s\tgyro_dps\n0.0\t1.5\n0.5\t-2.5\n', 'time_s;gyro_dps\n0.0;1.5\n0.5;-2.5\n'])
+    'time_s\tgyro_dps\n0.0\t1.5\n0.5\t-2.5\n', 'time_s;gyro_dps\n0.0;1.5\n0.5;-2.5\n',
+    'sep=;\ntime_s;gyro_dps\n0,0;1,5\n0,5;-2,5\n'])
 def test_semicolons_tabs_and_decimal_commas_are_understood(tmp_path, text):
     log = read_log(written(tmp_path, text))
     assert log.time.tolist() == [0.0, 0.5]
