@@ -284,7 +284,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
         settled = find_settled(fit_causes(found.search.problem, found.causes), responds)
         if not responds and not settled:
             return found
-    followed = follow_reference(replays)
+    followed = follow_reference(replays, follows)
     moved = fit_causes(build_problem(followed.replays), [])
     if follows:
         settled = find_settled(moved, True)

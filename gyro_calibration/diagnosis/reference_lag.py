@@ -34,7 +34,7 @@ from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (
     cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
-from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import norm
@@ -54,6 +54,8 @@ _LAGS_OF_GYRO, _LATE_LEVEL = 4, 0.05
 #: Numbers of time constants and sizes of the prior of a response that are tried; and least
 #: variance of a response by its prior, over that by the noise.
 _TIME_CONSTANTS, _PRIOR_SIZES, _MIN_RATIO = 16, 65, 0.01
+#: Largest standard deviation of a scale factor error beside the response, as a share of the prior.
+_MAX_PRIOR_SHARE = 0.5
 #: Limits of acceleration that are tried at first, rad/s², and share to which they are found;
 #: number of samples; number of lags of the response to the limited command, and the longest, s.
 _FIRST_LIMITS, _LIMIT_STEP, _LIMITED_SAMPLES = 0.25 * 2.0 ** np.arange(7), 0.005, 16384
@@ -101,16 +103,21 @@ def follows_rate(replays: Sequence[Replay]) -> bool:
                for each in replays)
 
 
-def follow_reference(replays: Sequence[Replay]) -> FollowedReference:
-    """Return the motion that follows the reference rate of logs."""
-    followed, lags = zip(*map(_follow, replays))
+def follow_reference(replays: Sequence[Replay], is_command: bool) -> FollowedReference:
+    """
+    Return the motion that follows the reference rate of logs.
+
+    Raises `DataRefused` where this is a command and no scale factor error can be known beside the
+    response.
+    """
+    followed, lags = zip(*(_follow(each, is_command) for each in replays))
     weights = np.array([each.deviation for each in lags]) ** -2
     mean = float(np.average([each.estimate for each in lags], weights=weights))
     return FollowedReference(followed, Estimate.from_half_width(
         mean, NORMAL_QUANTILE_975 * float(weights.sum() ** -0.5), 's'))
 
 
-def _follow(replay: Replay) -> tuple[Replay, Estimate]:
+def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate]:
     """
     Return a log with the motion that follows as the reference, and its mean delay, s.
 
@@ -128,12 +135,12 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
     begin = plain.channels.time[0] + longest[len(kernels) - 1]
     tried = [(each, _response_transforms(each, kernels)) for each in (
         drop_samples(each, plain.channels.time < begin) for each in (plain, limited))]
-    criteria = [_fit_response(transforms, 1, kernels @ lags).criterion for _, transforms in tried]
+    fits = [_fit_response(transforms, 1, kernels @ lags) for _, transforms in tried]
     # Two limits have to be worth their number (Schwarz), by as many independent errors as there
     # are changes of the command: most errors are after these, and by their time between samples.
     share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
-    moved, (rate, *seen) = tried[int(
-        share * (criteria[0] - criteria[1]) > 2.0 * math.log(len(command)))]
+    chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
+    moved, (rate, *seen) = tried[chosen]
     late = moved
     others: list[Array] = []
     for _ in range(2):
@@ -151,6 +158,12 @@ def _follow(replay: Replay) -> tuple[Replay, Estimate]:
                   for column in effect_candidate(name).columns(moved)]
         fit = fit_causes(build_problem([moved]), [])
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
+    most = _MAX_PRIOR_SHARE * HEADING_TREATMENT.prior[0]
+    if is_command and fitted.scale_deviation > most:
+        raise DataRefused(
+            'the motion follows its command late, and what it does then has the same effect as a '
+            'scale factor error, as in a swing that repeats: turn at several rates for several '
+            'seconds each, with rests, or use a measured rate or heading as the reference')
     return moved, Estimate.from_half_width(
         float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's')
 
@@ -228,6 +241,7 @@ class _Response(NamedTuple):
     independent: Array
     lag_deviation: float  # standard deviation of the mean delay, s
     criterion: float  # -2 times the log-likelihood, but for a constant
+    scale_deviation: float  # standard deviation of the scale factor error beside the response
 
 
 def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
@@ -272,6 +286,11 @@ def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
     values = sizes @ independent
     scale = np.linalg.lstsq(own, left[:, 0] - delayed @ values, rcond=None)[0][0]
     deviation = math.sqrt(variance * float(np.sum((independent @ lags) ** 2 / (1.0 + ratios))))
-    powers, vectors = np.linalg.svd(delayed @ independent.T, full_matrices=False)[1:]
+    responses, command = delayed @ independent.T, own[:, 0]
+    along_command = responses.T @ command
+    left_of_command = float(command @ command - along_command @ np.linalg.solve(
+        np.eye(len(along_command)) + responses.T @ responses, along_command))
+    scale_deviation = math.sqrt(variance / max(left_of_command, np.finfo(float).tiny))
+    powers, vectors = np.linalg.svd(responses, full_matrices=False)[1:]
     return _Response(values / (1.0 + scale), (vectors @ independent)[powers ** 2 > _MIN_RATIO],
-                     deviation, criterion)
+                     deviation, criterion, scale_deviation)

@@ -14,7 +14,7 @@ from chance import seeds
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.reference_noise import rate_noise_share
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 import numpy as np
 import pytest
 
@@ -152,6 +152,18 @@ def test_a_limit_of_acceleration_leaves_the_gyro_known(kind, limit, period, seed
     (scale, deviation), = [(value, deviation) for name, _, value, deviation
                            in found.model.estimates() if name == 'scale_factor_error']
     assert abs(scale - SCALE) < 4.0 * deviation < 2e-3
+
+
+def test_a_swing_that_a_slow_robot_repeats_is_refused():
+    """Any waveform is a response to it, of any scale."""
+    step = INTERVAL / SUBSTEPS
+    command = 0.8 * np.sign(np.sin(2.0 * np.pi / 8.0 * step * np.arange(COUNT * SUBSTEPS)))
+    rate = followed(limited(command, 0.6 * step), 0.08, 20.0, 0.7)[::SUBSTEPS]
+    generator = np.random.default_rng(0)
+    log = Log(time=INTERVAL * np.arange(COUNT), reference_rate=command[::SUBSTEPS],
+              output=(1.0 + SCALE) * rate + BIAS + 1e-3 * generator.standard_normal(COUNT))
+    with pytest.raises(DataRefused, match='in a swing that repeats: turn at several rates'):
+        diagnose([log], generator, reference_kind='rate_command')
 
 
 def test_a_command_that_is_held_between_updates_has_no_noise():
