@@ -68,15 +68,20 @@ class FollowedReference:
 
     replays: tuple[Replay, ...]  # the logs, with the motion that follows as the reference
     lag: Estimate  # mean delay of the motion, s
+    # limits of acceleration away from and towards a rate of 0, rad/s², median of the logs, or inf
+    limits: Array
 
     def finding(self) -> Finding:
         """Return the finding of the lag."""
+        away, towards = self.limits.tolist()
+        limited = (f', accelerates by at most {away:.3g} rad/s² and slows down by at most '
+                   f'{towards:.3g} rad/s²' if math.isfinite(away + towards) else '')
         return make_finding(
             'reference_lag', {'reference_lag': self.lag},
             max(float(2.0 * norm.sf(abs(self.lag.estimate) / self.lag.deviation)),
                 MIN_PROBABILITY),
             evidence=f'the motion is {1e3 * self.lag.estimate:.0f} ms behind the reference rate '
-            'on average, and the output is compared with the motion that follows',
+            f'on average{limited}; the output is compared with the motion that follows',
             remedy='use a measured rate or heading as the reference')
 
 
@@ -110,16 +115,17 @@ def follow_reference(replays: Sequence[Replay], is_command: bool) -> FollowedRef
     Raises `DataRefused` where this is a command and no scale factor error can be known beside the
     response.
     """
-    followed, lags = zip(*(_follow(each, is_command) for each in replays))
+    followed, lags, limits = zip(*(_follow(each, is_command) for each in replays))
     weights = np.array([each.deviation for each in lags]) ** -2
     mean = float(np.average([each.estimate for each in lags], weights=weights))
     return FollowedReference(followed, Estimate.from_half_width(
-        mean, NORMAL_QUANTILE_975 * float(weights.sum() ** -0.5), 's'))
+        mean, NORMAL_QUANTILE_975 * float(weights.sum() ** -0.5), 's'),
+        np.median(limits, axis=0))
 
 
-def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate]:
+def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     """
-    Return a log with the motion that follows as the reference, and its mean delay, s.
+    Return a log with the motion that follows, its mean delay, s, and limits of acceleration.
 
     It is fitted with effects of the gyro along the motion, and with the noise that a first
     response leaves.
@@ -129,8 +135,8 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate]:
     kernels = kernels[longest < _MAX_LAG_SHARE * replay.duration]
     plain = replace(replay, command=replay.channels.rate)
     grid, command = plain.held_command
-    limited = plain.with_command(limit_acceleration(
-        command, plain.interval, _likely_limits(plain))[grid])
+    limits = _likely_limits(plain)
+    limited = plain.with_command(limit_acceleration(command, plain.interval, limits)[grid])
     # at first the motion follows commands from before the log
     begin = plain.channels.time[0] + longest[len(kernels) - 1]
     tried = [(each, _response_transforms(each, kernels)) for each in (
@@ -164,8 +170,9 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate]:
             'the motion follows its command late, and what it does then has the same effect as a '
             'scale factor error, as in a swing that repeats: turn at several rates for several '
             'seconds each, with rests, or use a measured rate or heading as the reference')
-    return moved, Estimate.from_half_width(
-        float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's')
+    return (moved, Estimate.from_half_width(
+        float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's'),
+        limits if chosen else np.full(2, math.inf))
 
 
 def _response_transforms(replay: Replay, kernels: Array) -> Array:
