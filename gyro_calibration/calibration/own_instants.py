@@ -79,7 +79,9 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     all_values = (np.append(values[0], own)[np.searchsorted(at, every, 'right')] if is_held
                   else np.interp(every, time, values))
     all_values[np.searchsorted(every, at)] = own
-    return OwnInstants(every, all_values, usual, is_held)
+    # two instants may be found where a gap ends
+    every, place = np.unique(every, return_index=True)
+    return OwnInstants(every, all_values[place], usual, is_held)
 
 
 def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> float | None:
