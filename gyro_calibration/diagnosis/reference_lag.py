@@ -137,10 +137,13 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     grid, command = plain.held_command
     limits = _likely_limits(plain)
     limited = plain.with_command(limit_acceleration(command, plain.interval, limits)[grid])
-    # at first the motion follows commands from before the log
-    begin = plain.channels.time[0] + longest[len(kernels) - 1]
+    # at first, and after a hole, the motion follows commands that are not in the log
+    time = plain.channels.time
+    known = time[np.isfinite(plain.reference)]
+    begins = np.append(time[0], known[1:][np.diff(known) > LEAD])
+    unknown = time - begins[np.searchsorted(begins, time, 'right') - 1] < longest[len(kernels) - 1]
     tried = [(each, _response_transforms(each, kernels)) for each in (
-        drop_samples(each, plain.channels.time < begin) for each in (plain, limited))]
+        drop_samples(each, unknown) for each in (plain, limited))]
     fits = [_fit_response(transforms, 1, kernels @ lags) for _, transforms in tried]
     # Two limits have to be worth their number (Schwarz), by as many independent errors as there
     # are changes of the command: most errors are after these, and by their time between samples.

@@ -159,6 +159,20 @@ def test_a_limit_of_acceleration_leaves_the_gyro_known(kind, limit, period, seed
     assert [float(each) for each in stated.groups()] == pytest.approx([limit, limit], rel=0.05)
 
 
+@pytest.mark.parametrize('kind', ['trapezoids', 'swing'])
+def test_what_follows_a_hole_in_the_command_is_left_out(kind):
+    """The motion follows commands that are not known, by an unknown lag."""
+    log = commanded_log(kind, 3e-5, 4)
+    log.reference_rate[1400:1460] = np.nan
+    found = diagnose([log], np.random.default_rng(0), reference_kind='rate_command')
+    named, = (each for each in found.findings if each.status == 'established')
+    lag = named.parameters['reference_lag']
+    assert lag.estimate == pytest.approx(0.08 + 2.0 * 0.7 / 8.0, abs=0.03)
+    (scale, deviation), = [(value, deviation) for name, _, value, deviation
+                           in found.model.estimates() if name == 'scale_factor_error']
+    assert abs(scale - SCALE) < 4.0 * deviation < 4e-3
+
+
 def test_a_swing_that_a_slow_robot_repeats_is_refused():
     """Any waveform is a response to it, of any scale."""
     step = INTERVAL / SUBSTEPS
