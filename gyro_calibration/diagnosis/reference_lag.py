@@ -151,11 +151,12 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
     moved, (rate, *seen) = tried[chosen]
     late = moved
-    others: list[Array] = []
+    fitted, others = fits[chosen], list[Array]()
     for _ in range(2):
-        own = [rate, *(cosine_transform(late.resample(each)) for each in others)]
-        fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
-                               len(own), kernels @ lags)
+        if others:
+            own = [rate, *(cosine_transform(late.resample(each)) for each in others)]
+            fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
+                                   len(own), kernels @ lags)
         response = fitted.values @ kernels
         change = next(late.delayed_commands(response[None]))
         # effects along this motion would otherwise pass for a longer response

@@ -587,10 +587,10 @@ def _evidence_alone(rest: RegressionFit, event: Candidate) -> float:
             - complexity_penalty(event))
 
 
-def eliminate_backward(search: Search, causes: Causes, beside: Causes = ()) -> Causes:
-    """Remove causes that are not significant given the others, the weakest first."""
+def eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Causes:
+    """Remove causes that are not significant given the others and some kept, weakest first."""
     while causes:
-        chances = [p_value(each.cause, evidence_for(search, (*causes, *beside), place))
+        chances = [p_value(each.cause, evidence_for(search, (*causes, *kept), place))
                    for place, each in enumerate(causes)]
         weakest = int(np.argmax(chances))
         if chances[weakest] < search.rate:
