@@ -140,7 +140,7 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     # at first, and after a hole, the motion follows commands that are not in the log
     time = plain.channels.time
     known = time[np.isfinite(plain.reference)]
-    begins = np.append(time[0], known[1:][np.diff(known) > LEAD])
+    begins = np.append(time[0], known[1:][np.diff(known) > LEAD + plain.interval])
     unknown = time - begins[np.searchsorted(begins, time, 'right') - 1] < longest[len(kernels) - 1]
     tried = [(each, _response_transforms(each, kernels)) for each in (
         drop_samples(each, unknown) for each in (plain, limited))]

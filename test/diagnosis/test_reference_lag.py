@@ -98,6 +98,16 @@ def test_the_lag_of_a_robot_is_no_effect_of_its_gyro(kind, noise):
         assert abs(values[name][0] - true) < 4.0 * values[name][1]
 
 
+def test_a_command_may_be_recorded_ten_times_a_second():
+    log = commanded_log('trapezoids', 3e-4, 1)
+    slow = Log(output=log.output[::2], time=log.time[::2], reference_rate=log.reference_rate[::2])
+    found = diagnose([slow], np.random.default_rng(0))
+    assert {each.effect for each in found.findings} == {'reference_lag'}
+    values = {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
+    for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
+        assert abs(values[name][0] - true) < 4.0 * values[name][1]
+
+
 @pytest.mark.parametrize('robot', [(0.0, 1.6, 0.4), (0.1, 4.0, 1.0)])
 @pytest.mark.parametrize('kind, walk', [('trapezoids', 0.0), ('trapezoids', 0.3), ('swing', 0.0)])
 @pytest.mark.parametrize('seed', seeds(1))
