@@ -154,7 +154,10 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     fitted, others = fits[chosen], list[Array]()
     for _ in range(2):
         if others:
-            own = [rate, *(cosine_transform(late.resample(each)) for each in others)]
+            motion, *own = (cosine_transform(late.resample(each)) for each in (
+                moved.channels.rate, *others))
+            # what an effect has in common with the motion would pass for a part of it
+            own = [rate, *(each - motion * (motion @ each) / (motion @ motion) for each in own)]
             fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
                                    len(own), kernels @ lags)
         response = fitted.values @ kernels
