@@ -448,6 +448,9 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: Least residual over the longest spans, and least rotation of the reference, rad, for which
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
+#: Longest lag of a gyro, s; largest trial lag and distance of trial lags, in spans; ratio of the
+#: lags at which a motion follows its reference.
+MAX_GYRO_LAG, _MAX_LAG_SPANS, _LAG_STEP, _LAG_RATIO = 0.1, 25, 0.25, 1.5
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
 _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 
@@ -461,6 +464,8 @@ class Agreement(NamedTuple):
     coherence: float  # common share of the variance
     residual: float  # standard deviation, rad
     noise_share: float  # largest share of the variance of the integral that may be white noise
+    lag: float = 0.0  # of the reference behind the integral, s
+    lag_step: float = 0.0  # of the trial lags, s
 
     def is_followed(self) -> bool:
         """Tell whether the reference may have made half the turns of the gyro, at least."""
@@ -468,12 +473,73 @@ class Agreement(NamedTuple):
         return highest > 0.5 * (1.0 - self.noise_share)
 
 
-def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
-    """Return the gates of a log with a reference, up to the first that failed."""
+def check_gates(log: Log, model: GyroModel | None = None, is_command: bool = False
+                ) -> tuple[Gate, ...]:
+    """
+    Return the gates of a log with a reference, up to the first that failed.
+
+    The motion may follow a command with any response, which is fitted later.
+    """
     results = [] if log.output is None else list(_run_gates(log, model))
-    failed = next((place for place, gate in enumerate(results) if gate.passed is False),
-                  len(results))
-    return tuple(results[:failed + 1])
+    failed = next((place for place, gate in enumerate(results) if gate.passed is False), None)
+    if failed is None:
+        return tuple(results)
+    late = (_late_motion_gate(log, results[failed], is_command)
+            if log.reference_rate is not None else results[failed])
+    return (*results[:failed], late)
+
+
+def _late_motion_gate(log: Log, failed: Gate, is_command: bool) -> Gate:
+    """
+    Return the gate of a motion that follows a rate late, or the one that failed if it does not.
+
+    Later than a gyro, and not in the ratio of two units at all frequencies, as a robot follows its
+    command; it turns opposite to a swing half a period later.
+    """
+    assert log.time is not None and log.output is not None
+    reference = reference_angle(log)
+    by_length = compare_headings(log, reference)
+    if not by_length:
+        return failed
+    best = max(by_length, key=lambda each: each.coherence)
+    if abs(best.lag) <= max(MAX_GYRO_LAG, best.lag_step):
+        return failed
+    gain, deviation, coherence = _response_gain(
+        log.time, integrate(log.time, bridge_gaps(log.output)), reference,
+        best.lag_step / _LAG_STEP)
+    is_ratio = (failed.name != 'motion' and deviation < _MAX_DEVIATION * abs(gain)
+                and _factor_ratio(gain, 1.0 / best.factor) < UNIT_TOLERANCE)
+    if coherence < _MIN_MOTION_COHERENCE or is_ratio:
+        return failed
+    evidence = (f'{100.0 * coherence:.3g} % of the variance of the heading over spans follows the '
+                'reference, but late, and slow motion in another ratio than fast motion')
+    return (Gate('motion', None, evidence) if is_command
+            else Gate('motion', False, evidence,
+                      'if this is the command of a robot, state --reference-kind rate_command, '
+                      'and turn at several rates for several seconds each, with rests; otherwise '
+                      'give a reference of this motion, with stamps of the same clock'))
+
+
+def _response_gain(time: Array, turned: Array, reference: Array, span: float
+                   ) -> tuple[float, float, float]:
+    """
+    Return the gain of a motion that follows a heading with any response, and how well it does.
+
+    They are the sum of the response at lags from 0 to 25 spans, each with a prior of 0 +- 1; its
+    standard deviation; and the share of the variance of the motion over spans.
+    """
+    lags = span * np.append(0.0, _LAG_RATIO ** np.arange(
+        int(math.log(_MAX_LAG_SPANS) / math.log(_LAG_RATIO)) + 1))
+    at = np.arange(time[0] + lags[-1], time[-1], span)
+    moved = np.diff(np.interp(at, time, turned))
+    columns = np.array([*(np.diff(np.interp(at - lag, time, reference)) for lag in lags),
+                        np.full(len(moved), span)]).T
+    left = moved - columns @ np.linalg.lstsq(columns, moved, rcond=None)[0]
+    variance = float(left @ left) / (len(left) - len(lags) - 1)
+    inverse = np.linalg.inv(columns.T @ columns + variance * np.diag([*np.ones(len(lags)), 0.0]))
+    gain = inverse[:-1].sum(axis=0)
+    return (float(gain @ (columns.T @ moved)), math.sqrt(variance * float(gain[:-1].sum())),
+            1.0 - float(np.var(left) / max(np.var(moved), np.finfo(float).tiny)))
 
 
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
@@ -635,14 +701,15 @@ def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading
     change, steps = np.diff(heading), np.diff(point_times)
     # at fractions of a span, of which a delay may be a swing's phase of some degrees: where no lag
     # near zero agrees, one half a period later does, in the opposite sense
-    lags = 0.25 * span * np.arange(-100, 101)
+    lags = _LAG_STEP * span * np.arange(-_MAX_LAG_SPANS / _LAG_STEP, _MAX_LAG_SPANS / _LAG_STEP + 1)
     found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change,
                               white) for lag in lags]
     least = min(1.0 - each.coherence for each in found)
     # a periodic motion agrees again a period later
     near = [place for place, each in enumerate(found)
             if 1.0 - each.coherence <= 1.5 * least + 0.01]
-    return found[min(near, key=lambda place: abs(lags[place]))]
+    place = min(near, key=lambda place: abs(lags[place]))
+    return found[place]._replace(lag=float(lags[place]), lag_step=_LAG_STEP * span)
 
 
 def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> Agreement:

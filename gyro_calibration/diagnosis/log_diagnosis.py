@@ -106,7 +106,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     remarks: list[str] = []
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
-        passed = check_gates(log, model)
+        passed = check_gates(log, model, reference_kind == 'rate_command')
         failed = mismatch_finding(passed)
         if failed is None or failed.effect != 'wrapped_heading':
             refuse_unusable(given[place])

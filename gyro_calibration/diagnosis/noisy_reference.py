@@ -46,6 +46,7 @@ from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
     probabilities, Reference, RULED_OUT_DEFICIT, SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR,
     TIME_LIMIT_REMARK, Trace, VALUE_ALARM_SHARE)
+from gyro_calibration.diagnosis.gates import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
@@ -61,8 +62,6 @@ from scipy.stats import t as student
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Standard deviations of a value that is found in 95 % of logs.
 DETECTION_SIGMAS = 4.8
-#: Longest lag of a gyro, s.
-MAX_GYRO_LAG = 0.1
 _CLOCK_REMEDY = ('synchronize the clocks of gyro and reference; the model does not contain it')
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',

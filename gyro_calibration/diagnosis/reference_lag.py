@@ -29,7 +29,7 @@ from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
 from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
-from gyro_calibration.diagnosis.noisy_reference import MAX_GYRO_LAG
+from gyro_calibration.diagnosis.gates import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (

@@ -178,3 +178,29 @@ def test_a_commanded_rate_that_hardly_changes_shows_no_unit():
     log = Log(output=command + 0.01 + 0.02 * generator.standard_normal(len(time)), time=time,
               reference_rate=command)
     assert all(gate.passed is not False for gate in check_gates(log))
+
+
+def followed(command, most):
+    """Return a rate that follows a command by at most so many rad/s²."""
+    rates = [0.0]
+    for wanted in command[1:].tolist():
+        rates.append(rates[-1] + np.clip(wanted - rates[-1], -0.01 * most, 0.01 * most))
+    return np.array(rates)
+
+
+def test_a_robot_that_follows_a_swing_in_part_is_no_unit_error():
+    command = np.sin(2.0 * np.pi * 0.3 * TIME)
+    output = followed(command, 0.5) + 1e-3 * np.random.default_rng(1).standard_normal(len(TIME))
+    log = Log(output=output, time=TIME, reference_rate=command)
+    gate = check_gates(log)[-1]
+    assert gate.name == 'motion' and not gate.passed and 'rate_command' in gate.remedy, gate
+    assert all(gate.passed is not False for gate in check_gates(log, is_command=True))
+
+
+@pytest.mark.parametrize('factor, name', [(-1.0, 'sense'), (DEGREE, 'unit'), (0.5, 'unit')])
+def test_a_robot_that_follows_steps_late_shows_its_unit(factor, name):
+    generator = np.random.default_rng(2)
+    command = np.repeat(generator.uniform(-1.0, 1.0, 40), 300)
+    output = factor * (followed(command, 0.5) + 1e-3 * generator.standard_normal(len(TIME)))
+    gate = check_gates(Log(output=output, time=TIME, reference_rate=command), is_command=True)[-1]
+    assert gate.name == name and gate.passed is False, gate
