@@ -701,7 +701,8 @@ def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading
     change, steps = np.diff(heading), np.diff(point_times)
     # at fractions of a span, of which a delay may be a swing's phase of some degrees: where no lag
     # near zero agrees, one half a period later does, in the opposite sense
-    lags = _LAG_STEP * span * np.arange(-_MAX_LAG_SPANS / _LAG_STEP, _MAX_LAG_SPANS / _LAG_STEP + 1)
+    most = _MAX_LAG_SPANS / _LAG_STEP
+    lags = _LAG_STEP * span * np.arange(-most, most + 1.0)
     found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change,
                               white) for lag in lags]
     least = min(1.0 - each.coherence for each in found)
