@@ -23,6 +23,8 @@ from scipy.interpolate import CubicSpline
 
 #: Longest interval of a slow reference, s; what is steady for longer is a motion.
 _LONGEST_INTERVAL = 1.0
+#: Longest lag of a gyro, s.
+MAX_GYRO_LAG = 0.1
 #: Step of a heading from which on it is that of an encoder, whose changes are exact, rad.
 MAX_ROUNDING_STEP = 2e-4
 #: Largest change of the slope on a straight line as a share of the usual slope, and least number
@@ -146,7 +148,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         if found is None or not (found.interval <= _LONGEST_INTERVAL
                                  or found.is_held and is_heading):
             continue
-        if found.is_held and not is_heading and is_command(log, given):
+        if found.is_held and not is_heading and output_delay(log, given) > -0.25 * found.interval:
             continue
         # not those in gaps
         after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
@@ -165,21 +167,22 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     return log, kept
 
 
-def is_command(log: Log, held: Array) -> bool:
+def output_delay(log: Log, rate: Array) -> float:
     """
-    Tell whether the gyro is later than a held rate, as a robot that follows its command.
+    Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s.
 
-    A rate that was measured, and held, is later than the motion.
+    A robot is later than its command, and a rate that was measured and is held is later than the
+    motion, by half of the time that it is held.
     """
     assert log.time is not None and log.output is not None
-    known, output = np.isfinite(held), bridge_gaps(log.output)
+    known, output = np.isfinite(rate), bridge_gaps(log.output)
     sample = float(np.median(np.diff(log.time)))
     delays = sample * np.arange(-round(_LONGEST_INTERVAL / sample),
                                 round(_LONGEST_INTERVAL / sample) + 1)
-    late = (np.interp(log.time - delay, log.time[known], held[known]) for delay in delays.tolist())
+    late = (np.interp(log.time - delay, log.time[known], rate[known]) for delay in delays.tolist())
     # correlations but for the scatter of the output, which a dead gyro does not have
     alike = [(output - output.mean()) @ each / max(each.std(), 1e-300) for each in late]
-    return bool(delays[int(np.argmax(alike))] > 0.0)
+    return float(delays[int(np.argmax(alike))])
 
 
 def is_slow(values: Array) -> bool:

@@ -17,7 +17,7 @@ import math
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.own_instants import (
-    find_own_instants, is_command, keep_own_instants)
+    find_own_instants, keep_own_instants, MAX_GYRO_LAG, output_delay)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
@@ -167,9 +167,11 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     time = np.arange(len(known)) if log.time is None else log.time
     steps = np.diff(time[known])
     begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
-    if log.time is not None and len(begins) < 0.5 * len(rate) and is_command(
-            log, log.reference_rate):
-        return 0.0
+    if log.time is not None and (is_commanded or len(begins) < 0.5 * len(rate)):
+        delay = output_delay(log, log.reference_rate)
+        held = len(rate) / max(len(begins), 1) * float(np.median(steps))
+        if delay > (MAX_GYRO_LAG if len(begins) >= 0.5 * len(rate) else -0.25 * held):
+            return 0.0
     slow = None if log.time is None else find_own_instants(log.time[known], rate)
     if slow is not None and slow.is_held:
         counts = np.diff(begins, append=len(rate))

@@ -30,7 +30,7 @@ from gyro_calibration.calibration.dwells import (
     few_values_remedy, find_lost_reference, require_output)
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.own_instants import (
-    interpolate_by_splines, is_slow, MAX_ROUNDING_STEP)
+    interpolate_by_splines, is_slow, MAX_GYRO_LAG, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
     heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
@@ -448,9 +448,9 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: Least residual over the longest spans, and least rotation of the reference, rad, for which
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
-#: Longest lag of a gyro, s; largest trial lag and distance of trial lags, in spans; ratio of the
-#: lags at which a motion follows its reference.
-MAX_GYRO_LAG, _MAX_LAG_SPANS, _LAG_STEP, _LAG_RATIO = 0.1, 25, 0.25, 1.5
+#: Largest trial lag and distance of trial lags, in spans; ratio of the lags at which a motion
+#: follows its reference.
+_MAX_LAG_SPANS, _LAG_STEP, _LAG_RATIO = 25, 0.25, 1.5
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
 _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 

@@ -32,7 +32,7 @@ from gyro_calibration.calibration.heading_regression import (
     lay_out_spans, MIN_STRETCHES, MISALIGNMENT_TERM, SpanFit, Spans, whiten_regression,
     WhitenedRegression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
-from gyro_calibration.calibration.own_instants import OwnInstants
+from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.diagnosis.candidates import (
     lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE)
 from gyro_calibration.diagnosis.causes import (
@@ -46,7 +46,6 @@ from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
     probabilities, Reference, RULED_OUT_DEFICIT, SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR,
     TIME_LIMIT_REMARK, Trace, VALUE_ALARM_SHARE)
-from gyro_calibration.diagnosis.gates import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975

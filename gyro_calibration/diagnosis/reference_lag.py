@@ -25,11 +25,11 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import HEADING_TREATMENT, MIN_STRETCHES
+from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
 from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
-from gyro_calibration.diagnosis.gates import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (
@@ -184,7 +184,8 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
         others = [column for name in _MOTION_EFFECTS
                   for column in effect_candidate(name).columns(moved)]
     most = _MAX_PRIOR_SHARE * HEADING_TREATMENT.prior[0]
-    if is_command and fitted.scale_deviation > most:
+    # on average no motion is ahead of its command
+    if is_command and (fitted.scale_deviation > most or response @ lags < -LEAD):
         raise DataRefused(
             'the motion follows its command late, and what it does then has the same effect as a '
             'scale factor error, as in a swing that repeats: turn at several rates for several '
@@ -222,19 +223,21 @@ def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Ar
         apart = at[place:] - at[:len(at) - place]
         band[:len(apart)] = (np.append(alike, 0.0)[np.minimum(apart, len(alike))]
                              * sizes[place:] * sizes[:len(apart)])
-    best, delays = len(known) * math.log(whole @ whole) - math.log(len(known)), 0.0 * seen
+    count, added = np.count_nonzero(known), np.zeros(len(command))
+    best = count * math.log(whole @ whole) - math.log(count)
     for deviation in _CHANGE_DEVIATIONS:
         ratio = (deviation / noise) ** 2
         factor = cholesky_banded(ratio * bands + np.eye(width, 1), lower=True)
-        tried = ratio * cho_solve_banded((factor, True), seen)
-        criterion = (len(known) * math.log(whole @ whole - seen @ tried)
-                     + 2.0 * np.log(factor[0]).sum())
+        delays = ratio * cho_solve_banded((factor, True), seen)
+        impulses = np.zeros(len(command))
+        impulses[at] = sizes * delays
+        tried = oaconvolve(np.pad(impulses, (len(response) - 1 - lead, lead)), response, 'valid')
+        rest = left[known] - tried[grid[known]]
+        criterion = (count * math.log(rest @ rest + delays @ delays / ratio)
+                     + 2.0 * float(np.log(factor[0]).sum()))
         if criterion < best:
-            best, delays = criterion, tried
-    impulses = np.zeros(len(command))
-    impulses[at] = sizes * delays
-    return np.asarray(oaconvolve(np.pad(impulses, (len(response) - 1 - lead, lead)), response,
-                                 'valid')[grid])
+            best, added = criterion, tried
+    return np.asarray(added[grid])
 
 
 def _response_transforms(replay: Replay, kernels: Array) -> Array:

@@ -139,18 +139,18 @@ def test_rests_in_which_the_bias_wanders_are_no_lost_reference(seed):
     assert drop_repeated_headings(log)[1] == []
 
 
-def test_the_instants_of_a_held_command_are_found_beside_a_gap():
+def test_the_instants_of_a_held_rate_are_found_beside_a_gap():
     """Two of them might be the same at the end of the gap, and no spline goes through these."""
     time = np.arange(6000) / 50.0
     for seed in range(40):
         generator = np.random.default_rng(seed)
-        command = sum(size * np.sin(2.0 * np.pi * frequency * time) for size, frequency in zip(
+        motion = sum(size * np.sin(2.0 * np.pi * frequency * time) for size, frequency in zip(
             generator.uniform(0.1, 0.5, 3), generator.uniform(0.02, 0.3, 3)))
-        command = command[np.arange(6000) // 5 * 5]
+        measured = motion[np.arange(6000) // 5 * 5]
         begin, length = generator.integers([500, 10], [5000, 300])
         kept = np.delete(np.arange(6000), slice(begin, begin + length))
         _, instants = keep_own_instants(Log(
-            time=time[kept], reference_rate=command[kept],
-            output=(command + 0.01 * generator.standard_normal(6000))[kept]))
+            time=time[kept], reference_rate=measured[kept],
+            output=(motion + 0.01 * generator.standard_normal(6000))[kept]))
         known = instants.time[np.isfinite(instants.time)]
         assert (np.diff(known) > 0.0).all() and len(known) == pytest.approx(len(kept) / 5, rel=0.1)
