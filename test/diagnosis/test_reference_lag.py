@@ -10,6 +10,7 @@
 
 """What a motion does beside its commanded rate is not named as an effect of the gyro."""
 
+from dataclasses import replace
 import re
 
 from chance import seeds
@@ -19,6 +20,7 @@ from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 INTERVAL, SUBSTEPS, COUNT = 0.05, 20, 3000
 SCALE, BIAS = 0.012, 0.3 * DEGREE
@@ -106,6 +108,41 @@ def test_a_command_may_be_recorded_ten_times_a_second():
     values = {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
     for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
         assert abs(values[name][0] - true) < 4.0 * values[name][1]
+
+
+def turns_between_samples(seed):
+    """Return a log at 50 Hz of a robot 0.4 s late, whose command is sent at 20 Hz."""
+    generator = np.random.default_rng(seed)
+    sizes = np.ravel([[0.0, each] for each in generator.choice([-0.8, 0.8], 16)])
+    command = np.repeat(sizes, 50 * generator.integers(40, 160, len(sizes)))  # at 1000 Hz
+    rate = lfilter([0.0025], [1.0, -0.9975], command)[::20]
+    time = 0.02 * np.arange(len(rate))
+    return Log(output=(1.0 + SCALE) * rate + BIAS + 2e-3 * generator.standard_normal(len(rate)),
+               time=time, reference_rate=command[::20])
+
+
+@pytest.mark.parametrize('seed', seeds(2))
+def test_a_command_may_change_between_the_samples_of_a_log(seed):
+    """Each change is seen up to a sample late; not the dwells alone show the gyro, all does."""
+    found = diagnose([turns_between_samples(seed)], np.random.default_rng(0),
+                     reference_kind='rate_command')
+    assert {each.effect for each in found.findings if each.status == 'established'} == {
+        'reference_lag'} and not found.remarks
+    values = {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
+    for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
+        value, deviation = values[name]
+        assert abs(value - true) < 4.0 * deviation
+
+
+def test_a_late_motion_is_compared_with_its_command_however_that_jitters():
+    log = commanded_log('swing', 3e-4, 1, period=0.1, jitter=0.1, robot=(0.2, 8.0, 0.7))
+    assert rate_noise_share(log, True) == 0.0
+    sample = replace(log, reference_rate=log.reference_rate + 0.01 * np.random.default_rng(
+        1).standard_normal(len(log)))
+    assert rate_noise_share(sample, True) == 0.0
+    # which a rate that was measured is not
+    on_time = replace(sample, output=commanded_log('swing', 3e-4, 1, robot=(0.0, 40.0, 1.0)).output)
+    assert rate_noise_share(on_time, True) > 0.1
 
 
 @pytest.mark.parametrize('robot', [(0.0, 1.6, 0.4), (0.1, 4.0, 1.0)])
