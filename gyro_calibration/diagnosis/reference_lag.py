@@ -156,7 +156,8 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
     chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
     moved, (rate, *seen) = tried[chosen]
-    late, between = moved, np.zeros(len(time))
+    late = moved
+    between: Array = np.zeros(len(time))
     fitted, others = fits[chosen], list[Array]()
     for _ in range(2):
         if others:

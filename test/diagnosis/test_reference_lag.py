@@ -141,8 +141,8 @@ def test_a_late_motion_is_compared_with_its_command_however_that_jitters():
         1).standard_normal(len(log)))
     assert rate_noise_share(sample, True) == 0.0
     # which a rate that was measured is not
-    on_time = replace(sample, output=commanded_log('swing', 3e-4, 1, robot=(0.0, 40.0, 1.0)).output)
-    assert rate_noise_share(on_time, True) > 0.1
+    prompt = commanded_log('swing', 3e-4, 1, robot=(0.0, 40.0, 1.0))
+    assert rate_noise_share(replace(sample, output=prompt.output), True) > 0.1
 
 
 @pytest.mark.parametrize('robot', [(0.0, 1.6, 0.4), (0.1, 4.0, 1.0)])
