@@ -223,7 +223,7 @@ def format_rows(rows: Iterable[Iterable[Any]]) -> str:
     return text.getvalue()
 
 
-def format_json(value: Any, indent: int | None = None) -> str:
+def format_json(value: Any) -> str:
     """Return a value as JSON, with null for numbers that are not finite."""
     def finite(part: Any) -> Any:
         if isinstance(part, dict):
@@ -232,7 +232,7 @@ def format_json(value: Any, indent: int | None = None) -> str:
             return [finite(each) for each in part]
         return None if isinstance(part, float) and not math.isfinite(part) else part
 
-    return json.dumps(finite(value), indent=indent, allow_nan=False)
+    return json.dumps(finite(value), allow_nan=False)
 
 
 def keep_aside(path: Path) -> str:
