@@ -44,8 +44,6 @@ from scipy.special import ndtri
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
 MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
-#: Duration between two jumps, s, in which the rate may be erroneous.
-_JUMP_DURATION = 2.0
 #: Longest step of the state, s.
 _STEP_DURATION = MEAN_LAGS[0]
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
@@ -279,7 +277,7 @@ class HeadingTracker:
 
     def _may_be_erroneous(self, time: float) -> bool:
         """Tell whether the rate has jumped so shortly before that it may be erroneous."""
-        return 0.0 <= time - self._before_jump[0] < _JUMP_DURATION
+        return 0.0 <= time - self._before_jump[0] < RECENT_DURATION
 
     def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
                      still: Array | None, gap: tuple[int, float] | None = None) -> str:

@@ -44,7 +44,7 @@ from gyro_calibration.model.motion import (
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
 from gyro_calibration.ros.inputs import (
-    Clock, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
+    Clock, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
 from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
@@ -54,7 +54,6 @@ FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
 SAMPLE_TIMEOUT = 5.0
-DRIVE_SAMPLE_TIMEOUT = 0.25  # s; likewise of a drive; four intervals of a slower gyro
 STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
 #: Least change of the odometry heading that shows a turn, rad: beyond the slack of wheels at rest.
 MIN_TURN_ANGLE = 1.0 * DEGREE
@@ -143,7 +142,7 @@ class Drive:
         self._start_time = self._last_poll = clock.steady()
         self._has_receiver = self._had_callers = self._lost_callers = False
         self._next_command_time = -math.inf
-        self._stamp_delay = StampDelay(clock, 2.0, (0.5, DRIVE_SAMPLE_TIMEOUT))
+        self._stamp_delay = StampDelay(clock, 2.0, (0.5, FAULT_DURATION))
         self.command_lateness = self.sample_lateness = 0.0  # largest ones, s
 
     def add_sample(self, time: float) -> None:
@@ -336,7 +335,7 @@ class CalibrationSession:
                           'to true and run again')
             if not drive.is_waiting(receivers):
                 usual = self._estimator.tracker.intervals.usual_interval
-                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.limits.max_gap)
+                timeout = min(max(FAULT_DURATION, 4.0 * usual), run.limits.max_gap)
                 is_driven = True
         # Decided at the second poll: after a pause of this process, queued samples are delivered
         # after its timers.

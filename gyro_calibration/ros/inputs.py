@@ -221,6 +221,9 @@ class RosTime:
         self._last_poll = now
 
 
+#: Shortest fault of the samples, s: none come (of a slower gyro for four intervals), they repeat a
+#: value, or their stamps or ROS time stand still.
+FAULT_DURATION = 0.25
 MAX_VELOCITY_AGE = 1.0  # largest age of a velocity that is used, s; slower odometry shows nothing
 #: Longest motion after the last command to move, s: the default time-out of ros2_control's
 #: diff_drive_controller.
