@@ -44,8 +44,6 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-#: Iterates over items, and may show the progress.
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 #: Half-width of the central 95 % interval of a normal distribution, standard deviations.
