@@ -103,10 +103,6 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     The instants are those of a slow reference, by `keep_own_instants`.
     """
     on_progress(None, 'data quality')
-    if reference.kind != 'rate_command' and log.reference_heading is not None:
-        log = replace(log, reference_rate=None)
-    else:
-        log = replace(log, reference_heading=None)
     record = inspect_record(replace(log, reference_heading=None, reference_rate=None))
     assert log.output is not None
     cleaned_log = replace(log, output=np.where(record.usable, log.output, np.nan))
