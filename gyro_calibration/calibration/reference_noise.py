@@ -49,6 +49,9 @@ _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Least noise of a course, rad, over a second or from span to span; by RTK fixes of a car in town
 #: it is 0.4 deg, and a motion capture with short gaps has less.
 MIN_COURSE_NOISE = 0.25 * DEGREE
+#: Time for which a recorder misses a reference that is not lost, as it does not begin, nor end, to
+#: receive all topics at once, s; or five intervals of the reference, as for gaps of a recording.
+_MAX_LATE_START = 0.1
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
@@ -228,7 +231,13 @@ def is_course(log: Log) -> bool:
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
     lost = float(find_lost_reference(known).mean())
-    if lost == 0.0 or cross_rotation(log).size:
+    rows = np.flatnonzero(known)
+    if lost == 0.0 or len(rows) < 2 or cross_rotation(log).size:
+        return False
+    stamps, (first, last) = log.time[rows], rows[[0, -1]]
+    at_ends = max(stamps[0] - log.time[0], log.time[-1] - stamps[-1])
+    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), _MAX_LATE_START)
+            and not find_lost_reference(known[first:last + 1]).any()):
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
