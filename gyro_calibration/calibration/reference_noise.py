@@ -62,19 +62,23 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     Return rests of 3 s and more: first and last row, shape (r, 2), and where the reference stands.
 
     The gyro is quiet, and the reference is lost, or stands: it is known and does not change. Where
-    it stands and the gyro is not quiet all the time, something moves, and there is no rest.
+    it stands and the gyro is not quiet on average, something moves, and there is no rest.
     """
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
     scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    is_quiet = scatter <= 2.0 * scatter.min(initial=math.inf) + 1e-12
+    # of the quietest rest: beside filtered noise, or steps of the output, single seconds may be
+    # far quieter by chance
+    quietest = maximum_filter1d(scatter, 3)[1:-1].min(initial=math.inf)
+    is_quiet = scatter <= 2.0 * quietest + 1e-12
     known = np.flatnonzero(np.isfinite(reference))
     changed = known[np.diff(reference[known], prepend=np.nan) != 0.0]
     is_lost, is_same = (np.bincount(rows // second, minlength=blocks)[:blocks] == 0
                         for rows in (known, changed))
     is_standing = is_same & ~is_lost
-    for run in find_runs(is_standing):
-        is_standing[run] &= is_quiet[run][1:-1].all()
+    for run in (each for each in find_runs(is_standing) if each.stop - each.start >= 3):
+        inner = slice(run.start + 1, run.stop - 1)
+        is_quiet[inner] = np.sqrt(np.mean(scatter[inner] ** 2)) <= 2.0 * quietest + 1e-12
     rests = [(second * run.start, second * run.stop - 1, stands)
              for stands, each in enumerate((binary_erosion(is_lost, border_value=1), is_standing))
              for run in find_runs(is_quiet & each) if run.stop - run.start >= 3]

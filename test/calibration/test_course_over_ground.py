@@ -15,12 +15,14 @@ import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.own_instants import keep_own_instants
-from gyro_calibration.calibration.reference_noise import heading_difference, is_course
+from gyro_calibration.calibration.reference_noise import (
+    find_rests, heading_difference, is_course)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import bridge_gaps
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 SCALE, BIAS = 1.01, 0.4 * DEGREE
 
@@ -206,3 +208,16 @@ def test_the_errors_of_a_reference_at_an_uneven_part_of_the_samples_are_found():
         output=rate + 0.1 * DEGREE * generator.standard_normal(len(time))))
     assert np.isfinite(log.reference_heading).mean() < 0.5
     assert heading_difference(log).total_walk == pytest.approx(0.2 * DEGREE, rel=0.2)
+
+
+def test_rests_are_found_beside_filtered_noise_and_coarse_steps():
+    """There, single seconds are far quieter than others by chance."""
+    time = np.arange(15_000) / 50.0
+    moves = time % 30.0 > 10.0
+    turned = np.where(moves, 0.3 * np.sin(1.3 * time), 0.0)
+    noise = np.random.default_rng(10).standard_normal(len(time))
+    slow = lfilter([0.1], [1.0, -0.9], noise)
+    for rate in (turned + 1e-3 * slow, np.round((turned + 3e-4 + 1e-3 * noise) / 3e-3) * 3e-3):
+        rests, stands = find_rests(time, rate, np.cumsum(turned))
+        assert len(rests) == 10 and stands.all()
+        assert np.diff(time[rests]).sum() == pytest.approx(100.0, abs=10.0)
