@@ -642,8 +642,9 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
             if is_settled:
                 raise
     if len(logs) > 1:
-        raise InputError(f'--method {method or "likelihood"} takes one log; '
-                         'give one log, or use --method dwells')
+        raise InputError((f'--method {method} takes one log' if method else
+                          'a log with a reference heading is fitted alone')
+                         + '; give one log, or use --method dwells')
     if others:
         raise InputError(HEADING_ALONE)
     (log,) = logs.values()
