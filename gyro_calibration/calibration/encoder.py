@@ -303,12 +303,13 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     return replace(log, reference_heading=heading - np.cumsum(sizes)), remarks
 
 
-def choose_reference(log: Log, by_rate: bool = False) -> tuple[Log, list[str]]:
+def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str]]:
     """
     Return a log with a single reference over time, and remarks on what was left out.
 
-    Of a heading and a rate it is the heading, unless this is known for less than half as long, or
-    the rate is wanted: a rate may be filtered, or a command, where a heading is what was turned.
+    Of a heading and a rate it is the heading, unless this is known for less than half as long: a
+    rate may be filtered, or a command, where a heading is what was turned. If a rate is preferred,
+    it is that where both turn alike.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -316,23 +317,25 @@ def choose_reference(log: Log, by_rate: bool = False) -> tuple[Log, list[str]]:
         return replace(log, reference_rate=rate, reference_heading=heading), []
     counts = [int(np.count_nonzero(~find_lost_reference(np.isfinite(each))))
               for each in (rate, heading)]
-    is_lost = 2 * counts[1] < counts[0]
-    remarks = [f'The reference heading is known in {counts[1]} samples only; the rate, known in '
-               f'{counts[0]}, is used.'] * is_lost
-    by_rate |= is_lost
+    by_rate, remarks = 2 * counts[1] < counts[0], []
+    if by_rate:
+        remarks.append(f'The reference heading is known in {counts[1]} samples only; the rate, '
+                       f'known in {counts[0]}, is used.')
     known = np.isfinite(rate) & np.isfinite(heading)
     if np.count_nonzero(known) >= 100:
         time = log.time[known] - log.time[known][0]
         pieces, motion = split_run(time, rate[known]), motion_from_headings(time, heading[known])
+        turned, largest = pieces.reference_angle(motion), RunLimits().max_scale_deviation
+        alike = np.sum((pieces.gyro_angle - turned) ** 2) <= largest ** 2 * np.sum(turned ** 2)
+        by_rate |= prefer_rate and bool(alike)
         unexplained, scale, _ = fit_profile(pieces, motion, MAX_ENCODER_OFFSET)
         late, _, delay = fit_profile(pieces, motion, COURSE_TREATMENT.largest_delay)
         contradiction = ''
         # a longer delay that explains less than half is chance, as in a motion that repeats
-        if late < 0.5 * unexplained:
+        if not alike and late < 0.5 * unexplained:
             contradiction = f'is {abs(delay):.1f} s {"behind" if delay > 0.0 else "ahead of"}'
         # what noise or another delay may do to the scale is less than the root of what they leave
-        elif abs(scale - 1.0) >= max(RunLimits().max_scale_deviation,
-                                     math.sqrt(max(unexplained, 0.0))):
+        elif abs(scale - 1.0) >= max(largest, math.sqrt(max(unexplained, 0.0))):
             contradiction = f'turns {scale:.3f} times as far as'
         if contradiction:
             remarks.append(f'The reference rate {contradiction} the reference heading; the '

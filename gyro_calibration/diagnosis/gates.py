@@ -285,7 +285,7 @@ def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
     if log.time is None:
         return log, ()
-    log, notes = choose_reference(log)
+    log, notes = choose_reference(log, prefer_rate=True)
     rate = reference_rate(log)
     if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not is_at_rest(log):
         return log, tuple(notes)
@@ -464,8 +464,8 @@ class Agreement(NamedTuple):
 
 def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
     """Return the gates of a log with a reference, up to the first that failed."""
-    results = ([] if log.output is None
-               else list(_run_gates(choose_reference(log)[0], model)))
+    results = [] if log.output is None else list(
+        _run_gates(choose_reference(log, prefer_rate=True)[0], model))
     failed = next((place for place, gate in enumerate(results) if gate.passed is False),
                   len(results))
     return tuple(results[:failed + 1])

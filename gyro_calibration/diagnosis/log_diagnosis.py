@@ -103,7 +103,10 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
     all_gates: list[Gate] = []
-    logs, chosen = zip(*(choose_reference(log, reference_kind == 'rate_command') for log in logs))
+    if reference_kind == 'rate_command':
+        logs = [log if log.reference_rate is None else replace(log, reference_heading=None)
+                for log in logs]
+    logs, chosen = zip(*(choose_reference(log, prefer_rate=True) for log in logs))
     given, remarks = logs, [remark for each in chosen for remark in each]
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):

@@ -130,8 +130,8 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     """
     Read a log file (.csv or .csv.gz), with the parameters of `api.read_log`.
 
-    Values are separated by commas, or by semicolons, tabs or spaces; then the decimal mark may be a
-    comma, but with spaces.
+    Values are separated by commas or spaces, or by semicolons or tabs; then the decimal mark may
+    be a comma.
     `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
     """
     blocks, numbers = [], 0
