@@ -467,8 +467,9 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
            f'({reference.evidence}); if it is another kind, state it with --reference-kind. Its '
            f'errors: {errors}.')
     if done.lacks_turns:
-        yield ('Fewer than three stretches with rotation determine the scale factor error, whose '
-               'standard deviation is that of the prior, '
+        yield ('Fewer than three stretches of '
+               f'{done.spans.treatment.stretch_duration:g} s have most of the rotation, and '
+               'determine the scale factor error, whose standard deviation is that of the prior, '
                f'{100.0 * done.spans.treatment.prior[0]:g} %: turn more often, in both '
                'directions.')
 
