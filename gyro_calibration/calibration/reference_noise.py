@@ -67,8 +67,8 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
     scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    # of the quietest rest, as of filtered noise single seconds are far quieter by chance; an output
-    # whose steps hide its noise does not show its bias in a rest
+    # of the quietest rest, as of filtered noise single seconds are far quieter by chance; where
+    # steps hide the noise, a rest does not show the bias
     quietest = (maximum_filter1d(scatter, 3)[1:-1].min(initial=math.inf) if scatter.all()
                 else 0.0)
     is_quiet = scatter <= 2.0 * quietest + 1e-12
