@@ -948,8 +948,9 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     """
     spans = lay_out_spans(log, 'course', np.array(TECHNOLOGY_PRIORS[technology]))
     length = spans.treatment.min_span
-    if len(spans.time) < _MIN_SPANS:
-        raise DataRefused(f'the course is known for {len(spans.time) * length:.0f} s, wanted at '
+    duration = len(spans.time) * length + spans.rest_durations[spans.stands].sum()
+    if duration < _MIN_SPANS * length:
+        raise DataRefused(f'the course is known for {duration:.0f} s, wanted at '
                           f'least {_MIN_SPANS * length:.0f} s: drive for longer, faster than a '
                           'walk')
     fit = fit_spans(spans)

@@ -76,8 +76,8 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
 #: letters only, before the unit.
 _COLUMN_ALIASES = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
-    'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|gyroscope|gyroscopez|omega|omegaz|.*angularvelocityz|'
-            r'angvelz|yawrate|gyrorate',
+    'gyro': r'w|wz|gz|(gyro|gyr|gyroscope|omega)(rotation|rate)?z?|angvelz|yawrate|'
+            r'.*(angularvelocity|rotationrate)z',
     'temperature': r'temp|temperature|tempc|gyrotemp|imutemp|dietemp|tgyro',
     'rate': r'ref|reference|referencerate|refrate|truerate|tablerate|ratetable',
     'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
