@@ -472,9 +472,8 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
            f'errors: {errors}.')
     if done.lacks_turns:
         yield ('Fewer than three stretches with rotation determine the scale factor error, whose '
-               'standard deviation is that of the prior, '
-               f'{100.0 * done.spans.treatment.prior[0]:g} %: turn more often, in both '
-               'directions.')
+               f'interval of 95 % is +- {100.0 * done.half_width(0):.2g} %: turn more often, in '
+               'both directions.')
 
 
 def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
