@@ -585,9 +585,15 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
             yield ('the reference is never lost, as odometry, and stands in no rest: its drift in '
                    'motion has the same effect as a bias, which the intervals do not include; '
                    'rest now and then')
-        if abs(s) > NORMAL_QUANTILE_975 * TECHNOLOGY_PRIORS[technology][0]:
+        half = NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0])
+        largest = NORMAL_QUANTILE_975 * TECHNOLOGY_PRIORS[technology][0]
+        if abs(s) > largest:
             yield ('the scale factor error is beyond what gyros of the technology '
                    f'{technology} have: check the units, and the size and distance of wheels')
+        elif half > 1.001 * largest:
+            yield ('the drive does not show whether the reference has a wrong scale, as of wheels '
+                   'at another distance, so that the interval of the scale factor error is wider '
+                   f'than that of gyros of the technology {technology}: turn more often')
         else:
             yield (f'scale factor error and bias have priors of the technology {technology} '
                    '(--technology) with mean zero, which the intervals include')

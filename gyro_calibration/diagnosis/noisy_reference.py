@@ -467,9 +467,8 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
     if done.lacks_turns:
         yield ('Fewer than three stretches of '
                f'{done.spans.treatment.stretch_duration:g} s have most of the rotation, and '
-               'determine the scale factor error, whose standard deviation is that of the prior, '
-               f'{100.0 * done.spans.treatment.prior[0]:g} %: turn more often, in both '
-               'directions.')
+               'determine the scale factor error, whose interval of 95 % is +- '
+               f'{100.0 * done.half_width(0):.2g} %: turn more often, in both directions.')
 
 
 def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:

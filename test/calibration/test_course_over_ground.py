@@ -14,11 +14,13 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.heading_regression import lay_out_spans
 from gyro_calibration.calibration.own_instants import keep_own_instants
 from gyro_calibration.calibration.reference_noise import (
     find_rests, heading_difference, is_course)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.log import (
+    DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, read_log)
 from gyro_calibration.logs.quality import bridge_gaps
 import numpy as np
 import pytest
@@ -177,6 +179,41 @@ def test_wheels_at_another_distance_are_no_slip(track):
     assert abs((1.0 + found.fit.scale_factor_error) * track / SCALE - 1.0) < 3.0 * deviation
     assert deviation < 0.02
     assert 'beyond what gyros of the technology mems have' in ' '.join(found.remarks)
+
+
+def short_odometry(seed, track, turns, slip):
+    """Return 90 s with turns of 90 deg, beside wheels whose heading walks by `slip` in each."""
+    generator, time = np.random.default_rng(seed), np.arange(0.0, 90.0, 0.02)
+    rate, is_turning = 0.2 * DEGREE * np.sin(time), np.zeros(len(time), dtype=bool)
+    for begin in np.linspace(5.0, 80.0, turns):
+        inside = (time >= begin) & (time < begin + 4.0)
+        rate[inside] += generator.choice([-1.0, 1.0]) * 45.0 * DEGREE * np.sin(
+            np.pi * (time[inside] - begin) / 4.0) ** 2
+        is_turning |= inside
+    slips = slip / math.sqrt(200.0) * is_turning * generator.standard_normal(len(time))
+    return Log(time=time, output=SCALE * rate + BIAS + 1e-3 * generator.standard_normal(len(time)),
+               reference_heading=np.cumsum(track * 0.02 * rate + slips))
+
+
+@pytest.mark.parametrize('track', [0.94, 1.0])
+def test_a_scale_that_a_short_drive_hardly_shows_is_in_the_interval(track):
+    """Wrong ones were near 0 with the interval of a gyro, +- 2 %."""
+    held = []
+    for seed in range(6):
+        fit = calibrate_encoder(short_odometry(seed, track, 5, 5.0 * DEGREE), 'course').fit
+        held.append(abs(fit.scale_factor_error - SCALE / track + 1.0)
+                    < NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0]))
+    assert np.sum(held) >= 5
+
+
+def test_noise_of_the_gyro_is_no_turn_of_a_course():
+    """It is in the observations too, so that a scale factor error of 1 would cancel it."""
+    spans = lay_out_spans(short_odometry(0, 1.0, 5, 0.0))
+    count = len(spans.heading) - 1
+    straight = replace(spans, heading=np.zeros(count + 1))
+    turned, none = (each.rate_columns()[:count, 0] for each in (spans, straight))
+    assert np.abs(turned).max() > 45.0 * DEGREE
+    assert (none == 0.0).all() and (straight.angles == 0.0).all()
 
 
 def test_a_motion_capture_that_loses_its_markers_is_no_course():
