@@ -137,7 +137,7 @@ def score(given: argparse.Namespace) -> None:
 
 
 def _write(path: Path, schema: str, **content: Any) -> None:
-    path.write_text(format_json({'schema': schema, **content}, indent=1) + '\n')
+    path.write_text(format_json({'schema': schema, **content}) + '\n')
 
 
 def _read(path: Path, schema: str) -> Any:

@@ -148,7 +148,8 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         if found is None or not (found.interval <= _LONGEST_INTERVAL
                                  or found.is_held and is_heading):
             continue
-        if found.is_held and not is_heading and output_delay(log, given) > -0.25 * found.interval:
+        if found.is_held and not is_heading and (
+                output_delay(log, given) > 0.0 or _follows_steps(log, given, found)):
             continue
         # not those in gaps
         after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
@@ -165,6 +166,16 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         log = (replace(log, reference_heading=own) if is_heading
                else replace(log, reference_rate=own))
     return log, kept
+
+
+def _follows_steps(log: Log, held: Array, found: OwnInstants) -> bool:
+    """Tell whether the output follows the steps of a held rate rather than lines between them."""
+    assert log.time is not None and log.output is not None
+    known = np.isfinite(held) & np.isfinite(log.output)
+    left = [(log.output - rate)[known] for rate in (
+        held, np.interp(log.time, found.time, found.values))]
+    steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
+    return bool(steps < lines)
 
 
 def output_delay(log: Log, rate: Array) -> float:

@@ -177,8 +177,7 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
     if log.time is not None and (is_commanded or len(begins) < 0.5 * len(rate)):
         delay = output_delay(log, log.reference_rate)
-        held = len(rate) / max(len(begins), 1) * float(np.median(steps))
-        if delay > (MAX_GYRO_LAG if len(begins) >= 0.5 * len(rate) else -0.25 * held):
+        if delay > (0.0 if len(begins) < 0.5 * len(rate) else MAX_GYRO_LAG):
             return 0.0
     slow = None if log.time is None else find_own_instants(log.time[known], rate)
     if slow is not None and slow.is_held:

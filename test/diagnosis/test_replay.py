@@ -90,7 +90,7 @@ def stepped(every):
 def test_a_held_reference_that_stands_is_not_bent_towards_what_comes_next():
     """Rests of 10 s were a ramp to the first value after them."""
     held = stepped(5)
-    log, _ = keep_own_instants(Log(output=held + NOISE, time=TIME, reference_rate=held))
+    log, _ = keep_own_instants(Log(output=stepped(1) + NOISE, time=TIME, reference_rate=held))
     each = replay(log, np.ones(len(TIME), bool), np.random.default_rng(0))
     standing = (TIME % 20.0 > 0.5) & (TIME % 20.0 < 9.5)
     assert np.abs(each.reference - held)[standing].max() < 1e-5
