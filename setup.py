@@ -36,8 +36,7 @@ KILTED = '9.1.2', '5.5.1', '2.3.0'  # for Python 3.10 to 3.14
 ros = wheels(*JAZZY, 'python_version < "3.14"') + wheels(*KILTED, 'python_version >= "3.14"')
 
 plot = ['matplotlib']
-# what a fleet of logs can use: a Dask cluster, and tables in Parquet
-fleet = ['distributed', 'pyarrow']
+fleet = ['distributed']  # a Dask cluster
 # what docs.ros.org builds pages with
 docs = ['sphinx', 'sphinx-rtd-theme', 'myst-parser']
 # hypothesis makes up inputs and finds the shortest that fails; atheris makes them up guided by

@@ -95,14 +95,6 @@ def remedy(error: OSError, path: str | Path) -> str:
     return to_printable(words.format(path=path, folder=Path(path).parent))
 
 
-def describe_os_error(error: OSError) -> str:
-    """Return an OSError as a sentence, with a remedy if it names a file."""
-    if error.filename is None or not error.strerror:
-        return to_printable(error)
-    path = str(error.filename)
-    return f'{to_printable(path)}: {describe_error(error)}; {remedy(error, path)}'
-
-
 def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.BufferedReader:
     """Open a regular file, on request also a pipe with a writer; others raise `OSError`."""
     # Opening a device may already have an effect; and the file may be replaced between the checks.
@@ -223,7 +215,7 @@ def format_rows(rows: Iterable[Iterable[Any]]) -> str:
     return text.getvalue()
 
 
-def format_json(value: Any, indent: int | None = None) -> str:
+def format_json(value: Any) -> str:
     """Return a value as JSON, with null for numbers that are not finite."""
     def finite(part: Any) -> Any:
         if isinstance(part, dict):
@@ -232,7 +224,7 @@ def format_json(value: Any, indent: int | None = None) -> str:
             return [finite(each) for each in part]
         return None if isinstance(part, float) and not math.isfinite(part) else part
 
-    return json.dumps(finite(value), indent=indent, allow_nan=False)
+    return json.dumps(finite(value), allow_nan=False)
 
 
 def keep_aside(path: Path) -> str:

@@ -21,11 +21,11 @@ import math
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_rate
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DEGREE, Progress
+from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import constant_rate_motion, Motion, motion_from_headings
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
-    Comparison, Contradiction, from_own_figures, Reproduction)
+    Comparison, Contradiction, from_own_figures, Progress, Reproduction)
 from gyro_calibration_reproduction.hong_park import solve_equation_7
 import numpy as np
 from scipy.stats import linregress

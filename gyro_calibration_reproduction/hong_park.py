@@ -23,13 +23,13 @@ from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, to_model_record
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
-from gyro_calibration.logs.log import Array, DEGREE, Progress
+from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, Motion, motion_from_rates, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.finding import (
-    Comparison, Contradiction, from_own_figures, Reproduction)
+    Comparison, Contradiction, from_own_figures, Progress, Reproduction)
 import numpy as np
 
 TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile '

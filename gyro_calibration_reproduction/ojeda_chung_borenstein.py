@@ -22,14 +22,14 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import fit_effects, Scatter
-from gyro_calibration.logs.log import Array, DEGREE, Progress
+from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, Effect, rate_temperature_polynomial, SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
-    Comparison, Contradiction, from_own_figures, Reproduction)
+    Comparison, Contradiction, from_own_figures, Progress, Reproduction)
 import numpy as np
 
 TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for '

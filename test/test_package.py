@@ -92,7 +92,7 @@ def test_the_manifest_names_exactly_what_is_imported():
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert {element.text for element in manifest.iter('exec_depend')} == {
         f'python3-{root}' if root in python else root
-        for root in roots - {'distributed', 'pyarrow'}}
+        for root in roots - {'distributed'}}
 
 
 def test_every_launcher_is_the_same_and_can_be_executed():

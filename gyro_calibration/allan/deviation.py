@@ -75,7 +75,8 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     if left_out:
         remarks.append(f'{left_out} samples without output, or moving, are left out.')
     remarks += _remove_outliers(rate, stamps)
-    _refuse_motion(rate, stamps)
+    if (motion := _find_motion(rate, stamps)) is not None:
+        raise _Moved(motion[0], _find_rest(motion[1], time, output, moving, heading))
     if heading is not None and moving is None:
         _refuse_turning(time, output, heading)
     # long gaps are cut, since no window crosses them
@@ -137,8 +138,40 @@ def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
             's.']
 
 
-def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
-    """Refuse a record whose means change by more than noise; name time and longest rest."""
+class _Moved(DataRefused):
+    """A record with motion; begin and end of its longest part that is not refused, s, or None."""
+
+    def __init__(self, motion: str, rest: tuple[float, float] | None):
+        self.rest = rest
+        super().__init__(motion + (
+            'record again at rest' if rest is None else 'use the longest part at rest, '
+            f'from {rest[0]:.1f} to {rest[1]:.1f} s, or record again'))
+
+
+def _find_rest(rests: Sequence[tuple[float, float]], time: Array, output: Array,
+               moving: Array | None, heading: Array | None) -> tuple[float, float] | None:
+    """Return the first part, s, that is not refused; next to a motion a smaller one is hidden."""
+    for begin, end in rests:
+        rows = (time >= begin) & (time <= end)
+        try:
+            build_rest_record(time[rows], output[rows], *(
+                None if each is None else each[rows] for each in (moving, heading)))
+            return begin, end
+        except _Moved as smaller:
+            if smaller.rest is not None:
+                return smaller.rest
+        except DataRefused:
+            pass
+    return None
+
+
+def _find_motion(rate: Array,
+                 stamps: StampGrid) -> tuple[str, list[tuple[float, float]]] | None:
+    """
+    Return a sentence on means that change by more than noise, and the parts between, s.
+
+    The longest is first, and each is within its limits as printed. None without motion.
+    """
     angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
@@ -157,15 +190,13 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
         if change.max() > worst * scale:
             worst, over = float(change.max() / scale), size
     if not moved.any():
-        return
-    rests = max(find_runs(~moved), key=lambda rest: rest.stop - rest.start, default=None)
-    remedy = ('record again at rest' if rests is None else
-              f'use the longest part at rest, from {stamps.time_at(rests.start):.1f} to '
-              f'{stamps.time_at(rests.stop - 1):.1f} s, or record again')
-    raise DataRefused('the gyro was moved, or its output jumped: from '
-                      f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
-                      f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
-                      f'deviations: {remedy}')
+        return None
+    rests = sorted(find_runs(~moved), key=lambda rest: rest.start - rest.stop)
+    return ('the gyro was moved, or its output jumped: from '
+            f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
+            f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard deviations: ',
+            [(math.ceil(10.0 * stamps.time_at(rest.start)) / 10.0,
+              math.floor(10.0 * stamps.time_at(rest.stop - 1)) / 10.0) for rest in rests])
 
 
 # lost samples

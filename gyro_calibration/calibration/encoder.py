@@ -31,7 +31,7 @@ import math
 from pathlib import Path
 
 from gyro_calibration.calibration.dwells import (
-    Dwells, extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, format_list,
+    Dwells, extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     interpolate_reference, join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
     COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
@@ -156,6 +156,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     DataRefused : with the reason and the remedy
 
     """
+    log, chosen = choose_reference(log)
     refuse_wrapped(log)
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
@@ -191,7 +192,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         _heading_residual(on_reference, (output - fit.bias) / (1.0 + fit.scale_factor_error),
                           motion),
         0 if lost is None else int(lost.sum()),
-        (*repeated, *jumps, *_list_remarks(fit, motion, method, technology)))
+        (*chosen, *repeated, *jumps, *_list_remarks(fit, motion, method, technology)))
 
 
 def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
@@ -302,11 +303,53 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     return replace(log, reference_heading=heading - np.cumsum(sizes)), remarks
 
 
+def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str]]:
+    """
+    Return a log with a single reference over time, and remarks on what was left out.
+
+    Of a heading and a rate it is the heading, unless this is known for less than half as long: a
+    rate may be filtered, or a command, where a heading is what was turned. If a rate is preferred,
+    it is that where both turn alike.
+    """
+    rate, heading = (None if each is None or not np.isfinite(each).any() else each
+                     for each in (log.reference_rate, log.reference_heading))
+    if log.time is None or rate is None or heading is None:
+        return replace(log, reference_rate=rate, reference_heading=heading), []
+    counts = [int(np.count_nonzero(~find_lost_reference(np.isfinite(each))))
+              for each in (rate, heading)]
+    by_rate, remarks = 2 * counts[1] < counts[0], []
+    if by_rate:
+        remarks.append(f'The reference heading is known in {counts[1]} samples only; the rate, '
+                       f'known in {counts[0]}, is used.')
+    known = np.isfinite(rate) & np.isfinite(heading)
+    if np.count_nonzero(known) >= 100:
+        time = log.time[known] - log.time[known][0]
+        pieces, motion = split_run(time, rate[known]), motion_from_headings(time, heading[known])
+        turned, largest = pieces.reference_angle(motion), RunLimits().max_scale_deviation
+        alike = np.sum((pieces.gyro_angle - turned) ** 2) <= largest ** 2 * np.sum(turned ** 2)
+        by_rate |= prefer_rate and bool(alike)
+        unexplained, scale, _ = fit_profile(pieces, motion, MAX_ENCODER_OFFSET)
+        late, _, delay = fit_profile(pieces, motion, COURSE_TREATMENT.largest_delay)
+        contradiction = ''
+        # a longer delay that explains less than half is chance, as in a motion that repeats
+        if not alike and late < 0.5 * unexplained:
+            contradiction = f'is {abs(delay):.1f} s {"behind" if delay > 0.0 else "ahead of"}'
+        # what noise or another delay may do to the scale is less than the root of what they leave
+        elif abs(scale - 1.0) >= max(largest, math.sqrt(max(unexplained, 0.0))):
+            contradiction = f'turns {scale:.3f} times as far as'
+        if contradiction:
+            remarks.append(f'The reference rate {contradiction} the reference heading; the '
+                           f'{"rate" if by_rate else "heading"} is used: check both, and leave '
+                           'the wrong one out.')
+    return (replace(log, reference_heading=None) if by_rate
+            else replace(log, reference_rate=None)), remarks
+
+
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
     """Return time and output of the gyro, motion and its cross rotation, without lost samples."""
     heading, rate = log.reference_heading, log.reference_rate
     if log.time is None or log.output is None or (heading is None and rate is None):
-        raise DataRefused('the log holds no reference over time: it needs the columns time_s, '
+        raise DataRefused('the log holds no reference over time: it needs values of time_s, '
                           'gyro_dps and reference_heading_deg or reference_rate_dps')
     if heading is None:
         assert rate is not None
@@ -542,9 +585,15 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
             yield ('the reference is never lost, as odometry, and stands in no rest: its drift in '
                    'motion has the same effect as a bias, which the intervals do not include; '
                    'rest now and then')
-        if abs(s) > NORMAL_QUANTILE_975 * TECHNOLOGY_PRIORS[technology][0]:
+        half = NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0])
+        largest = NORMAL_QUANTILE_975 * TECHNOLOGY_PRIORS[technology][0]
+        if abs(s) > largest:
             yield ('the scale factor error is beyond what gyros of the technology '
                    f'{technology} have: check the units, and the size and distance of wheels')
+        elif half > 1.001 * largest:
+            yield ('the drive does not show whether the reference has a wrong scale, as of wheels '
+                   'at another distance, so that the interval of the scale factor error is wider '
+                   f'than that of gyros of the technology {technology}: turn more often')
         else:
             yield (f'scale factor error and bias have priors of the technology {technology} '
                    '(--technology) with mean zero, which the intervals include')
@@ -602,14 +651,15 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
             if is_settled:
                 raise
     if len(logs) > 1:
-        raise InputError(f'--method {method or "likelihood"} takes one log; '
-                         'give one log, or use --method dwells')
+        raise InputError((f'--method {method} takes one log' if method else
+                          'a log with a reference heading is fitted alone')
+                         + '; give one log, or use --method dwells')
     if others:
         raise InputError(HEADING_ALONE)
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
     if log.reference_heading is not None:
-        return replace(found, remarks=(*_compare_references(log), *found.remarks))
+        return found
     return replace(found, remarks=(
         f'the log has a reference rate, which is constant {_MIN_DWELLS - 1} times at most, or for '
         f'up to {100.0 * FEW_DWELLS_SHARE:g} % of the time; so the rate is integrated, and '
@@ -634,24 +684,6 @@ def _refuse_own_reference(log: Log) -> None:
                 _OWN_DIFFERENCE_SHARE * white_noise_deviation(columns @ shares, 6)):
             raise DataRefused('the reference is computed from this gyro, since it follows its '
                               'noise from sample to sample: give a reference without it')
-
-
-def _compare_references(log: Log) -> list[str]:
-    """Return a remark where heading and rate of a reference turn by different angles."""
-    if log.time is None or log.reference_rate is None or log.reference_heading is None:
-        return []
-    known = np.isfinite(log.reference_rate) & np.isfinite(log.reference_heading)
-    if np.count_nonzero(known) < 100:
-        return []
-    time = log.time[known] - log.time[known][0]
-    unexplained, scale = fit_profile(
-        split_run(time, log.reference_rate[known]),
-        motion_from_headings(time, log.reference_heading[known]), MAX_ENCODER_OFFSET)
-    # what noise or another delay may do to the scale is less than the root of what they leave
-    if abs(scale - 1.0) < max(RunLimits().max_scale_deviation, math.sqrt(max(unexplained, 0.0))):
-        return []
-    return [f'the reference rate turns {scale:.3f} times as far as the reference heading, which '
-            'is used; one of the two is wrong: check both, and leave the wrong one out']
 
 
 def _extract_named_dwells(path: str, log: Log) -> Dwells:

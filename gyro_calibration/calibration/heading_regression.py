@@ -66,6 +66,7 @@ from scipy.fft import dct, idct
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.special import expit
 from scipy.stats import t as student
 from scipy.stats import ttest_1samp
 
@@ -86,9 +87,10 @@ _BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
 _COURSE_RANDOM_WALK_RANGE, WANDER_COSINES = (1e-7, 1e-4), 8
 #: Largest number of corrections of the rate, and error of the scale by a last one.
 _MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
-#: Prior standard deviations of scale factor error and bias, rad/s, where gyro and course disagree
-#: by more than a gyro errs; and probability of that.
-_WIDE_PRIOR, _WIDE_PROBABILITY = (0.3, 10.0 * DEGREE), 1e-3
+#: Prior standard deviations of scale factor error and bias, rad/s, where gyro and reference
+#: disagree by more than a gyro errs; and prior odds of that beside a course that is lost at times,
+#: which has no wheels. A scale of odometry is wrong as probably as it is right.
+_WIDE_PRIOR, _WIDE_ODDS_OF_COURSE = (0.3, 10.0 * DEGREE), 1e-3
 #: Prior standard deviation of the smoothing of a course, s².
 _SMOOTHING_DEVIATION = 0.1
 #: Correlations of the errors of a course over a span that are possible.
@@ -279,8 +281,15 @@ class Spans:
 
     @property
     def angles(self) -> Array:
-        """Return the angle that is turned in each span, rad, shape (n,)."""
-        return np.diff(self.point_means(np.asarray(self.channels.heading)))
+        """
+        Return the angle that is turned in each span, rad, shape (n,).
+
+        It is 0 where a course is nearer to no turn than to that of the gyro, which is noise then.
+        As that is in the observations too, it would pass for a scale factor error of 1.
+        """
+        by_gyro = np.diff(self.point_means(np.asarray(self.channels.heading)))
+        turns = np.diff(self.heading) * by_gyro > 0.5 * by_gyro ** 2
+        return np.asarray(np.where(turns | self.treatment.is_fine, by_gyro, 0.0))
 
     @property
     def rest_durations(self) -> Array:
@@ -337,7 +346,10 @@ class Spans:
     def rate_columns(self) -> Array:
         """Return the columns of scale factor error and bias, shape (n + r, 2)."""
         rate = np.asarray(self.channels.rate)
-        return np.column_stack([-self.span_integrals(each) for each in (rate, np.ones_like(rate))])
+        columns = np.column_stack([-self.span_integrals(each)
+                                   for each in (rate, np.ones_like(rate))])
+        columns[:len(self.time) - 1, 0] *= self.angles != 0.0
+        return columns
 
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
@@ -579,11 +591,7 @@ class SpanFit:
     def half_width(self, value_index: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
         deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
-        half = float(student.ppf(0.975, self.freedom[value_index])) * deviation
-        if value_index >= len(BASE_VALUES):
-            return half
-        of_prior = NORMAL_QUANTILE_975 * self.spans.treatment.prior[value_index]
-        return of_prior if value_index == 0 and self.lacks_turns else min(half, of_prior)
+        return float(student.ppf(0.975, self.freedom[value_index])) * deviation
 
     @property
     def normal_covariance(self) -> Array:
@@ -610,34 +618,45 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    A scale factor error that is determined by fewer than `MIN_STRETCHES` stretches cannot be
-    separated from errors of the reference; its interval is that of the prior. Rests that the
-    motion contradicts are left out where no causes are given.
+    Rests that the motion contradicts are left out where no causes are given.
 
     Wheels of another size, or a wrong unit, may exceed what a gyro errs by. Beside a course, whose
-    errors otherwise take that up, the prior is wide where this is far likelier.
+    errors otherwise take that up, the values are means under the prior of the technology and a
+    wide one, weighted by their probability given the drive, and the intervals contain both answers
+    where it does not decide. An error that a drive does not need lowers its evidence.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
-    _, corrected, point_variances = _correct_rate(spans, every)
+    corrected, point_variances = _correct_rate(spans, every)
     if not (causes or spans.stands.all()):
         corrected = _drop_contradicted_rests(corrected, every, point_variances)
     usual = _fit_with_noise(corrected, every, point_variances)
-    if spans.treatment.is_fine:
+    if spans.treatment.is_fine or prior[:2] == _WIDE_PRIOR:
         return usual
     # with the same rests, without which evidences cannot be compared
-    values, corrected, point_variances = _correct_rate(replace(
-        spans, rests=corrected.rests, stands=corrected.stands, treatment=replace(
-            spans.treatment, prior=(*_WIDE_PRIOR, prior[2]))), every)
-    if abs(values[0]) < NORMAL_QUANTILE_975 * prior[0]:
-        return usual
+    wider = replace(spans, rests=corrected.rests, stands=corrected.stands,
+                    treatment=replace(spans.treatment, prior=(*_WIDE_PRIOR, prior[2])))
+    corrected, point_variances = _correct_rate(wider, every)
     wide = _fit_with_noise(corrected, every, point_variances)
-    exceeds = abs(wide.values[0]) - wide.half_width(0) > NORMAL_QUANTILE_975 * prior[0]
-    return (wide if exceeds and wide.fit.log_evidence + math.log(_WIDE_PROBABILITY)
-            > usual.fit.log_evidence else usual)
+    assert spans.log.reference_heading is not None
+    is_lost = find_lost_reference(np.isfinite(spans.log.reference_heading)).any()
+    least = abs(wide.values[0]) - wide.half_width(0)
+    probability = 0.0 if is_lost and least < NORMAL_QUANTILE_975 * prior[0] else float(expit(
+        wide.fit.log_evidence - usual.fit.log_evidence
+        + math.log(_WIDE_ODDS_OF_COURSE if is_lost else 1.0)))
+    likelier = wide if probability > 0.5 else usual
+    if min(probability, 1.0 - probability) < 0.025:  # an interval of 95 % does not contain it
+        return likelier
+    change = wide.values - usual.values
+    covariance = (probability * wide.normal_covariance
+                  + (1.0 - probability) * usual.normal_covariance
+                  + probability * (1.0 - probability) * np.outer(change, change))
+    widening = np.sqrt(np.diag(likelier.normal_covariance) / np.diag(likelier.covariance))
+    return replace(likelier, values=usual.values + probability * change,
+                   covariance=covariance / np.outer(widening, widening))
 
 
-def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Array, Spans, Array]:
-    """Return first values, the spans with the rate corrected by them, and variances of points."""
+def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Array]:
+    """Return the spans with the rate corrected by first values, and variances of points."""
     free = spans.prior_deviations(causes)
     count = len(spans.time) - 1
     delayed = replace(spans, delay=spans.delay or _find_delay(spans))
@@ -660,7 +679,7 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Array, Spa
         # the columns are of the rate by the scale before
         if number and abs(scale * change) < _SCALE_TOLERANCE:
             break
-    return values, delayed, point_variances
+    return delayed, point_variances
 
 
 def _find_delay(spans: Spans) -> float:
@@ -795,7 +814,7 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
                    np.ones(len(values)))
     covariance, effective, freedom = _cluster_robust_covariance(
-        whiten_regression(done, causes), fit)
+        whiten_regression(done, causes), fit, np.array(prior))
     return replace(done, covariance=covariance, effective_stretches=effective, freedom=freedom)
 
 
@@ -824,8 +843,8 @@ def _reference_walk(spans: Spans,
     return walk, math.sqrt(max(by_turn, by_span))
 
 
-def _cluster_robust_covariance(data: WhitenedRegression,
-                               fit: GridFit) -> tuple[Array, Array, Array]:
+def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
+                               prior: Array) -> tuple[Array, Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
 
@@ -834,7 +853,9 @@ def _cluster_robust_covariance(data: WhitenedRegression,
 
     Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958):
     the few turning points of a swing at an even rate may determine a value and take up their
-    errors.
+    errors. The intervals of the first values are not wider than those of their priors; that of a
+    scale factor error that fewer than `MIN_STRETCHES` stretches determine is as wide, as it cannot
+    be separated from errors of the reference, unless the prior includes these.
 
     Also the effective number of stretches that determine each value, and the degrees of freedom.
     """
@@ -856,6 +877,10 @@ def _cluster_robust_covariance(data: WhitenedRegression,
         scatter = _jackknife(data, cluster, inside)[:count]
         freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
         variances = np.maximum(variances, scatter)
+    if effective[0] < MIN_STRETCHES and tuple(prior[:2]) != _WIDE_PRIOR:
+        variances[0] = math.inf
+    largest = NORMAL_QUANTILE_975 * prior / student.ppf(0.975, freedom[:len(prior)])
+    variances[:len(prior)] = np.minimum(variances[:len(prior)], largest ** 2)
     inflation = np.sqrt(variances / np.diag(fit.covariance))
     return fit.covariance * np.outer(inflation, inflation), effective, freedom
 
@@ -948,15 +973,17 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     """
     spans = lay_out_spans(log, 'course', np.array(TECHNOLOGY_PRIORS[technology]))
     length = spans.treatment.min_span
-    if len(spans.time) < _MIN_SPANS:
-        raise DataRefused(f'the course is known for {len(spans.time) * length:.0f} s, wanted at '
+    duration = len(spans.time) * length + spans.rest_durations[spans.stands].sum()
+    if duration < _MIN_SPANS * length:
+        raise DataRefused(f'the course is known for {duration:.0f} s, wanted at '
                           f'least {_MIN_SPANS * length:.0f} s: drive for longer, faster than a '
                           'walk')
     fit = fit_spans(spans)
     turned = np.diff(spans.heading)
+    left = fit.spans.observed - fit.values[0] * fit.spans.rate_columns()[:, 0]
     # a bias is the same in each span
     residual, variation = (robust_deviation(each - np.median(each))
-                           for each in (fit.spans.observed[:len(turned)], turned))
+                           for each in (left[:len(turned)], turned))
     if residual > max(MAX_FOLLOWED_RESIDUAL, 0.5 * variation):
         raise DataRefused(f'from span to span of {length:.0f} s the course turns by '
                           f'{variation / DEGREE:.1f} deg, and its difference to the gyro changes '

@@ -49,6 +49,9 @@ _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Least noise of a course, rad, over a second or from span to span; by RTK fixes of a car in town
 #: it is 0.4 deg, and a motion capture with short gaps has less.
 MIN_COURSE_NOISE = 0.25 * DEGREE
+#: Time for which a recorder misses a reference that is not lost, as it does not begin, nor end, to
+#: receive all topics at once, s; or five intervals of the reference, as for gaps of a recording.
+_MAX_LATE_START = 0.1
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
@@ -59,19 +62,24 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     Return rests of 3 s and more: first and last row, shape (r, 2), and where the reference stands.
 
     The gyro is quiet, and the reference is lost, or stands: it is known and does not change. Where
-    it stands and the gyro is not quiet all the time, something moves, and there is no rest.
+    it stands and the gyro is not quiet on average, something moves, and there is no rest.
     """
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
     scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    is_quiet = scatter <= 2.0 * scatter.min(initial=math.inf) + 1e-12
+    # of the quietest rest, as of filtered noise single seconds are far quieter by chance; where
+    # steps hide the noise, a rest does not show the bias
+    quietest = (maximum_filter1d(scatter, 3)[1:-1].min(initial=math.inf) if scatter.all()
+                else 0.0)
+    is_quiet = scatter <= 2.0 * quietest + 1e-12
     known = np.flatnonzero(np.isfinite(reference))
     changed = known[np.diff(reference[known], prepend=np.nan) != 0.0]
     is_lost, is_same = (np.bincount(rows // second, minlength=blocks)[:blocks] == 0
                         for rows in (known, changed))
     is_standing = is_same & ~is_lost
-    for run in find_runs(is_standing):
-        is_standing[run] &= is_quiet[run][1:-1].all()
+    for run in (each for each in find_runs(is_standing) if each.stop - each.start >= 3):
+        inner = slice(run.start + 1, run.stop - 1)
+        is_quiet[inner] = np.sqrt(np.mean(scatter[inner] ** 2)) <= 2.0 * quietest + 1e-12
     rests = [(second * run.start, second * run.stop - 1, stands)
              for stands, each in enumerate((binary_erosion(is_lost, border_value=1), is_standing))
              for run in find_runs(is_quiet & each) if run.stop - run.start >= 3]
@@ -230,7 +238,13 @@ def is_course(log: Log) -> bool:
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
     lost = float(find_lost_reference(known).mean())
-    if lost == 0.0 or cross_rotation(log).size:
+    rows = np.flatnonzero(known)
+    if lost == 0.0 or len(rows) < 2 or cross_rotation(log).size:
+        return False
+    stamps, (first, last) = log.time[rows], rows[[0, -1]]
+    at_ends = max(stamps[0] - log.time[0], log.time[-1] - stamps[-1])
+    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), _MAX_LATE_START)
+            and not find_lost_reference(known[first:last + 1]).any()):
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))

@@ -158,10 +158,11 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
     raise DataRefused(message)
 
 
-def fit_profile(run: RunPieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
-    """Return the unexplained fraction of the squares at the best delay, and the scale there."""
-    return min(run.fit_scale(run.reference_angle(motion, offset))
-               for offset in _trial_offsets(largest_offset))
+def fit_profile(run: RunPieces, motion: Motion,
+                largest_offset: float) -> tuple[float, float, float]:
+    """Return the unexplained fraction of the squares at the best delay, the scale, and that, s."""
+    return min((*run.fit_scale(run.reference_angle(motion, offset)), offset)
+               for offset in _trial_offsets(largest_offset).tolist())
 
 
 def _trial_offsets(largest_offset: float) -> Array:

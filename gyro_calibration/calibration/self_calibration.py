@@ -349,7 +349,7 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
         raise DataRefused(f"the samples cover {covered:.1f} s of the {motion.name}'s "
                           f'{motion.duration:.1f} s: record the whole motion')
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
-    unexplained, scale = fit_profile(run, motion, largest_offset)
+    unexplained, scale, _ = fit_profile(run, motion, largest_offset)
     if unexplained <= MAX_UNEXPLAINED_SHARE:
         refuse_unit_error(scale, motion.name)
         refuse_scale(scale - 1.0, motion.name,

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, field, replace
+import math
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,11 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     if given.model and not given.out:
         raise InputError('--model was given without --out; give the file to write with --out')
-    model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
-    verb.require_time(given, log)
+    model = read_model(given.model) if given.model else GyroModel()
+    whole = verb.read(argparse.Namespace(**{**vars(given), 'begin': 0.0, 'end': math.inf}))
+    time = verb.require_time(given, whole)
+    # in messages, times are those of --from and --to
+    log = next(verb.cut_to_range(given, [replace(whole, time=time - time[0])]))
     try:
         with show_progress('noise figures from the Allan deviation'):
             found = find_noise_figures(log)

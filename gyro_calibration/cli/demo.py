@@ -54,11 +54,11 @@ try:
     from rclpy.executors import SingleThreadedExecutor
     from sensor_msgs.msg import Imu
     from std_srvs.srv import Trigger
-    MISSING = ''
+    _MISSING = ''
 except ImportError as error:
-    MISSING = str(error)
+    _MISSING = str(error)
 
-PROTOCOL = 'kvh_dsp3000'
+_PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
 _MAX_ATTEMPTS = 3  # to calibrate
 _DRIVE_MOTION = constant_rate_motion([
@@ -73,8 +73,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    if MISSING:
-        raise InputError(f'the demo needs ROS 2 and matplotlib ({MISSING}); source ROS 2, or '
+    if _MISSING:
+        raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); source ROS 2, or '
                          'install gyro_calibration[ros,plot]')
     verb.require_folder(given.out)
     return _run_demo(Path(given.out), given.seed)
@@ -219,9 +219,9 @@ def _run_demo(out: Path, seed: int) -> Answer:
     robot = _SimulatedRobot(XV3500.model, simulate_noise(
         XV3500.noise, 30000, XV3500.interval, np.random.default_rng(seed)))
     with ExitStack() as stack:
-        stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
+        stack.enter_context(Emulator(find_protocol(_PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
-        stack.enter_context(_node_process('driver_node', port=port, protocol=PROTOCOL))
+        stack.enter_context(_node_process('driver_node', port=port, protocol=_PROTOCOL))
         stack.enter_context(_node_process('compensation_node', model_file=model_file,
                                           calibration_file=calibration_file,
                                           **{'calibration.drive': True}))
@@ -246,7 +246,7 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
                               'programs, and run the demo again')
             time.sleep(0.02)
         bar.set_description('calibrating on the motion profile')
-        calibrate(client, bar)
+        _calibrate(client, bar)
         client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
         begin, started = time.time(), time.monotonic()
@@ -258,7 +258,7 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
     return begin
 
 
-def calibrate(client: _DemoClient, bar: tqdm) -> None:
+def _calibrate(client: _DemoClient, bar: tqdm) -> None:
     """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
     for attempt in range(1, _MAX_ATTEMPTS + 1):
         try:

@@ -25,7 +25,7 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.simulate import add_motion_options, simulate_log
-from gyro_calibration.driver.emulator import emulate, Emulator
+from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.logs.log import Array, DataRefused
@@ -73,14 +73,14 @@ def run(given: argparse.Namespace) -> None:
     samples = _make_samples(time, output, log.temperature, given.repeat)
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
-
-    def answer(path: str) -> None:
+    try:
+        emulator.open()
+        path = emulator.path if emulator.link is None else str(emulator.link)
         print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json
               else to_printable(path), flush=True)
-
-    try:
-        emulate(emulator, answer)
+        emulator.run()
     finally:
+        emulator.close()
         # launch sends a second signal, which must not interrupt a program that is about to end
         _handle_signals(signal.SIG_IGN)
 

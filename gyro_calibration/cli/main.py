@@ -30,7 +30,7 @@ from gyro_calibration import __version__
 from gyro_calibration.cli.verb import print_message
 from gyro_calibration.diagnosis.causes import register_causes
 from gyro_calibration.files import (
-    describe_error, describe_os_error, format_json, InputError, suggest_nearest, to_printable)
+    describe_error, format_json, InputError, remedy, suggest_nearest, to_printable)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np
@@ -61,7 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_message(error)
         return 2
     except OSError as error:
-        print_message(describe_os_error(error))
+        path = error.filename
+        print_message(error if path is None or not error.strerror else
+                      f'{path}: {describe_error(error)}; {remedy(error, str(path))}')
         return 2
     if text is not None:
         _print_text(text)

@@ -15,16 +15,14 @@ example: gyro_calibration reproduce hong_park
 """
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
-from itertools import count
-from typing import Any
+from functools import partial
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress
-from gyro_calibration.logs.log import Progress
+from gyro_calibration.cli.verb import Answer
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import render_page
 import numpy as np
+from tqdm import tqdm
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -38,23 +36,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     """Reproduce each source with a generator of its own, independent of the other sources."""
     names = [given.source] if given.source else list(SOURCES)
-    with show_progress(names[0]) as on_progress:
-        found = {name: SOURCES[name](np.random.default_rng(given.seed),
-                                     progress=_make_progress(name, on_progress)) for name in names}
+    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=partial(
+        tqdm, desc=name, unit=' runs', leave=False, disable=None)) for name in names}
     text = '\n\n'.join(render_page(reproduction) for reproduction in found.values())
     return Answer([text],
                   {'seed': given.seed,
                    'sources': {name: reproduction.data() for name, reproduction in found.items()}})
-
-
-def _make_progress(name: str, on_progress: Callable[[float | None, str], None]) -> Progress:
-    """Return a function that numbers the simulations of a source and reports their runs."""
-    number = count(1)
-
-    def report_runs(items: Iterable[Any]) -> Iterator[Any]:
-        simulation, drawn = next(number), list(items)
-        for run, item in enumerate(drawn, 1):
-            on_progress(None, f'{name}, simulation {simulation}, run {run} of {len(drawn)}')
-            yield item
-
-    return report_runs

@@ -201,7 +201,7 @@ def read(given: argparse.Namespace) -> Log:
         time = require_time(given, log)
         log = replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
                                                             np.asarray(log.output))[0])
-    return next(_cut_to_range(given, [log]))
+    return next(cut_to_range(given, [log]))
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
@@ -214,7 +214,7 @@ def read_each(given: argparse.Namespace) -> Iterator[Log]:
         yield log
 
 
-def _cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
+def cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
     """Give the parts of logs between --from and --to; at least one has samples."""
     if given.begin <= 0.0 and given.end == math.inf:
         yield from logs
@@ -260,7 +260,7 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     with _show_bytes_read(given.log) as on_progress:
         blocks = read_log_blocks(given.log, given.sensitivity, given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
-        for log in _cut_to_range(given, blocks):
+        for log in cut_to_range(given, blocks):
             yield _orient_output(given, log)
 
 

@@ -62,8 +62,8 @@ _LOG_EXPERIMENTS: Mapping[str, str] = {
 
 #: Name, sentence, unit, origin, required channels, variable along which it shows, experiment.
 _OTHER_CAUSES = (
-    ('outliers', 'Single samples are outliers, as from a disturbed line or a corrected checksum.',
-     '1', 'record', 'time', 'time', ''),
+    ('outliers', 'Single samples are outliers, as from a shock, a disturbed line or a corrected '
+     'checksum.', '1', 'record', 'time', 'time', ''),
     ('stuck_samples', 'The last value is repeated instead of a new one.', '1', 'record', 'time',
      'time', 'turn without rest: the output of a working gyro then changes in each sample'),
     ('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time', 'time', ''),
@@ -190,6 +190,7 @@ _REMEDIES = {
     'gyro': 'add it to the model of the gyro',
     'reference': 'repair or replace the reference, or keep it out of calibrations',
     'record': 'repair the recording',
+    'outliers': 'avoid shocks, or repair the line or the recording',
     'noise': 'use the noise figures of the extended model'}
 
 
@@ -200,7 +201,8 @@ def add_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
 
     def remedy(effect: str) -> str:
         origin = CAUSES[effect].origin
-        return '' if origin == 'gyro' and effect not in inside else _REMEDIES[origin]
+        return ('' if origin == 'gyro' and effect not in inside
+                else _REMEDIES.get(effect, _REMEDIES[origin]))
 
     return [replace(each, share_of_heading_error=shares.get(each.effect),
                     remedy=each.remedy or remedy(each.effect)) for each in findings]

@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
     few_values_remedy, find_lost_reference, require_output)
+from gyro_calibration.calibration.encoder import choose_reference
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.own_instants import (
     interpolate_by_splines, is_slow, MAX_GYRO_LAG, MAX_ROUNDING_STEP)
@@ -279,22 +280,15 @@ def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
     Return a log with the reference that is used, and remarks on it.
 
-    The reference rate is dropped if it has less than half as many samples as the heading. A rate
-    that consists of noise alone is replaced by that of a rest.
+    Of a heading and a rate it is that of `choose_reference`. A rate that consists of noise alone
+    is replaced by that of a rest.
     """
     if log.time is None:
         return log, ()
-    counts = [0 if values is None else int(np.isfinite(values).sum())
-              for values in (log.reference_rate, log.reference_heading)]
-    by_rate = counts[0] > 0 and 2 * counts[0] >= counts[1]
-    notes = (() if by_rate or not counts[0]
-             else (f'The reference rate is known in {counts[0]} samples only; '
-                   f'the heading, known in {counts[1]}, is used.',))
-    log = replace(log, reference_rate=log.reference_rate if by_rate else None,
-                  reference_heading=log.reference_heading if counts[1] else None)
+    log, notes = choose_reference(log, prefer_rate=True)
     rate = reference_rate(log)
     if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not is_at_rest(log):
-        return log, notes
+        return log, tuple(notes)
     return (replace(log, reference_rate=0.0 * rate, reference_heading=None),
             (*notes, 'The reference shows noise alone, which the gyro does not measure; '
              'the gyro is taken to be at rest.'))
@@ -480,6 +474,7 @@ def check_gates(log: Log, model: GyroModel | None = None, is_command: bool = Fal
 
     The motion may follow a command with any response, which is fitted later.
     """
+    log, _ = choose_reference(log, prefer_rate=True)
     results = [] if log.output is None else list(_run_gates(log, model))
     failed = next((place for place, gate in enumerate(results) if gate.passed is False), None)
     if failed is None:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
+from gyro_calibration.calibration.encoder import choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
@@ -102,8 +103,11 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
     all_gates: list[Gate] = []
-    given = logs
-    remarks: list[str] = []
+    if reference_kind == 'rate_command':
+        logs = [log if log.reference_rate is None else replace(log, reference_heading=None)
+                for log in logs]
+    logs, chosen = zip(*(choose_reference(log, prefer_rate=True) for log in logs))
+    given, remarks = logs, [remark for each in chosen for remark in each]
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
         passed = check_gates(log, model, reference_kind == 'rate_command')

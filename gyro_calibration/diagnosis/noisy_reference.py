@@ -101,10 +101,6 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     The instants are those of a slow reference, by `keep_own_instants`.
     """
     on_progress(None, 'data quality')
-    if reference.kind != 'rate_command' and log.reference_heading is not None:
-        log = replace(log, reference_rate=None)
-    else:
-        log = replace(log, reference_heading=None)
     record = inspect_record(replace(log, reference_heading=None, reference_rate=None))
     assert log.output is not None
     cleaned_log = replace(log, output=np.where(record.usable, log.output, np.nan))
@@ -469,10 +465,10 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
            f'({reference.evidence}); if it is another kind, state it with --reference-kind. Its '
            f'errors: {errors}.')
     if done.lacks_turns:
-        yield ('Fewer than three stretches with rotation determine the scale factor error, whose '
-               'standard deviation is that of the prior, '
-               f'{100.0 * done.spans.treatment.prior[0]:g} %: turn more often, in both '
-               'directions.')
+        yield ('Fewer than three stretches of '
+               f'{done.spans.treatment.stretch_duration:g} s have most of the rotation, and '
+               'determine the scale factor error, whose interval of 95 % is +- '
+               f'{100.0 * done.half_width(0):.2g} %: turn more often, in both directions.')
 
 
 def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:

@@ -19,7 +19,7 @@ import textwrap
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
-    Change, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
+    Change, DETECTION_POWER, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects
@@ -295,7 +295,8 @@ def cause_paragraphs(found: Finding, diagnosis: Diagnosis) -> list[str]:
     if found.minimum_detectable is not None and found.parameters:
         name, first = next(iter(found.parameters.items()))
         detectable = ('smallest detectable: '
-                      f'{format_amount(found.minimum_detectable, first.unit, name, 2)}')
+                      f'{format_amount(found.minimum_detectable, first.unit, name, 2)} in '
+                      f'{100.0 * DETECTION_POWER:g} % of logs')
     remedy = ('it is in the extended model' if is_in_extended_model(found, diagnosis)
               else f'remedy: {found.remedy}' if found.remedy else '')
     paragraphs = [(found.cause, found.evidence, status, detectable),

@@ -17,7 +17,7 @@ read and ignored.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 import contextlib
 from dataclasses import replace
 import os
@@ -38,11 +38,11 @@ class Emulator:
     """
     An emulated gyro that programs can open as a port.
 
-    Use it as a context manager, which sends from a thread of its own, or call `emulate`, which
-    sends until the samples end. Each sample is taken from the source after the one before it was
-    sent, so a source may be endless and may depend on commands. The first sample is sent at once,
-    or when a reader has opened the port. Samples have a time, s; those without a sequence are
-    numbered from 0 on.
+    Use it as a context manager, which sends from a thread of its own, or call `open` and `run`,
+    which sends until the samples end, and `close`. Each sample is taken from the source after the
+    one before it was sent, so a source may be endless and may depend on commands. The first sample
+    is sent at once, or when a reader has opened the port. Samples have a time, s; those without a
+    sequence are numbered from 0 on.
 
     The speed is a factor of real time; inf is the speed of the reader. Up to 1, bytes that are not
     read are lost, as on a real line; above 1 the emulator waits for the reader. A symbolic link to
@@ -151,13 +151,3 @@ class Emulator:
                 return
             if data:
                 self._stop.wait(_POLL_INTERVAL / 10)
-
-
-def emulate(emulator: Emulator, announce: Callable[[str], None] = lambda path: None) -> None:
-    """Send all samples from this thread, and clean up at the end; `announce` gets the path."""
-    try:
-        emulator.open()
-        announce(emulator.path if emulator.link is None else str(emulator.link))
-        emulator.run()
-    finally:
-        emulator.close()

@@ -11,14 +11,13 @@
 """
 From the records of logs to the errors of the type, the unit and the reference.
 
-They are sentences, data, models, one page that needs nothing else, and tables in CSV and Parquet.
+They are sentences, data, models, one page that needs nothing else, and tables in CSV.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -507,26 +506,16 @@ def _dates_chart(summary: TypeSummary, value: ValueSummary, key: str) -> Chart:
 def table_files(types: Sequence[TypeSummary],
                 records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """Return the content of files by name: values of logs, and of units, one row each, in SI."""
-    # CSV, and Parquet where pyarrow is installed
     found, log_rows = {}, []
     for record in records:
         log_rows.append({key: record.get(key) for key in _COLUMNS})
         for name, value in (record.get('values', {}) | record.get('slow', {})).items():
             log_rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
     for name, rows in (('logs', log_rows), ('units', list(_unit_rows(types)))):
-        names = dict.fromkeys(key for row in rows for key in row)
-        columns = {each: [row.get(each) for row in rows] for each in names}
-        if not columns:
-            continue
-        found[f'{name}.csv'] = format_rows([columns, *zip(*columns.values())]).encode()
-        try:
-            import pyarrow
-            from pyarrow import parquet
-        except ImportError:
-            continue
-        stream = io.BytesIO()
-        parquet.write_table(pyarrow.table(columns), stream)
-        found[f'{name}.parquet'] = stream.getvalue()
+        columns = dict.fromkeys(key for row in rows for key in row)
+        if columns:
+            found[f'{name}.csv'] = format_rows(
+                [columns, *([row.get(each) for each in columns] for row in rows)]).encode()
     return found
 
 

@@ -47,8 +47,6 @@ from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 
-#: Width of a temperature bin, K; a run has one entry in each.
-_BIN_WIDTH = 1.5
 #: Largest number of entries.
 MAX_ENTRIES = 80
 #: Averaging time of a rest, s.
@@ -418,7 +416,9 @@ def _covariance_of_differences(from_origin: Array, pairwise: Array) -> Array:
 
 
 def _bin_number(entry: Entry) -> int:
-    return round(entry.temperature / _BIN_WIDTH)
+    """Return the temperature bin of an entry; a run has one entry in each."""
+    # the coefficient is the same within a tenth of its correlation length
+    return round(entry.temperature / (0.1 * Prior.correlation_length))
 
 
 def _is_possible(entry: Entry) -> bool:

@@ -38,9 +38,6 @@ from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_s
 import numpy as np
 from scipy.linalg import block_diag
 
-#: Distance from the temperature of the last start, K, at which the tracker is restarted at rest,
-#: with the new entries of the table.
-_RESTART_DISTANCE = 5.0
 #: Assumed drift of the temperature after its last message, K/s.
 _LOST_TEMPERATURE_RATE = 1.0 / 60.0
 #: Age of a temperature, s, from which on it is held with a growing uncertainty.
@@ -548,8 +545,10 @@ class HeadingEstimator:
                 continue
             message = self.table.add(temperature, bias, variance, now)
             self._table_message = message or self._table_message
-            if (self._correction is not None and resting and not stretch.has_ended and abs(
-                    temperature - self._correction.start_temperature) > _RESTART_DISTANCE):
+            # with the new entries, where the coefficient may have changed
+            if (self._correction is not None and resting and not stretch.has_ended
+                    and abs(temperature - self._correction.start_temperature)
+                    > Prior.correlation_length / 3.0):
                 self._restart(now)
 
     def _expected_bias(self, temperature: float, seen: Array) -> tuple[float, float]:

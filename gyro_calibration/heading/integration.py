@@ -150,7 +150,8 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
 
 #: Longest gap in the stamps that is integrated, s, unless the samples are as far apart.
 MAX_GAP = 1.0
-#: Duration, s, of the rates that show how the robot moves in a gap.
+#: Duration, s, of the rates that show how the robot moves in a gap, and in which a rate after a
+#: jump may be erroneous.
 RECENT_DURATION = 2.0
 
 

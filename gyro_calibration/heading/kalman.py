@@ -58,27 +58,19 @@ class RateIntegral:
     #: be added to others.
     is_unobserved: bool = False
 
-    def __add__(self, other: RateIntegral) -> RateIntegral:
+    def __add__(self, other: RateIntegral, sign: int = 1) -> RateIntegral:
         """Return the integral over both, one after the other."""
         return RateIntegral(
-            self.duration + other.duration, self.angle + other.angle,
-            self.sensitivity + other.sensitivity, self.lost_variance + other.lost_variance,
-            self.extra_noise_variance + other.extra_noise_variance, STANDSTILL,
-            self.block_count + other.block_count, self.block_square_sum + other.block_square_sum)
+            self.duration + sign * other.duration, self.angle + sign * other.angle,
+            self.sensitivity + sign * other.sensitivity,
+            self.lost_variance + sign * other.lost_variance,
+            self.extra_noise_variance + sign * other.extra_noise_variance, STANDSTILL,
+            self.block_count + sign * other.block_count,
+            self.block_square_sum + sign * other.block_square_sum)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return the rest of this integral after another with which it begins."""
-        return RateIntegral(
-            self.duration - other.duration, self.angle - other.angle,
-            self.sensitivity - other.sensitivity, self.lost_variance - other.lost_variance,
-            self.extra_noise_variance - other.extra_noise_variance, STANDSTILL,
-            self.block_count - other.block_count, self.block_square_sum - other.block_square_sum)
-
-    def with_sensitivity(self, sensitivity: Array) -> RateIntegral:
-        """Return the integral with another sensitivity, (m,)."""
-        return RateIntegral(
-            self.duration, self.angle, sensitivity, self.lost_variance, self.extra_noise_variance,
-            self.wander, self.block_count, self.block_square_sum, self.is_unobserved)
+        return self.__add__(other, -1)
 
 
 @dataclass(frozen=True)

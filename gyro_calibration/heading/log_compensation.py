@@ -25,12 +25,11 @@ from gyro_calibration.heading.tracker import HeadingTracker, MAX_ACCELERATION, M
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, select_rows
 from gyro_calibration.model.compensation import compensate, CompensatedSamples, rate_sensitivity
 from gyro_calibration.model.effects import Channels
-from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.gyro_model import GyroModel, STEP_TOLERANCE
 import numpy as np
 from numpy.typing import NDArray
 
-#: Change of the heading at which the iteration ends, rad, and largest number of passes.
-_HEADING_TOLERANCE, _MAX_PASSES = 1e-10, 50
+_MAX_PASSES = 50  # largest number of the iteration of a heading
 
 
 class LogCompensation:
@@ -88,7 +87,7 @@ class LogCompensation:
             before, heading = heading, integrate(time, rate, begin)
             if known.any():
                 heading += np.interp(time, time[known], (reference - heading)[known])
-            if np.abs(heading - before).max() < _HEADING_TOLERANCE:
+            if np.abs(heading - before).max() < STEP_TOLERANCE:
                 break
         self._last_integration = time[-1:], rate[-1:], float(heading[-1])
         return replace(channels, heading=heading[carried:])

@@ -44,8 +44,6 @@ from scipy.special import ndtri
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
 MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
-#: Duration between two jumps, s, in which the rate may be erroneous.
-_JUMP_DURATION = 2.0
 #: Longest step of the state, s.
 _STEP_DURATION = MEAN_LAGS[0]
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
@@ -279,7 +277,7 @@ class HeadingTracker:
 
     def _may_be_erroneous(self, time: float) -> bool:
         """Tell whether the rate has jumped so shortly before that it may be erroneous."""
-        return 0.0 <= time - self._before_jump[0] < _JUMP_DURATION
+        return 0.0 <= time - self._before_jump[0] < RECENT_DURATION
 
     def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
                      still: Array | None, gap: tuple[int, float] | None = None) -> str:
@@ -467,13 +465,7 @@ class HeadingTracker:
             for duration, angle, row, square in zip(
                 durations[last].tolist(), angles[last].tolist(), rows[last],
                 squares[last].tolist()))
-        turned = self._corrected_angle(whole)
-        if self.is_resting:
-            self.deleted_heading += turned
-        else:
-            decayed = float(piece.block_retentions[here].prod())
-            self.heading += turned + self._pending_correction * (1.0 - decayed)
-            self._pending_correction *= decayed
+        if not self.is_resting:
             turn, ends = self._open_integral, piece.block_ends[here]
             until = turn.duration + np.cumsum(durations)
             piece.epochs[-1].open_integrals.append((
@@ -481,17 +473,28 @@ class HeadingTracker:
                 self._unbiased_sensitivity(until, turn.sensitivity + np.cumsum(rows, axis=0),
                                            None if piece.still is None else piece.still[ends])))
             self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
+        self._integrate_blocks(piece, here, whole)
         self._open_integral += whole
         self._open_variance = None
-        end = piece.block_stops[number + passed - 1] - 1
-        time, rate = float(piece.time[end]), float(piece.rate[end])
-        used = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
-        self._last_sample = time, rate, rate, used[end]
-        self._interval, self._last_time = float(piece.intervals[end]), time
-        self._wheel_motion_time = time
-        self._still_sensitivity = None if piece.still is None else piece.still[end]
+        self._wheel_motion_time = self._last_time
         self._energy.skip(passed)
         return passed
+
+    def _integrate_blocks(self, piece: EvenSamples, here: slice, turn: RateIntegral) -> None:
+        """Integrate the heading over whole blocks, and adopt their last sample."""
+        turned = self._corrected_angle(turn)
+        if self.is_resting:
+            self.deleted_heading += turned
+        else:
+            decayed = float(piece.block_retentions[here].prod())
+            self.heading += turned + self._pending_correction * (1.0 - decayed)
+            self._pending_correction *= decayed
+        last = piece.block_stops[here.stop - 1] - 1
+        time, rate = float(piece.time[last]), float(piece.rate[last])
+        used = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
+        self._last_sample = time, rate, rate, used[last]
+        self._interval, self._last_time = float(piece.intervals[last]), time
+        self._still_sensitivity = None if piece.still is None else piece.still[last]
 
     def _count_quiet_blocks(self, piece: EvenSamples, number: int) -> int:
         """Return how many of the next whole blocks are at rest before a decision."""
@@ -579,7 +582,6 @@ class HeadingTracker:
         part = self._block_integral
         part.duration, part.angle = (float(piece.block_sums[0, number]),
                                      float(piece.block_angles[number]))
-        decayed = float(piece.block_retentions[number])
         part.sensitivity = piece.sensitivity_integrals[self.is_resting][number]
         if self.is_resting != piece.last_at_rest:
             assert self._last_sample is not None
@@ -587,16 +589,7 @@ class HeadingTracker:
                                 * (self._last_sample[3] - rows[begin - 1]))
             piece.last_at_rest = self.is_resting
         self._block.duration = part.duration
-        turned = self._corrected_angle(part)
-        if self.is_resting:
-            self.deleted_heading += turned
-        else:
-            self.heading += turned + self._pending_correction * (1.0 - decayed)
-            self._pending_correction *= decayed
-        time, rate = float(piece.time[end - 1]), float(piece.rate[end - 1])
-        self._last_sample = time, rate, rate, rows[end - 1]
-        self._interval, self._last_time = float(piece.intervals[end - 1]), time
-        self._still_sensitivity = None if piece.still is None else piece.still[end - 1]
+        self._integrate_blocks(piece, slice(number, number + 1), part)
         self._end_block(driven, moved[-1] if moved else None)
         if not -math.inf < self.heading < math.inf:
             self._rebuild_state()
@@ -1020,7 +1013,7 @@ class HeadingTracker:
         if (self._sensitivity_slope is None or self._still_sensitivity is None
                 or turn.is_unobserved):
             return turn
-        return turn.with_sensitivity(self._unbiased_sensitivity(
+        return replace(turn, sensitivity=self._unbiased_sensitivity(
             turn.duration, turn.sensitivity, self._still_sensitivity))
 
     def _unbiased_sensitivity(self, duration: Number, sensitivity: Array,
@@ -1034,7 +1027,7 @@ class HeadingTracker:
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
         return (turn + self._zero_integral if self._still_sensitivity is None
-                else turn.with_sensitivity(turn.duration * self._still_sensitivity))
+                else replace(turn, sensitivity=turn.duration * self._still_sensitivity))
 
     def _adopt_state(self) -> None:
         """Adopt the new state and the noise of the samples; the heading does not jump."""

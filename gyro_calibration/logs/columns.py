@@ -29,26 +29,25 @@ STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
 #: Temperatures, degC, that a sensor in a gyro may have; others are taken for errors.
 PLAUSIBLE_TEMPERATURES = -100.0, 200.0
 
-#: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
-COLUMNS: Mapping[str, tuple[str, float]] = {
-    'time_s': ('time', 1.0),
-    'gyro_rad_s': ('output', 1.0),
-    'gyro_dps': ('output', DEGREE),
-    'gyro_counts': ('counts', 1.0),
-    'temperature_degc': ('temperature', 1.0),
-    'reference_rate_rad_s': ('reference_rate', 1.0),
-    'reference_rate_dps': ('reference_rate', DEGREE),
-    'reference_heading_rad': ('reference_heading', 1.0),
-    'reference_heading_deg': ('reference_heading', DEGREE),
-    'cross_axis_1_rad': ('cross_axis_1', 1.0),
-    'cross_axis_1_deg': ('cross_axis_1', DEGREE),
-    'cross_axis_2_rad': ('cross_axis_2', 1.0),
-    'cross_axis_2_deg': ('cross_axis_2', DEGREE),
-    'acceleration_mps2': ('specific_force', 1.0),
-    'supply_v': ('supply', 1.0),
-    'moving': ('moving', 1.0),
+#: Quantity -> names of its columns, that in SI first; in the order of writing.
+_COLUMN_NAMES = {
+    'time': ('time_s',),
+    'output': ('gyro_rad_s', 'gyro_dps'),
+    'counts': ('gyro_counts',),
+    'temperature': ('temperature_degc',),
+    'reference_rate': ('reference_rate_rad_s', 'reference_rate_dps'),
+    'reference_heading': ('reference_heading_rad', 'reference_heading_deg'),
+    'cross_axis_1': ('cross_axis_1_rad', 'cross_axis_1_deg'),
+    'cross_axis_2': ('cross_axis_2_rad', 'cross_axis_2_deg'),
+    'specific_force': ('acceleration_mps2',),
+    'supply': ('supply_v',),
+    'moving': ('moving',),
 }
-QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
+QUANTITIES = tuple(_COLUMN_NAMES)
+#: Column name -> (quantity, factor to SI).
+COLUMNS: Mapping[str, tuple[str, float]] = {
+    name: (quantity, DEGREE if name.endswith(('_dps', '_deg')) else 1.0)
+    for quantity, names in _COLUMN_NAMES.items() for name in names}
 #: Parts of a quaternion, from which a reader computes the reference heading and `ROTATIONS`.
 ATTITUDE = ('attitude_w', 'attitude_x', 'attitude_y', 'attitude_z')
 #: The rotation about the axis of the gyro and about the next two, in the order x, y, z, x, y.
@@ -57,27 +56,28 @@ AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as 
 
 RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
               'deg/h': DEGREE / 3600.0}
+_NO_UNIT = {'1': 1.0}
 _ANGLE_UNITS = {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
     'gyro': ('output', RATE_UNITS),
-    'counts': ('counts', {'1': 1.0}),
+    'counts': ('counts', _NO_UNIT),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
     'rate': ('reference_rate', RATE_UNITS),
     'heading': ('reference_heading', _ANGLE_UNITS),
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
                                         'mg': 1e-3 * STANDARD_GRAVITY}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
-    'moving': ('moving', {'1': 1.0}),
-    'attitude': ('reference_heading', {'1': 1.0}),
+    'moving': ('moving', _NO_UNIT),
+    'attitude': ('reference_heading', _NO_UNIT),
 }
 #: Name of a quantity in options -> pattern of column names in other programs, in lower case,
 #: letters only, before the unit.
 _COLUMN_ALIASES = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
-    'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|gyroscope|gyroscopez|omega|omegaz|.*angularvelocityz|'
-            r'angvelz|yawrate|gyrorate',
+    'gyro': r'w|wz|gz|(gyro|gyr|gyroscope|omega)(rotation|rate)?z?|angvelz|yawrate|'
+            r'.*(angularvelocity|rotationrate)z',
     'temperature': r'temp|temperature|tempc|gyrotemp|imutemp|dietemp|tgyro',
     'rate': r'ref|reference|referencerate|refrate|truerate|tablerate|ratetable',
     'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',

@@ -44,8 +44,6 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-#: Iterates over items, and may show the progress.
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 #: Half-width of the central 95 % interval of a normal distribution, standard deviations.
@@ -130,7 +128,8 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     """
     Read a log file (.csv or .csv.gz), with the parameters of `api.read_log`.
 
-    Values are separated by commas, or by semicolons or tabs; then the decimal mark may be a comma.
+    Values are separated by commas or spaces, or by semicolons or tabs; then the decimal mark may
+    be a comma.
     `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
     """
     blocks, numbers = [], 0
@@ -169,7 +168,10 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                            'convert it, by pip install rosbags and '
                            f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
-        table, first_line = _read_header(_limit_length(lines), columns, axis)
+        table, first_line, first_rows = _read_header(_limit_length(lines), columns, axis)
+        lines = itertools.chain(first_rows, lines)
+        if table.delimiter == ' ':  # of which there may be several
+            lines = (' '.join(line.split()) + '\n' for line in lines)
         budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
@@ -271,22 +273,33 @@ class _FileHeader(NamedTuple):
 
 
 def _read_header(lines: Iterator[str], columns: Mapping[str, str],
-                 axis: str) -> tuple[_FileHeader, int]:
-    """Return notes and header, and the number of the next line."""
+                 axis: str) -> tuple[_FileHeader, int, list[str]]:
+    """
+    Return notes and header, the number of the next line, and the rows that were read.
+
+    Without a header, the names of columns are their numbers, from 1 on.
+    """
     notes, line = [], next(lines, '')
     while line.startswith(('#', 'sep=')):  # spreadsheets write the delimiter into the first line
         notes.append(line.removeprefix('#').strip())
         line = next(lines, '')
     delimiter = find_delimiter(line)
+    if delimiter not in line and len(line.split()) > 1:
+        delimiter, line = ' ', ' '.join(line.split())
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
+    has_names = not all(_is_number(name) for name in header)
+    if not has_names:
+        header = [str(1 + place) for place in range(len(header))]
     if not is_header(header, columns, axis):
         if not header:
             raise LogError('has no line with the names of columns; record again, or name another '
                            'file')
+        place = ('NAME:s', 'NAME:deg/s') if has_names else ('1:s', '2:deg/s')
         meant = suggest_columns(header) or (
             '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
-            'lines above it, or name the columns, as by --columns time=NAME:s,gyro=NAME:deg/s')
+            f'lines above it, or name the columns{"" if has_names else ", by number"}, as by '
+            '--columns time={},gyro={}'.format(*place))
         raise LogError(f'line {len(notes) + 1} is no header with a known column: '
                        f'{excerpt(line.strip())}{meant}')
     found = find_columns(header, columns, axis)
@@ -294,7 +307,14 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
     others = {name: index for index, name in enumerate(_make_unique(header))
               if index not in taken and header[index] not in COLUMNS}
     return (_FileHeader(tuple(notes), header, found, others, delimiter),
-            len(notes) + rows.line_num + 1)
+            len(notes) + has_names * rows.line_num + 1, [] if has_names else [line])
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(_to_number(text.replace(',', '.')))
+    except ValueError:
+        return False
 
 
 def _make_unique(header: list[str]) -> list[str]:

@@ -28,7 +28,7 @@ import numpy as np
 
 #: State at the last sample, by (channel, time constant) of a lag and ('heating', filter time,
 #: threshold) of the sign of heating.
-LagStates = dict[tuple[Any, ...], float]
+_LagStates = dict[tuple[Any, ...], float]
 
 
 class ChannelHistory:
@@ -77,13 +77,13 @@ class _Block:
         self._signals = dict(signals)
         self._end_time = _edge_value(time, -1)
         self._last_values: dict[str, float] = {}
-        self._lag_states: LagStates = {}
+        self._lag_states: _LagStates = {}
         begin = _edge_value(time, 0)
         if previous is not None:
             self._lag_states, begin = previous.end_states(), previous._end_time
             self._last_values = previous._last_values | {
                 name: _edge_value(signal, -1) for name, signal in previous._signals.items()}
-        self._end_states: LagStates = {}
+        self._end_states: _LagStates = {}
         self._interval = _differences(time, begin)
 
     def signal(self, channel: str) -> Number:
@@ -118,7 +118,7 @@ class _Block:
         self._end_states[key] = _edge_value(branch, -1)
         return branch
 
-    def end_states(self) -> LagStates:
+    def end_states(self) -> _LagStates:
         """Return the state at the end, including lags that were not requested in this block."""
         for key in self._lag_states.keys() - self._end_states.keys():
             (self.heating_sign if key[0] == 'heating' else self.lag_difference)(*key[-2:])

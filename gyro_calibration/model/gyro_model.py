@@ -33,7 +33,7 @@ _MIN_OUTPUT_SLOPE = 0.1
 _NO_ERROR_STATE = nullcontext()
 #: Largest last step of a converged iteration, relative to 1 rad/s plus the rate; the error is much
 #: smaller.
-_STEP_TOLERANCE = 1e-10
+STEP_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -384,7 +384,7 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
         # a single sample may leave the domain by at most 1 rad/s during the iteration
         rate, step = _iterate_secant(lambda x: output - error_at(x), start, low - 1.0, high + 1.0)
         solved = ((low <= rate) & (rate <= high)
-                  & (abs(step) <= _STEP_TOLERANCE * (1.0 + abs(rate))))
+                  & (abs(step) <= STEP_TOLERANCE * (1.0 + abs(rate))))
     if solved.all() if many else solved:
         return rate, False
     with np.errstate(all='ignore'):

@@ -157,8 +157,8 @@ def read_motion(path: str | Path) -> Motion:
     """
     try:
         lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
-        rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
-        header = [name.strip() for name in next(rows, [])]
+        rows = csv.DictReader(line for line in lines if line.strip() and not line.startswith('#'))
+        rows.fieldnames = header = [name.strip() for name in rows.fieldnames or ()]
         found = sorted(name for name in _COLUMN_UNITS if name in header)
         has_both = (len(found) == 2 and found[0].startswith('reference_heading')
                     and found[1].startswith('reference_rate'))
@@ -167,9 +167,8 @@ def read_motion(path: str | Path) -> Motion:
             raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
                               'heading_deg, heading_rad, rate_dps, rate_rad_s')
         name = found[0]
-        places = header.index('time_s'), header.index(name)
-        time, values = np.fromiter((_parse_number(path, row, place, header)
-                                    for row in rows for place in places), float).reshape(-1, 2).T
+        time, values = np.fromiter((_parse_number(path, each, row[each] or '') for row in rows
+                                    for each in ('time_s', name)), float).reshape(-1, 2).T
     except MotionError:
         raise
     except (OSError, ValueError, csv.Error) as error:
@@ -182,16 +181,15 @@ def read_motion(path: str | Path) -> Motion:
     return (motion_from_rates if 'rate' in name else motion_from_headings)(time, values)
 
 
-def _parse_number(path: str | Path, row: list[str], place: int, header: list[str]) -> float:
+def _parse_number(path: str | Path, column: str, text: str) -> float:
     """Return a number; nan is one where a reference may be lost."""
-    text = row[place] if place < len(row) else ''
     try:
         value = float(text)
     except ValueError:
         value = math.inf
-    if abs(value) <= MAX_MAGNITUDE or value != value and header[place].startswith('reference_'):
+    if abs(value) <= MAX_MAGNITUDE or value != value and column.startswith('reference_'):
         return value
-    raise MotionError(f'{path}: column {header[place]}: {excerpt(text) or "an empty cell"} is not '
+    raise MotionError(f'{path}: column {column}: {excerpt(text) or "an empty cell"} is not '
                       'a finite number; correct or remove the row')
 
 

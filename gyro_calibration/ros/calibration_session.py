@@ -44,18 +44,17 @@ from gyro_calibration.model.motion import (
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
 from gyro_calibration.ros.inputs import (
-    Clock, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
+    Clock, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
 from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
+_REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
 SAMPLE_TIMEOUT = 5.0
-DRIVE_SAMPLE_TIMEOUT = 0.25  # s; likewise of a drive; four intervals of a slower gyro
-STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
+_STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
 #: Least change of the odometry heading that shows a turn, rad: beyond the slack of wheels at rest.
 MIN_TURN_ANGLE = 1.0 * DEGREE
 _MAX_NODE_PAUSE = 1.0  # s; after a longer one in a drive the base has stopped, or turned on
@@ -113,7 +112,7 @@ class CalibrationRun:
     @property
     def extra_duration(self) -> float:
         """Return the duration of samples after the motion, s."""
-        return {REST: 0.0, TURNS: REST_AFTER_TURNS}.get(
+        return {REST: 0.0, TURNS: _REST_AFTER_TURNS}.get(
             self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property
@@ -143,7 +142,7 @@ class Drive:
         self._start_time = self._last_poll = clock.steady()
         self._has_receiver = self._had_callers = self._lost_callers = False
         self._next_command_time = -math.inf
-        self._stamp_delay = StampDelay(clock, 2.0, (0.5, DRIVE_SAMPLE_TIMEOUT))
+        self._stamp_delay = StampDelay(clock, 2.0, (0.5, FAULT_DURATION))
         self.command_lateness = self.sample_lateness = 0.0  # largest ones, s
 
     def add_sample(self, time: float) -> None:
@@ -246,10 +245,10 @@ class CalibrationSession:
                 return str(error)
             duration = motion.duration
             # less than any gyro's limit; one in deg/s that was taken for rad/s is faster
-            fastest, limit = _max_rate(motion), STOPPING_DURATION * MAX_ANGULAR_ACCELERATION
+            fastest, limit = _max_rate(motion), _STOPPING_DURATION * MAX_ANGULAR_ACCELERATION
             if drives and fastest > limit:
                 return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but a robot is '
-                        f'expected to stop in {STOPPING_DURATION:g} s, as from '
+                        f'expected to stop in {_STOPPING_DURATION:g} s, as from '
                         f'{limit / DEGREE:.0f} deg/s: correct calibration.profile_file')
         if drives and obstacle:
             return obstacle
@@ -290,7 +289,7 @@ class CalibrationSession:
             self.run.odometry.append((time, heading, rate))
         late = self._clock.steady() - self._stop_time
         alone = self._last_foreign_command < self._stop_time and not self._drive
-        if (alone and STOPPING_DURATION < late < 2.0 * STOPPING_DURATION
+        if (alone and _STOPPING_DURATION < late < 2.0 * _STOPPING_DURATION
                 and abs(rate) > 1.0 * DEGREE):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
                             f'{late:.1f} s after it was commanded to stop: set the command '
@@ -336,7 +335,7 @@ class CalibrationSession:
                           'to true and run again')
             if not drive.is_waiting(receivers):
                 usual = self._estimator.tracker.intervals.usual_interval
-                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.limits.max_gap)
+                timeout = min(max(FAULT_DURATION, 4.0 * usual), run.limits.max_gap)
                 is_driven = True
         # Decided at the second poll: after a pause of this process, queued samples are delivered
         # after its timers.

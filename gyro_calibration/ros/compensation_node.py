@@ -37,8 +37,8 @@ from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSE
 from gyro_calibration.ros.inputs import Clock, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
-    allow_future_response, call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK,
-    publish_on, Report, run_node, status_array, subscribe_to, WARN)
+    call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK, publish_on, Report,
+    run_node, status_array, subscribe_to, WARN)
 from nav_msgs.msg import Odometry
 from rclpy.clock import ROSClock
 from rclpy.duration import Duration
@@ -132,8 +132,17 @@ class CompensationNode(Node):
 
     def _offer_service(self, name: str,
                        fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
-        allow_future_response(
-            self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response)))
+        """Offer a service whose answer may be a `Future`, in every executor."""
+        service = self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response))
+        send = service.send_response
+
+        def send_when_done(response: Any, header: Any) -> None:
+            if isinstance(response, Future):
+                response.add_done_callback(lambda done: send(done.result(), header))
+            else:
+                send(response, header)
+
+        service.send_response = send_when_done  # type: ignore[method-assign]
 
     # Subscriptions
 

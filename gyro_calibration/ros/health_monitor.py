@@ -31,12 +31,12 @@ from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.inputs import MAX_ANGULAR_ACCELERATION, MIN_ODOMETRY_TURN_RATE
+from gyro_calibration.ros.inputs import (
+    FAULT_DURATION, MAX_ANGULAR_ACCELERATION, MIN_ODOMETRY_TURN_RATE)
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
 _PART_DURATION = 1.0  # s; of the parts of a stretch that are compared: a push shows in one
-_MIN_REPEAT_DURATION = 0.25  # s; repeated values that last as long are a fault
 #: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
 #: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
@@ -105,7 +105,7 @@ class RepeatedOutputDetector:
             return toggles
         self._count, self._until = self._count + 1, time
         lasts = time - self._since
-        if toggles or self._count < 20 or lasts < _MIN_REPEAT_DURATION:
+        if toggles or self._count < 20 or lasts < FAULT_DURATION:
             return toggles
         if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
@@ -144,7 +144,7 @@ class RepeatedOutputDetector:
         self._band = low, high, since, count
         lasts = time - since
         sample = (self._noise.angle_random_walk / math.sqrt(lasts / count)
-                  if lasts > _MIN_REPEAT_DURATION else 0.0)
+                  if lasts > FAULT_DURATION else 0.0)
         return (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
                 and self._changes > 100 and sample > 0.0
                 and self._excludes_chance(2.0 * self._step, count, sample))
@@ -188,7 +188,7 @@ class PulseDetector:
             self._median_step = float(np.median([size for _, size in self._steps]))
         is_jump = abs(step) > _MAX_DECELERATION * interval + _MIN_PULSE_RATIO * self._median_step
         found = 0.0, 0
-        if self._pulse and not 0.0 <= time - self._pulse[1] <= _MIN_REPEAT_DURATION:
+        if self._pulse and not 0.0 <= time - self._pulse[1] <= FAULT_DURATION:
             self._pulse = None
         if self._pulse is None:
             if is_jump:

@@ -221,13 +221,16 @@ class RosTime:
         self._last_poll = now
 
 
+#: Shortest fault of the samples, s: none come (of a slower gyro for four intervals), they repeat a
+#: value, or their stamps or ROS time stand still.
+FAULT_DURATION = 0.25
 MAX_VELOCITY_AGE = 1.0  # largest age of a velocity that is used, s; slower odometry shows nothing
 #: Longest motion after the last command to move, s: the default time-out of ros2_control's
 #: diff_drive_controller.
 COASTING_DURATION = 0.5
 #: Largest speeds of wheels at standstill, m/s and rad/s: what turns slower adds to the bias at
 #: rest, 0.011 deg/s at most.
-STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
+_STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s: 2.9 deg/s, beyond the bias of a gyro.
 MIN_ODOMETRY_TURN_RATE = 0.05
 #: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
@@ -245,7 +248,7 @@ class Velocity:
     @property
     def is_moving(self) -> bool:
         """Tell whether it exceeds the speeds at standstill."""
-        return (any(abs(part) > STANDSTILL_SPEED for part in self.linear)
+        return (any(abs(part) > _STANDSTILL_SPEED for part in self.linear)
                 or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
 
 

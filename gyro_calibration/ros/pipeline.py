@@ -42,12 +42,12 @@ from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, DRIVE_SAMPLE_TIMEOUT, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
+    CalibrationSession, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
-    AlternateTurns, Clock, COMMAND, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE, NodeParameter,
-    ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
+    AlternateTurns, Clock, COMMAND, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE,
+    NodeParameter, ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
 from gyro_calibration.ros.state_store import StateStore
 
 PARAMETERS = (
@@ -192,7 +192,7 @@ class Pipeline:
         """Return a comparison of stamps and clock, whose tolerance a deviation of 6 % exceeds."""
         self._stamp_turn = 0.0  # unknown turn by them that is in the variance, rad
         # a busy computer delays all samples by a second for a short time
-        return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, DRIVE_SAMPLE_TIMEOUT))
+        return StampDelay(self._clock, 30.0, (0.5, 1.0), (5.0, FAULT_DURATION))
 
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
@@ -418,13 +418,13 @@ class Pipeline:
             self._frozen_stamp = first, max(fastest, abs(output))
             journal.event = (
                 f'the stamp stands still at {time:.3f} s; the sample is not used'
-                if now - first > DRIVE_SAMPLE_TIMEOUT else
+                if now - first > FAULT_DURATION else
                 f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
                 'on its arrival; only the first of them is used: stamp when the gyro measures')
             return True
         if self._frozen_stamp is not None:
             (first, fastest), self._frozen_stamp = self._frozen_stamp, None
-            if now - first > DRIVE_SAMPLE_TIMEOUT:
+            if now - first > FAULT_DURATION:
                 self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                  'came; turns in this time are not in the heading')
@@ -446,7 +446,7 @@ class Pipeline:
         sources = _WHEEL_SOURCES[self.values.wheels]
         moving = self.wheels.is_moving(now, sources) if sources else None
         (interval, silence), lost = since, intervals.lost_samples
-        unseen = not 0.0 < interval <= DRIVE_SAMPLE_TIMEOUT
+        unseen = not 0.0 < interval <= FAULT_DURATION
         if unseen and not moving and not self.wheels.has_stood(journal.last_received, now,
                                                                sources):
             moving = None
@@ -553,9 +553,9 @@ class Pipeline:
         # lists the killed one. Delayed samples also follow too soon, until they have caught up.
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
         interval, behind = stamp - self._last_stamp, self._backlog
-        begins = self._clock.steady() - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
+        begins = self._clock.steady() - self._last_arrival > FAULT_DURATION
         self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
-                                               NSEC_PER_SEC * DRIVE_SAMPLE_TIMEOUT)
+                                               NSEC_PER_SEC * FAULT_DURATION)
         self._interleaved_count += not (2.0 * interval > usual or behind)
         if self._interleaved_count > 1:
             self._refuse_all(self.publisher_conflict)
@@ -563,7 +563,7 @@ class Pipeline:
     def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
-        if self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT:
+        if self.ros_time.paused_duration > FAULT_DURATION:
             return ROS_TIME_PAUSED
         if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
                 or self.clock_fault or self.frame_fault or self.alternation_fault):
@@ -596,7 +596,7 @@ class Pipeline:
         # A drive ends where several publishers exist, before their samples mix.
         conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
         self.session.poll(self.values, receivers,
-                          self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT, conflict)
+                          self.ros_time.paused_duration > FAULT_DURATION, conflict)
 
     def run_periodic_tasks(self, is_final: bool = False) -> None:
         """Update bias table and files; to be called once per second, and at the end."""

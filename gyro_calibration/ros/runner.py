@@ -28,7 +28,6 @@ import signal
 import sys
 import threading
 from types import SimpleNamespace
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from gyro_calibration.ros.inputs import NodeParameter, parameter_values
@@ -42,10 +41,8 @@ from rclpy.node import Node, PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 from rclpy.timer import Timer
 
 #: Of subscriptions to samples: best effort, compatible with every publisher (REP-2003). The depth
@@ -223,19 +220,6 @@ def run_node(node_class: Callable[[], Node]) -> int:
         # A launch file sends SIGINT twice; the second would kill the interpreter at its exit.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
-
-
-def allow_future_response(service: Service) -> None:
-    """Allow the callback of a service to return a `Future`, in every executor."""
-    send = service.send_response
-
-    def send_when_done(response: Any, header: Any) -> None:
-        if isinstance(response, Future):
-            response.add_done_callback(lambda done: send(done.result(), header))
-        else:
-            send(response, header)
-
-    service.send_response = send_when_done  # type: ignore[method-assign]
 
 
 def spin(node: Node, stop: threading.Event) -> None:

@@ -12,6 +12,7 @@
 
 import json
 import math
+import re
 
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.allan.deviation import allan_deviation, build_rest_record
@@ -219,7 +220,7 @@ def moved(kind):
 
 @pytest.mark.parametrize(
     'kind, said',
-    [('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest, from 2[23]\d.*to 500'),
+    [('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest, from 2[23]\d.*to 499.9'),
      ('jolt', r'moved.*from (199|200)\.\d+ s on'), ('swing', 'the record contains something'),
      ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
      ('tatters', r'10 ms apart.*--rate'), ('few', '99 samples.*at least 100'),
@@ -228,6 +229,19 @@ def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
         record = build_rest_record(*moved(kind))
         fit_noise(record.rate, record.interval)
+
+
+def test_the_part_at_rest_that_is_proposed_is_accepted(tmp_path, run):
+    """Beside a large motion a smaller one does not show; times are those of --from and --to."""
+    time, rate = stamps(20_000), simulate_noise(WHITE, 20_000, INTERVAL,
+                                                np.random.default_rng(24))
+    rate += np.where((time > 20.0) & (time < 30.0), np.sin(time), 0.0)
+    rate += np.where((time > 100.0) & (time < 101.0), 0.02 * np.sin(2.0 * math.pi * time), 0.0)
+    write_log(log := tmp_path / 'log.csv', Log(time=1000.0 + time, output=rate))
+    refusal = run('allan', log)[2].replace('\n', ' ')
+    begin, end = re.search(r'at rest, from ([\d.]+) to ([\d.]+) s, or', refusal).groups()
+    assert 101.0 <= float(begin) < 110.0 and float(end) == pytest.approx(199.9, abs=0.11)
+    assert run('allan', log, '--from', begin, '--to', end)[0] == 0
 
 
 def test_a_fit_without_noise_or_without_windows_is_refused():

@@ -14,12 +14,17 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.heading_regression import lay_out_spans
 from gyro_calibration.calibration.own_instants import keep_own_instants
-from gyro_calibration.calibration.reference_noise import heading_difference
+from gyro_calibration.calibration.reference_noise import (
+    find_rests, heading_difference, is_course)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.log import (
+    DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, read_log)
+from gyro_calibration.logs.quality import bridge_gaps
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 SCALE, BIAS = 1.01, 0.4 * DEGREE
 
@@ -51,6 +56,30 @@ def test_scale_bias_and_delay_are_found(late, every):
     assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=4.5 * deviations[0])
     assert found.fit.bias == pytest.approx(BIAS, abs=4.5 * deviations[1])
     assert deviations[0] < 0.01 and deviations[1] < 0.1 * DEGREE
+
+
+def test_a_reference_that_begins_late_is_no_course():
+    """A recorder gets the first message of each topic when it comes."""
+    log = drive(7)
+    heading = bridge_gaps(log.reference_heading)
+    for lost, is_lost in ((0.0, False), (0.08, False), (3.0, True)):
+        late = np.where((log.time < lost) | (log.time > 179.98 - lost), math.nan, heading)
+        assert is_course(replace(log, reference_heading=late)) == is_lost
+
+
+@pytest.mark.parametrize('turns', [1, 3])
+def test_odometry_that_drives_straight_is_known(turns):
+    """Its heading is the same all the time, as its rate is 0 there."""
+    time = np.arange(4000) / 50.0
+    rate = np.where((time > 4.0) & (time < 4.0 + 5.0 * turns), 0.4 * np.sin(2.0 * time), 0.0)
+    output = SCALE * rate + BIAS + 2e-3 * np.random.default_rng(8).standard_normal(len(time))
+    log = Log(time=time, output=output, reference_heading=np.cumsum(rate) / 50.0)
+    fit = calibrate_encoder(log, 'course').fit
+    assert fit.bias == pytest.approx(BIAS, abs=0.02 * DEGREE)
+    assert abs(fit.scale_factor_error - (SCALE - 1.0)) < 3.0 * math.sqrt(fit.covariance[0, 0])
+    with pytest.raises(DataRefused, match='the course is known for 1. s, wanted at least 20 s'):
+        calibrate_encoder(Log(time=time[:600], output=output[:600],
+                              reference_heading=log.reference_heading[:600]), 'course')
 
 
 def test_a_delay_at_the_limit_is_said():
@@ -152,6 +181,41 @@ def test_wheels_at_another_distance_are_no_slip(track):
     assert 'beyond what gyros of the technology mems have' in ' '.join(found.remarks)
 
 
+def short_odometry(seed, track, turns, slip):
+    """Return 90 s with turns of 90 deg, beside wheels whose heading walks by `slip` in each."""
+    generator, time = np.random.default_rng(seed), np.arange(0.0, 90.0, 0.02)
+    rate, is_turning = 0.2 * DEGREE * np.sin(time), np.zeros(len(time), dtype=bool)
+    for begin in np.linspace(5.0, 80.0, turns):
+        inside = (time >= begin) & (time < begin + 4.0)
+        rate[inside] += generator.choice([-1.0, 1.0]) * 45.0 * DEGREE * np.sin(
+            np.pi * (time[inside] - begin) / 4.0) ** 2
+        is_turning |= inside
+    slips = slip / math.sqrt(200.0) * is_turning * generator.standard_normal(len(time))
+    return Log(time=time, output=SCALE * rate + BIAS + 1e-3 * generator.standard_normal(len(time)),
+               reference_heading=np.cumsum(track * 0.02 * rate + slips))
+
+
+@pytest.mark.parametrize('track', [0.94, 1.0])
+def test_a_scale_that_a_short_drive_hardly_shows_is_in_the_interval(track):
+    """Wrong ones were near 0 with the interval of a gyro, +- 2 %."""
+    held = []
+    for seed in range(6):
+        fit = calibrate_encoder(short_odometry(seed, track, 5, 5.0 * DEGREE), 'course').fit
+        held.append(abs(fit.scale_factor_error - SCALE / track + 1.0)
+                    < NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0]))
+    assert np.sum(held) >= 5
+
+
+def test_noise_of_the_gyro_is_no_turn_of_a_course():
+    """It is in the observations too, so that a scale factor error of 1 would cancel it."""
+    spans = lay_out_spans(short_odometry(0, 1.0, 5, 0.0))
+    count = len(spans.heading) - 1
+    straight = replace(spans, heading=np.zeros(count + 1))
+    turned, none = (each.rate_columns()[:count, 0] for each in (spans, straight))
+    assert np.abs(turned).max() > 45.0 * DEGREE
+    assert (none == 0.0).all() and (straight.angles == 0.0).all()
+
+
 def test_a_motion_capture_that_loses_its_markers_is_no_course():
     """It errs by less than a course, and by more than the gyro, as where its axes are oblique."""
     generator = np.random.default_rng(4)
@@ -181,3 +245,15 @@ def test_the_errors_of_a_reference_at_an_uneven_part_of_the_samples_are_found():
         output=rate + 0.1 * DEGREE * generator.standard_normal(len(time))))
     assert np.isfinite(log.reference_heading).mean() < 0.5
     assert heading_difference(log).total_walk == pytest.approx(0.2 * DEGREE, rel=0.2)
+
+
+def test_rests_are_found_beside_filtered_noise():
+    """Single seconds are far quieter than others by chance."""
+    time = np.arange(15_000) / 50.0
+    moves = time % 30.0 > 10.0
+    turned = np.where(moves, 0.3 * np.sin(1.3 * time), 0.0)
+    noise = np.random.default_rng(10).standard_normal(len(time))
+    slow = lfilter([0.1], [1.0, -0.9], noise)
+    rests, stands = find_rests(time, turned + 1e-3 * slow, np.cumsum(turned))
+    assert len(rests) == 10 and stands.all()
+    assert np.diff(time[rests]).sum() == pytest.approx(100.0, abs=10.0)

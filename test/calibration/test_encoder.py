@@ -174,7 +174,7 @@ def test_references_that_contradict_each_other_are_remarked(factor, late, said):
     noise = 0.1 * DEGREE * np.random.default_rng(65).standard_normal(len(rate))
     remark = calibrate({'': replace(NOISY, reference_rate=rate + noise)}, method='likelihood'
                        ).remarks[0]
-    assert remark.startswith(f'the reference rate turns {said}') == bool(said), remark
+    assert remark.startswith(f'The reference rate turns {said}') == bool(said), remark
 
 
 @pytest.mark.parametrize('size', [0.5, 100.0, 1e6])

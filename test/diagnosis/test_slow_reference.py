@@ -13,7 +13,7 @@
 from dataclasses import replace
 
 from chance import seeds
-from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.encoder import calibrate_encoder, choose_reference
 from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
@@ -104,6 +104,33 @@ def test_a_slow_reference_shows_the_gyro_and_nothing_else(name, asymmetry, seed)
     values = {term.effect.name: term.values[0] for term in found.model.terms}
     assert values['scale_factor_error'] == pytest.approx(SCALE, abs=2e-3)
     assert values['bias'] == pytest.approx(BIAS, abs=0.03 * DEGREE)
+
+
+def test_all_verbs_take_the_heading_where_a_rate_is_late_and_state_that_once():
+    """The twist of odometry is often a mean over the last second, and its pose is not."""
+    log, rate, heading = turning(4)
+    late = np.mean([rate(TIME - back) for back in np.arange(0.0, 1.2, 0.02)], axis=0)
+    log = replace(log, reference_heading=heading(TIME))
+    alone, both = (diagnose([each], np.random.default_rng(0))
+                   for each in (log, replace(log, reference_rate=late)))
+    fitted = calibrate_encoder(replace(log, reference_rate=late))
+    for found in (both, fitted):
+        remarks = [each for each in found.remarks if 'the heading is used' in each]
+        assert len(remarks) == 1, found.remarks
+        assert remarks[0].startswith('The reference rate is 0.6 s behind the reference heading')
+    assert [each.effect for each in both.findings] == [each.effect for each in alone.findings]
+    assert both.model.terms == alone.model.terms
+    assert fitted.fit.scale_factor_error == pytest.approx(SCALE, abs=2e-3)
+    assert fitted.model.terms == calibrate_encoder(log).model.terms
+
+
+def test_a_heading_that_is_seldom_known_gives_way_to_the_rate():
+    log, rate, heading = turning(4)
+    log = replace(log, reference_rate=rate(TIME), reference_heading=np.where(
+        TIME < 40.0, heading(TIME), np.nan))
+    left, remarks = choose_reference(log)
+    assert left.reference_heading is None and 'heading is known in 2000 samples only' in remarks[0]
+    assert choose_reference(replace(log, reference_heading=heading(TIME)))[1] == []
 
 
 def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():

@@ -165,15 +165,10 @@ def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
 LENGTH = 300_000
 HOSTILE = {
     'noise': random.Random(6).randbytes(LENGTH),
-    'zeros': bytes(LENGTH),
     'line ends': b'\r\n' * (LENGTH // 2),
-    'blanks': b' ' * LENGTH,
-    'commas': b',' * LENGTH,
-    'digits': b'1' * LENGTH,
-    'headers of the 1750': b'\xfe\x81\xff\x55' * (LENGTH // 4),
-    'headers of fizoptika': b'\xdd' * LENGTH,
-    'headers of witmotion': b'\x55\x52' * (LENGTH // 2),
-    'headers of the ecore': b'\x80' * LENGTH,
+    **{f'{byte!r} again and again': byte * LENGTH for byte in (b'\0', b' ', b',', b'1', b'\x80')},
+    'headers of frames': (b'\xfe\x81\xff\x55' * 100 + b'\xdd' * 400 + b'\x55\x52' * 200) * (
+        LENGTH // 1200),
     'almost frames of the ecore': b'\x80' + b'\x01\x00\x00\x00\x00\x00\x00\x80' * (LENGTH // 8),
     'almost lines of the razor': b'#YPRAG=1,1,1,1,1,1,1,1,\n' * (LENGTH // 24),
     'a long number': b'#YPRAG=' + b'1' * 200 + b'\n',
@@ -296,7 +291,7 @@ def received(data, ratio, idle=0):
 @pytest.mark.parametrize('name', ALL)
 def test_every_format_is_recognized_from_five_samples_and_as_no_other(name):
     for motion, force in itertools.product(MOTIONS.values(), (None, 9.8)):
-        recognition = recognize_protocol(b''.join(frames(name, 5, motion, force)))
+        recognition = recognize_protocol(joined(name, 5, motion, force))
         assert recognition.protocol is find_protocol(name), recognition.summary
         assert (recognition.explained_share > 0.99
                 and recognition.summary.startswith(f'{name} explains 100% of'))
@@ -327,8 +322,8 @@ def test_a_wrong_baud_is_no_format(name, idle):
         assert recognition.protocol is None, (baud, recognition)
 
 
-def joined(name, count):
-    return b''.join(frames(name, count))
+def joined(*given):
+    return b''.join(frames(*given))
 
 
 ZEROS = b'\x80' + bytes(7)  # which pass the check of the E-Core

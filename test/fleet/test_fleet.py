@@ -13,7 +13,6 @@
 import csv
 from dataclasses import replace
 from datetime import date, timedelta
-import io
 import json
 import os
 from pathlib import Path
@@ -484,8 +483,6 @@ def test_tables_hold_a_row_for_each_log_and_for_each_value_of_a_unit():
     rows = list(csv.DictReader(content['units.csv'].decode().splitlines()))
     assert [row['unit'] for row in rows if row['value'] == 'bias'] == list('01234')
     assert len(content['logs.csv'].decode().splitlines()) == 1 + len(logs)
-    parquet = pytest.importorskip('pyarrow.parquet')
-    assert parquet.read_table(io.BytesIO(content['units.parquet'])).num_rows == len(rows)
 
 
 def test_a_cluster_gives_what_processes_give():

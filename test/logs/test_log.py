@@ -269,6 +269,21 @@ def test_semicolons_tabs_and_decimal_commas_are_understood(tmp_path, text):
     assert log.others in ({}, {'place': ('a,b', 'c')})
 
 
+@pytest.mark.parametrize('text', [
+    '0.5,10,-1\n1.5,20,-2\n', '0.5;10,0;-1\n1.5;20;-2\n', '  0.5   10 -1\n  1.5 20  -2 \n',
+    '# by hand\n0.5 10 -1\n1.5 20 -2'])
+def test_columns_without_names_have_numbers(tmp_path, text):
+    path, columns = written(tmp_path, text), {'time': '1', 'gyro': '2:deg/s', 'heading': '3:deg'}
+    log = read_log(path, columns=columns)
+    assert log.time.tolist() == [0.5, 1.5]
+    assert log.output / DEGREE == pytest.approx([10.0, 20.0])
+    assert log.reference_heading / DEGREE == pytest.approx([-1.0, -2.0])
+    with pytest.raises(LogError, match='by number, as by --columns time=1:s,gyro=2:deg/s'):
+        read_log(path)
+    with pytest.raises(LogError, match='no column 4 among 1,2,3'):
+        read_log(path, columns={**columns, 'heading': '4:deg'})
+
+
 @pytest.mark.parametrize(('axis', 'rate', 'force'),
                          [('x', 1.0, 7.0), ('y', 2.0, 8.0), ('z', 3.0, 9.0)])
 def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
@@ -284,6 +299,8 @@ def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
      'gyro=gyro_z_degs:deg/s,temperature=temp:UNIT,heading=yaw_deg:deg'),
     ('Time (ms);gyro_z [°/s];temp [°C];Yaw [°]', {}, "--columns 'time=Time (ms):ms,"
      "gyro=gyro_z [°/s]:deg/s,temperature=temp [°C]:degC,heading=Yaw [°]:deg' is meant"),
+    ('loggingTime,gyroRotationZ(rad/s),gyroRotationX(rad/s)', {},
+     "--columns 'gyro=gyroRotationZ(rad/s):rad/s' is meant"),
     ('%time,field.angular_velocity.z', {},
      '--columns time=%time:UNIT,gyro=field.angular_velocity.z:UNIT is meant'),
     ('time_s,gyro_dsp', {}, 'gyro_dps is meant by gyro_dsp'),
