@@ -318,9 +318,9 @@ class RegressionFit:
                       else [one.value for one in self.coefficients(place)])
             for value, column in zip(values, known.columns(new)):
                 found[known.cause] = found.get(known.cause, 0.0) + value * column
-        if replay.command is not None:
+        if replay.command is not None or len(replay.rounding):
             fitted = self.problem.replays[log_index]
-            found['reference'] = fitted.response(
+            found['quantization' if replay.command is None else 'reference'] = fitted.response(
                 replay.channels.output - replay.reference - np.asarray(sum(found.values())))
         return found
 
@@ -359,7 +359,8 @@ class RegressionFit:
                 continue
             means[rank] = np.mean([(part - each.response(part))[each.valid].mean()
                                    for part, each in zip(parts, self.distorted)])
-        return float(means @ self.estimates[1] @ means)
+        rounding = [each.rounding_bias_variance for each in self.problem.replays]
+        return float(means @ self.estimates[1] @ means + np.mean(rounding) / len(rounding))
 
 
 def is_single_event(cause: Candidate) -> bool:

@@ -139,6 +139,8 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
+#: Number of terms of the rounding error of an output, and least noise in steps.
+_ROUNDING_TERMS, _LEAST_ROUNDED_NOISE = 32, 1e-3
 #: Samples in a block of `_without_noise`. The shorter, the less noise is left in a rest next to a
 #: motion; the longer, the slower are the rates that are known.
 _BLOCK_SAMPLES = 16
@@ -176,9 +178,12 @@ class Replay:
     # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
     rounding_variance: float = 0.0  # variance of a sample by quantization of the output, (rad/s)²
-    # commanded rate, shape (n,), and independent responses to it of one standard deviation of
-    # their prior, shape (k, lags), in units of the noise, if the motion follows the command: what
-    # they explain is then taken out of the residual and all columns
+    # independent errors by quantization of the output, shape (m, n); commanded rate, shape (n,),
+    # and independent responses to it, shape (k, lags), if the motion follows the command. Each is
+    # of one standard deviation of its prior, in units of the noise; what they explain is taken out
+    # of the residual and all columns
+    rounding: Array = field(default_factory=lambda: np.empty((0, 0)))
+    rounding_scale: float = 0.0  # deviation of the noise of a point, rad/s
     command: Array | None = None
     responses: Array = field(default_factory=lambda: np.empty((0, 0)))
     response_noise: NoiseShape = NoiseShape()  # noise under which the response is fitted
@@ -291,33 +296,47 @@ class Replay:
     @cached_property
     def _response_basis(self) -> tuple[Array, Array, Array, Array]:
         """
-        Return the responses to the command with independent transforms.
+        Return responses to the command, and errors by quantization, with independent transforms.
 
-        Their transforms, weighted by the noise and not, shape (k, points - 1), with products 1;
-        their kernels, shape (k, lags); and their variance by the prior over that by the noise.
+        Their transforms, weighted by the noise and not, shape (k + m, points - 1), with products
+        1; the sizes of those of this log in each, (k + m, k + m); and their variance by the prior
+        over that by the noise.
         """
-        columns = np.array([self._transform(each) for each in self.delayed_commands(
-            self.responses)])
+        columns = np.array([self._transform(each) for each in (
+            *(self.delayed_commands(self.responses) if len(self.responses) else ()),
+            *self.rounding)])
         weighted = columns / self.response_variance()
         ratios, vectors = np.linalg.eigh(weighted @ columns.T)
-        ratios = np.maximum(ratios, np.finfo(float).tiny)
+        ratios = np.maximum(ratios, np.finfo(float).eps * ratios[-1] + np.finfo(float).tiny)
         scaled = vectors.T / np.sqrt(ratios)[:, None]
-        return scaled @ weighted, scaled @ columns, scaled @ self.responses, ratios
+        return scaled @ weighted, scaled @ columns, scaled, ratios
 
     def _without_response(self, transform: Array) -> Array:
         """Return a transform that has the same variance whether along responses or not."""
-        if not len(self.responses):
+        if not len(self.responses) + len(self.rounding):
             return transform
         weighted, basis, _, ratios = self._response_basis
         return transform - (weighted @ transform) * (1.0 - (1.0 + ratios) ** -0.5) @ basis
 
     def response(self, values: Array) -> Array:
-        """Return the likeliest response to the command in samples, rad/s, shape (n,)."""
-        if not len(self.responses):
+        """Return the likeliest response, and error by quantization, in samples, rad/s, (n,)."""
+        if not len(self.responses) + len(self.rounding):
             return np.zeros(len(values))
-        weighted, _, kernels, ratios = self._response_basis
-        sizes = weighted @ self._transform(values) * ratios / (1.0 + ratios)
-        return next(self.delayed_commands((sizes @ kernels)[None]))
+        weighted, _, scaled, ratios = self._response_basis
+        sizes = (weighted @ self._transform(values) * ratios / (1.0 + ratios)) @ scaled
+        late, rounded = np.split(sizes, [len(self.responses)])
+        total = rounded @ self.rounding if len(rounded) else np.zeros(len(values))
+        return (total + next(self.delayed_commands((late @ self.responses)[None])) if len(late)
+                else total)
+
+    @property
+    def rounding_bias_variance(self) -> float:
+        """Return the variance of the bias by quantization of the output, (rad/s)²."""
+        if not len(self.rounding):
+            return 0.0
+        _, _, scaled, ratios = self._response_basis
+        means = scaled[:, len(self.responses):] @ self.rounding[:, self.valid].mean(axis=1)
+        return self.rounding_scale ** 2 * float(means ** 2 @ (ratios / (1.0 + ratios)))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
@@ -388,17 +407,19 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     heading = prepared_log.reference_heading
     if heading is None or not np.isfinite(heading).all():
         heading = integrate_trapezoidal(time, np.nan_to_num(smooth))
-    expected_rounding = (_expected_rounding(log.output, smooth, kept, output_step) if output_step
-                         else np.zeros(len(time)))
+    rounding, scale = (_rounding_errors(log.output, smooth, kept, output_step) if output_step
+                       else (np.empty((0, 0)), 0.0))
     channels = replace(channels_from_log(prepared_log), rate=smooth, time=time, heading=heading,
-                       output=log.output - expected_rounding)
+                       output=log.output)
     has = frozenset(name for name, known in (
         ('temperature', log), ('specific_force', log), ('supply', log),
         ('reference_rate', prepared_log)) if getattr(known, name) is not None)
     filling = generator.standard_normal(place[-1] + 1)
     plain = Replay(channels, reference, kept, place, interval, every, filling,
                    heading_step if is_heading else 0.0, noise, has, np.zeros(len(time)),
-                   max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0))
+                   max(output_step ** 2 / 12.0 - scale ** 2 / every * float(
+                       np.sum(np.var(rounding, axis=-1))), 0.0),
+                   rounding * math.sqrt(every), scale / math.sqrt(every))
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate
@@ -439,22 +460,22 @@ def _fit_output(output: Array, rate: Array, valid: Mask) -> Array:
     return scale * rate + bias
 
 
-def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> Array:
+def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tuple[Array, float]:
     """
-    Return the mean rounding error of the output, rad/s, shape (n,).
+    Return independent rounding errors of the output, in units of its noise, (m, n); the noise.
 
-    If the steps are not small compared with the noise, it depends on the rate, and would pass for
-    structure along the rate. It is the Fourier series of a sawtooth, smoothed by the noise before
-    the rounding (Widrow, Kollar and Liu 1996).
+    Where the steps are not small compared with the noise, the error depends on the rate, and would
+    pass for structure along the rate. They are the terms of the Fourier series of a sawtooth,
+    smoothed by the noise before the rounding (Widrow, Kollar and Liu 1996), of any phase: where
+    the output lies within its step is not known.
     """
     expected = _fit_output(output, rate, valid)
-    variance = max(float(np.var((output - expected)[valid])) - step ** 2 / 12.0, 0.0)
-    total = np.zeros(len(output))
-    for number in range(1, 8):
-        order = 2.0 * math.pi / step * number
-        total += ((-1.0) ** number * 2.0 / order * math.exp(-0.5 * order ** 2 * variance)
-                  * np.sin(order * expected))
-    return total
+    noise = max(white_noise_deviation((output - expected)[valid]), _LEAST_ROUNDED_NOISE * step)
+    order = 2.0 * math.pi / step * np.arange(1, _ROUNDING_TERMS + 1)[:, None]
+    size = 2.0 / order * np.exp(-0.5 * order ** 2 * max(noise ** 2 - step ** 2 / 12.0, 0.0))
+    size = size[size[:, 0] > 1e-2 * noise] / math.sqrt(2.0)
+    angle = order[:len(size)] * expected
+    return np.concatenate([size * np.cos(angle), size * np.sin(angle)]) / noise, noise
 
 
 def _reference_rates(log: Log, time: Array) -> tuple[Array, Array]:
