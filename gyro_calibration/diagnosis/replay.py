@@ -417,8 +417,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     filling = generator.standard_normal(place[-1] + 1)
     plain = Replay(channels, reference, kept, place, interval, every, filling,
                    heading_step if is_heading else 0.0, noise, has, np.zeros(len(time)),
-                   max(output_step ** 2 / 12.0 - scale ** 2 / every * float(
-                       np.sum(np.var(rounding, axis=-1))), 0.0),
+                   max(output_step ** 2 / 12.0 - scale ** 2 * float(
+                       np.sum(np.square(rounding))) / len(time), 0.0),
                    rounding * math.sqrt(every), scale / math.sqrt(every))
     if model is None:
         return plain
