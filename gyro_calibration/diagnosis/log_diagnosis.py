@@ -341,6 +341,8 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
     replay = fit.problem.replays[0]
+    if not follows and len(replay.rounding):  # it rests where the rate does
+        return None
     if follows:  # whitening would spread what is between dwells
         left, inside = fit.unbiased_residuals[0][replay.valid], within[replay.valid]
     else:
@@ -350,6 +352,8 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
     squares = np.add.reduceat(left ** 2, begin) / np.diff(np.append(begin, len(left)))
     steady, between = squares[inside[begin]], squares[~inside[begin]]
+    if len(replay.rounding):
+        steady = np.maximum(steady, replay.output_step ** 2 / 12.0)
     if (min(len(steady), len(between)) < MIN_STRETCHES
             or not follows and np.median(between) < 2.0 * np.median(steady)):
         return None

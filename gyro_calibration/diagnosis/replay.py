@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 from scipy.linalg import toeplitz
 from scipy.ndimage import binary_opening, maximum_filter1d
+from scipy.optimize import minimize
 from scipy.signal import oaconvolve
 from scipy.special import ndtri
 from scipy.stats import chi2
@@ -177,7 +178,7 @@ class Replay:
     available_channels: frozenset[str]  # names of the channels of the log
     # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
-    rounding_variance: float = 0.0  # variance of a sample by quantization of the output, (rad/s)²
+    output_step: float = 0.0  # quantization step of the output, rad/s; 0 if it does not matter
     # independent errors by quantization of the output, shape (m, n); commanded rate, shape (n,),
     # and independent responses to it, shape (k, lags), if the motion follows the command. Each is
     # of one standard deviation of its prior, in units of the noise; what they explain is taken out
@@ -330,6 +331,13 @@ class Replay:
                 else total)
 
     @property
+    def rounding_variance(self) -> float:
+        """Return the variance of a sample by quantization that is noise, (rad/s)²."""
+        errors = self.rounding_scale * self.rounding
+        return max(self.output_step ** 2 / 12.0 - float(np.sum(errors ** 2))
+                   / len(self.channels.time), 0.0)
+
+    @property
     def rounding_bias_variance(self) -> float:
         """Return the variance of the bias by quantization of the output, (rad/s)²."""
         if not len(self.rounding):
@@ -397,7 +405,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     noise = 0.0
     if is_heading:
         noise = heading_step / math.sqrt(12.0) or _largest_heading_noise(
-            (log.output - _fit_output(log.output, smooth, kept))[kept], place, interval)
+            (log.output - _fit_output(log.output[kept], smooth[kept], smooth))[kept], place,
+            interval)
         smooth = _without_noise(smooth, noise / interval)
     every = max(1, math.ceil((place[-1] + 1) / MAX_POINTS))
     if model is not None and log.temperature is None:  # simulated at the reference temperature
@@ -417,9 +426,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     filling = generator.standard_normal(place[-1] + 1)
     plain = Replay(channels, reference, kept, place, interval, every, filling,
                    heading_step if is_heading else 0.0, noise, has, np.zeros(len(time)),
-                   max(output_step ** 2 / 12.0 - scale ** 2 * float(
-                       np.sum(np.square(rounding))) / len(time), 0.0),
-                   rounding * math.sqrt(every), scale / math.sqrt(every))
+                   output_step, rounding * math.sqrt(every), scale / math.sqrt(every))
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate
@@ -453,11 +460,31 @@ def _even_time(time: Array) -> Array:
     return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
 
 
-def _fit_output(output: Array, rate: Array, valid: Mask) -> Array:
-    """Return the output by the line along the rate that fits best, rad/s, shape (n,)."""
-    scale, bias = (np.polyfit(rate[valid], output[valid], 1) if np.ptp(rate[valid]) > 0.0
-                   else (1.0, float(output[valid].mean())))
-    return scale * rate + bias
+def _fit_rounded_output(output: Array, rate: Array, step: float, expected_at: Array) -> Array:
+    """Return the output at other rates by the line along the rate whose codes are the nearest."""
+    codes, code, count = np.unique(output, return_inverse=True, return_counts=True)
+    offset = float(np.median(codes - step * np.rint(codes / step)))
+    low, high = float(rate.min()), float(rate.max())
+    limits = np.array([low, high])
+
+    def error(ends: Array) -> float:
+        expected = ends[0] + (rate - low) / max(high - low, np.finfo(float).tiny) * np.diff(ends)
+        return float(np.sum((output - offset - step * np.rint((expected - offset) / step)) ** 2))
+
+    # at steady rates, each code should count once
+    start = min(_fit_output(output, rate, limits),
+                _fit_output(codes, np.bincount(code, rate) / count, limits), key=error)
+    found = minimize(error, start, method='Nelder-Mead', options={
+        'initial_simplex': start + 0.5 * step * np.array([[0, 0], [1, 0], [0, 1]]),
+        'xatol': _LEAST_ROUNDED_NOISE * step, 'fatol': 0.0})
+    return _fit_output(found.x, limits, expected_at)
+
+
+def _fit_output(output: Array, rate: Array, expected_at: Array) -> Array:
+    """Return the output at other rates by the line along the rate that fits best, rad/s."""
+    scale, bias = (np.polyfit(rate, output, 1) if np.ptp(rate) > 0.0
+                   else (1.0, float(output.mean())))
+    return scale * expected_at + bias
 
 
 def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tuple[Array, float]:
@@ -469,7 +496,7 @@ def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tu
     smoothed by the noise before the rounding (Widrow, Kollar and Liu 1996), of any phase: where
     the output lies within its step is not known.
     """
-    expected = _fit_output(output, rate, valid)
+    expected = _fit_rounded_output(output[valid], rate[valid], step, rate)
     noise = max(white_noise_deviation((output - expected)[valid]), _LEAST_ROUNDED_NOISE * step)
     order = 2.0 * math.pi / step * np.arange(1, _ROUNDING_TERMS + 1)[:, None]
     size = 2.0 / order * np.exp(-0.5 * order ** 2 * max(noise ** 2 - step ** 2 / 12.0, 0.0))

@@ -273,3 +273,20 @@ def test_corners_of_a_motion_that_jitters_are_no_cause():
     log = Log(time=interval * np.arange(6000), reference_heading=heading,
               output=rate[::fine] + 1e-3 * generator.standard_normal(6000))
     assert not diagnose([log], generator).findings
+
+
+@pytest.mark.parametrize('seed', [0, 3, *seeds(8)[1:]])
+def test_a_coarse_output_at_few_rates_leaves_open_what_its_rounding_may_do(seed):
+    """Three rates and slow ramps between them, in steps of 20 times the noise."""
+    generator = np.random.default_rng(seed)
+    time, scale, bias = np.arange(10_000) / 50.0, 0.01, generator.normal(0.0, 0.01)
+    corners = np.cumsum(generator.uniform(0.5, 4.0, 160))
+    rate = np.interp(time, corners, np.repeat(generator.choice([-0.8, 0.0, 0.8], 80), 2))
+    output = (1.0 + scale) * rate + bias + 2e-3 * generator.standard_normal(len(time))
+    found = diagnose([Log(time=time, output=0.04 * np.round(output / 0.04),
+                          reference_rate=rate)], np.random.default_rng(1))
+    values = {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
+    # each was off by up to 2000 deviations, and the scale factor error by 1 %
+    for name, true, largest in (('bias', bias, 1e-3), ('scale_factor_error', scale, 1e-3)):
+        value, deviation = values[name]
+        assert abs(value - true) < 6.0 * deviation < 6.0 * largest, (name, value, deviation)
