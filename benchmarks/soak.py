@@ -44,7 +44,7 @@ import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
-from gyro_calibration.driver.emulator import emulate, Emulator
+from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -172,7 +172,11 @@ def gyro(given: argparse.Namespace) -> None:
     emulator = Emulator(find_protocol(given.protocol), samples_of(given, numbers), settings, speed,
                         given.folder / 'port', wait_for_reader=True)
     signal.signal(signal.SIGINT, lambda *_: emulator.stop())
-    emulate(emulator)
+    emulator.open()
+    try:
+        emulator.run()
+    finally:
+        emulator.close()
     numbers[LOST_BYTES] = emulator.lost_bytes
 
 

@@ -127,6 +127,7 @@ class ReferenceTreatment:
     # whether its errors are small enough to show a random walk of the bias, and events
     is_fine: bool
     errs_as_heading: bool  # whether it has errors of a heading, not of an integrated rate
+    wide_prior: tuple[float, float] = _WIDE_PRIOR  # of scale factor error and bias, rad/s
 
     @property
     def largest_delay(self) -> float:
@@ -484,21 +485,24 @@ class Spans:
 
 
 def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
-                  instants: OwnInstants | None = None) -> Spans:
+                  instants: OwnInstants | None = None, technology: str = 'mems') -> Spans:
     """
     Divide a log with a reference of some kind into spans.
 
     The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
-    gyro is known. The instants are those of the known values of a slow reference, by
+    gyro was measured; beside a course, that of its technology is used as well. The instants are those of the known values of a slow reference, by
     `keep_own_instants`.
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
         log, instants = keep_own_instants(log)
     assert log.time is not None and log.output is not None
-    if prior is not None:
-        scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
-        treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
+    measured_type = np.full(2, math.inf) if prior is None else prior
+    scale, bias = np.minimum(treatment.prior[:2], measured_type)
+    if not treatment.is_fine:
+        scale, bias = np.minimum((scale, bias), TECHNOLOGY_PRIORS[technology])
+    treatment = replace(treatment, prior=(float(scale), float(bias), treatment.prior[2]),
+                        wide_prior=(_WIDE_PRIOR[0], min(_WIDE_PRIOR[1], float(measured_type[1]))))
     time, measured = log.time - log.time[0], log.output
     output, white = bridge_gaps(measured), white_noise_deviation(measured)
     reference, at = _place_values(log, instants)
@@ -630,11 +634,12 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     if not (causes or spans.stands.all()):
         corrected = _drop_contradicted_rests(corrected, every, point_variances)
     usual = _fit_with_noise(corrected, every, point_variances)
-    if spans.treatment.is_fine or prior[:2] == _WIDE_PRIOR:
+    if spans.treatment.is_fine or prior[0] == _WIDE_PRIOR[0]:
         return usual
     # with the same rests, without which evidences cannot be compared
     wider = replace(spans, rests=corrected.rests, stands=corrected.stands,
-                    treatment=replace(spans.treatment, prior=(*_WIDE_PRIOR, prior[2])))
+                    treatment=replace(spans.treatment,
+                                      prior=(*spans.treatment.wide_prior, prior[2])))
     corrected, point_variances = _correct_rate(wider, every)
     wide = _fit_with_noise(corrected, every, point_variances)
     assert spans.log.reference_heading is not None
@@ -877,7 +882,7 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
         scatter = _jackknife(data, cluster, inside)[:count]
         freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
         variances = np.maximum(variances, scatter)
-    if effective[0] < MIN_STRETCHES and tuple(prior[:2]) != _WIDE_PRIOR:
+    if effective[0] < MIN_STRETCHES and prior[0] != _WIDE_PRIOR[0]:
         variances[0] = math.inf
     largest = NORMAL_QUANTILE_975 * prior / student.ppf(0.975, freedom[:len(prior)])
     variances[:len(prior)] = np.minimum(variances[:len(prior)], largest ** 2)
@@ -971,7 +976,7 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     DataRefused : the course is known for too short a time, or the gyro does not follow it
 
     """
-    spans = lay_out_spans(log, 'course', np.array(TECHNOLOGY_PRIORS[technology]))
+    spans = lay_out_spans(log, technology=technology)
     length = spans.treatment.min_span
     duration = len(spans.time) * length + spans.rest_durations[spans.stands].sum()
     if duration < _MIN_SPANS * length:

@@ -480,7 +480,7 @@ def check_gates(log: Log, model: GyroModel | None = None, is_command: bool = Fal
     if failed is None:
         return tuple(results)
     late = (_late_motion_gate(log, results[failed], is_command)
-            if log.reference_rate is not None else results[failed])
+            if log.time is not None and log.reference_rate is not None else results[failed])
     return (*results[:failed], late)
 
 
@@ -538,7 +538,13 @@ def _response_gain(time: Array, turned: Array, reference: Array, span: float
 
 
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
-    if log.time is None or log.reference_heading is None and log.reference_rate is None:
+    if log.time is None:
+        line = (None if log.reference_rate is None or log.output is None
+                else fit_line(None, log.reference_rate, log.output))
+        if line is not None:
+            yield from _unit_gates(line.factor, line.deviation, log)
+        return
+    if log.reference_heading is None and log.reference_rate is None:
         return
     if log.reference_rate is None:
         try:
@@ -613,7 +619,7 @@ def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: 
 
 def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
-    assert log.time is not None and log.output is not None
+    assert log.output is not None
     evidence = f'the output is {factor:.4g} times the reference'
     if not is_implausible_factor(factor):
         yield Gate('sense', True, f'{evidence}: the same sense')
@@ -622,7 +628,8 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     half = NORMAL_QUANTILE_975 * deviation
     known = (factor, (factor - half, factor + half))
     name = identify_unit_factor(factor, deviation)
-    power, interval = round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
+    power = round(math.log10(abs(factor)))
+    interval = 0.0 if log.time is None else float(np.median(np.diff(log.time)))
     slower = 10.0 ** power
     correct_gyro = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
                     '--sensitivity)')

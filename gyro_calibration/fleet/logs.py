@@ -41,9 +41,8 @@ from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns, fit_noise_grid, heading_noise)
 from gyro_calibration.calibration.selection import SelectedEffects
-from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.gates import (
-    is_at_rest, is_implausible_factor, refuse_mismatch, refuse_unusable)
+    is_at_rest, refuse_mismatch, refuse_unusable)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
@@ -472,9 +471,6 @@ def _calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
                     * math.sqrt(float(np.median(np.diff(log.time)))))
             return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
                                      noise=Noise(angle_random_walk=walk)), None
-    if log.time is None and is_implausible_factor((found := inspect_record(log)).unit_factor):
-        raise DataRefused(f'{found.findings[0].evidence}: correct the unit or the sign of the '
-                          'column of the gyro')
     fitted = calibrate({'': log}, technology=technology)
     if isinstance(fitted, SelectedEffects):
         return 'dwells', fitted.model, None

@@ -204,3 +204,16 @@ def test_a_robot_that_follows_steps_late_shows_its_unit(factor, name):
     output = factor * (followed(command, 0.5) + 1e-3 * generator.standard_normal(len(TIME)))
     gate = check_gates(Log(output=output, time=TIME, reference_rate=command), is_command=True)[-1]
     assert gate.name == name and gate.passed is False, gate
+
+
+@pytest.mark.parametrize('factor, refused', [
+    (-1.0, 'opposite senses'), (DEGREE, 'different units'), (1.0, None)])
+def test_the_unit_and_sense_of_a_rate_table_are_checked(factor, refused):
+    rate = np.repeat(np.arange(-100.0, 101.0, 20.0) * DEGREE, 3)
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
+    table = Log(output=factor * (rate + noise), reference_rate=rate)
+    if refused is None:
+        fit(table)
+    else:
+        with pytest.raises(DataRefused, match=refused):
+            fit(table)
