@@ -538,6 +538,9 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     if treatment.is_fine:
         rests, stands = rests[~stands], stands[~stands]
     known = np.flatnonzero(np.isfinite(reference) & ~mark_rows(rests[stands], len(time)))
+    if len(known) < 2:
+        raise DataRefused(f'the reference has {len(known)} values outside of rests in which it '
+                          'stands, 2 are needed: give a reference of this motion')
     stamps = at[known]
     length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
                  2.0 * float(np.median(np.diff(time))))

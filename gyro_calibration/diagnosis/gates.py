@@ -443,8 +443,8 @@ _MIN_UNIT_COHERENCE, _MIN_MOTION_COHERENCE = 0.8, 0.4
 #: another motion is detected.
 _MIN_HEADING_DIFFERENCE, _MIN_TURNED_ANGLE = 10.0 * DEGREE, 30.0 * DEGREE
 #: Largest trial lag and distance of trial lags, in spans; ratio of the lags at which a motion
-#: follows its reference.
-_MAX_LAG_SPANS, _LAG_STEP, _LAG_RATIO = 25, 0.25, 1.5
+#: follows its reference; and standard deviations of a gain below 0 from which on it is inverted.
+_MAX_LAG_SPANS, _LAG_STEP, _LAG_RATIO, _SENSE_SIGMAS = 25, 0.25, 1.5, 5.0
 #: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
 _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 
@@ -502,6 +502,8 @@ def _late_motion_gate(log: Log, failed: Gate, is_command: bool) -> Gate:
     gain, deviation, coherence = _response_gain(
         log.time, integrate(log.time, bridge_gaps(log.output)), reference,
         best.lag_step / _LAG_STEP)
+    if gain < -_SENSE_SIGMAS * deviation and not is_implausible_factor(-gain):
+        return next(each for each in _unit_gates(gain, deviation, log) if each.passed is False)
     is_ratio = (failed.name != 'motion' and deviation < _MAX_DEVIATION * abs(gain)
                 and _factor_ratio(gain, 1.0 / best.factor) < UNIT_TOLERANCE)
     if coherence < _MIN_MOTION_COHERENCE or is_ratio:

@@ -21,6 +21,7 @@ from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, log_from_table, unwrap_heading
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 TIME = np.arange(0.0, 120.0, 0.01)
 MOTION = 0.6 * np.sin(0.7 * TIME) + 0.3 * np.sin(1.9 * TIME + 1.0) + 0.1 * np.sin(0.11 * TIME)
@@ -204,6 +205,15 @@ def test_a_robot_that_follows_steps_late_shows_its_unit(factor, name):
     output = factor * (followed(command, 0.5) + 1e-3 * generator.standard_normal(len(TIME)))
     gate = check_gates(Log(output=output, time=TIME, reference_rate=command), is_command=True)[-1]
     assert gate.name == name and gate.passed is False, gate
+
+
+def test_a_robot_that_follows_quick_commands_late_shows_that_its_gyro_is_inverted():
+    """No single lag shows it, and another motion was left to the fit of a response."""
+    generator = np.random.default_rng(3)
+    command = lfilter([0.05], [1.0, -0.95], generator.standard_normal(len(TIME)))
+    output = -lfilter([0.03], [1.0, -0.97], command) + 1e-3 * generator.standard_normal(len(TIME))
+    gate = check_gates(Log(output=output, time=TIME, reference_rate=command), is_command=True)[-1]
+    assert gate.name == 'sense' and gate.passed is False, gate
 
 
 @pytest.mark.parametrize('factor, refused', [
