@@ -490,8 +490,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     Divide a log with a reference of some kind into spans.
 
     The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
-    gyro was measured; beside a course, that of its technology is used as well. The instants are those of the known values of a slow reference, by
-    `keep_own_instants`.
+    gyro was measured; beside a course, that of its technology is used as well. The instants are
+    those of the known values of a slow reference, by `keep_own_instants`.
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
