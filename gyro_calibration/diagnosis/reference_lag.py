@@ -171,15 +171,12 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
         response = fitted.values @ kernels
         change = next(late.delayed_commands(response[None])) + between
         # effects along this motion would otherwise pass for a longer response
-        moved = replace(late.with_rate(late.channels.rate + change),
-                        responses=fitted.independent @ kernels,
-                        reference=late.reference + change,
+        moved = replace(late.with_motion(change), responses=fitted.independent @ kernels,
                         response_noise=moved.response_noise)
         fit = fit_causes(build_problem([moved]), [])
         more = _changes_between_samples(moved, response, fit.unbiased_residuals[0] + between)
         if more.any():
-            moved = replace(moved.with_rate(moved.channels.rate + more - between),
-                            reference=moved.reference + more - between)
+            moved = moved.with_motion(more - between)
             between, fit = more, fit_causes(build_problem([moved]), [])
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
         others = [column for name in _MOTION_EFFECTS

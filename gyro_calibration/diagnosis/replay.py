@@ -140,8 +140,9 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
-#: Number of terms of the rounding error of an output, and least noise in steps.
-_ROUNDING_TERMS, _LEAST_ROUNDED_NOISE = 32, 1e-3
+#: Number of terms of the rounding error of an output, their least size as a share of the noise,
+#: and least noise in steps.
+_ROUNDING_TERMS, _LEAST_ROUNDING, _LEAST_ROUNDED_NOISE = 32, 1e-2, 1e-3
 #: Samples in a block of `_without_noise`. The shorter, the less noise is left in a rest next to a
 #: motion; the longer, the slower are the rates that are known.
 _BLOCK_SAMPLES = 16
@@ -286,8 +287,7 @@ class Replay:
 
     def with_command(self, command: Array) -> Replay:
         """Return the log with another command, rad/s, shape (n,), as its reference."""
-        return replace(self.with_rate(command), command=command,
-                       reference=self.reference + command - self.channels.rate)
+        return replace(self.with_motion(command - self.channels.rate), command=command)
 
     def response_variance(self) -> Array:
         """Return the variance of coefficients that weights the response, shape (points - 1,)."""
@@ -345,6 +345,11 @@ class Replay:
         _, _, scaled, ratios = self._response_basis
         means = scaled[:, len(self.responses):] @ self.rounding[:, self.valid].mean(axis=1)
         return self.rounding_scale ** 2 * float(means ** 2 @ (ratios / (1.0 + ratios)))
+
+    def with_motion(self, added: Array) -> Replay:
+        """Return the log with more motion, rad/s, shape (n,), in the reference and for effects."""
+        return replace(self.with_rate(self.channels.rate + added),
+                       reference=self.reference + added)
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
@@ -500,7 +505,7 @@ def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tu
     noise = max(white_noise_deviation((output - expected)[valid]), _LEAST_ROUNDED_NOISE * step)
     order = 2.0 * math.pi / step * np.arange(1, _ROUNDING_TERMS + 1)[:, None]
     size = 2.0 / order * np.exp(-0.5 * order ** 2 * max(noise ** 2 - step ** 2 / 12.0, 0.0))
-    size = size[size[:, 0] > 1e-2 * noise] / math.sqrt(2.0)
+    size = size[size[:, 0] > _LEAST_ROUNDING * noise] / math.sqrt(2.0)
     angle = order[:len(size)] * expected
     return np.concatenate([size * np.cos(angle), size * np.sin(angle)]) / noise, noise
 
