@@ -46,7 +46,8 @@ from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROU
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, is_course, rate_noise_share)
-from gyro_calibration.calibration.run_faults import fit_profile, refuse_unit_error, split_run
+from gyro_calibration.calibration.run_faults import (
+    fit_profile, refuse_unit_error, RunPieces, split_run)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects)
 from gyro_calibration.calibration.self_calibration import (
@@ -79,6 +80,9 @@ _SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
+#: Largest difference of the scales of a reference rate and heading that is not reported, 0.4 deg
+#: in a revolution, as by integration over samples.
+_SAME_SCALE = 1e-3
 #: Share of the largest differences that show their tail.
 _TAIL_SHARE = 0.005
 #: Largest difference from a reference that is computed from the output, relative to its noise:
@@ -309,7 +313,8 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
 
     Of a heading and a rate it is the heading, unless this is known for less than half as long: a
     rate may be filtered, or a command, where a heading is what was turned. If a rate is preferred,
-    it is that where both turn alike.
+    it is that where both turn alike. Where they contradict each other, it is the one that explains
+    more than half of what the gyro turned, if the other does not.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -317,10 +322,7 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         return replace(log, reference_rate=rate, reference_heading=heading), []
     counts = [int(np.count_nonzero(~find_lost_reference(np.isfinite(each))))
               for each in (rate, heading)]
-    by_rate, remarks = 2 * counts[1] < counts[0], []
-    if by_rate:
-        remarks.append(f'The reference heading is known in {counts[1]} samples only; the rate, '
-                       f'known in {counts[0]}, is used.')
+    by_rate, contradiction = 2 * counts[1] < counts[0], ''
     known = np.isfinite(rate) & np.isfinite(heading)
     if np.count_nonzero(known) >= 100:
         time = log.time[known] - log.time[known][0]
@@ -330,19 +332,34 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         by_rate |= prefer_rate and bool(alike)
         unexplained, scale, _ = fit_profile(pieces, motion, MAX_ENCODER_OFFSET)
         late, _, delay = fit_profile(pieces, motion, COURSE_TREATMENT.largest_delay)
-        contradiction = ''
         # a longer delay that explains less than half is chance, as in a motion that repeats
         if not alike and late < 0.5 * unexplained:
             contradiction = f'is {abs(delay):.1f} s {"behind" if delay > 0.0 else "ahead of"}'
         # what noise or another delay may do to the scale is less than the root of what they leave
-        elif abs(scale - 1.0) >= max(largest, math.sqrt(max(unexplained, 0.0))):
+        elif abs(scale - 1.0) >= max(_SAME_SCALE, math.sqrt(max(unexplained, 0.0))):
             contradiction = f'turns {scale:.3f} times as far as'
-        if contradiction:
-            remarks.append(f'The reference rate {contradiction} the reference heading; the '
-                           f'{"rate" if by_rate else "heading"} is used: check both, and leave '
-                           'the wrong one out.')
+        if contradiction and log.output is not None:
+            rows = np.isfinite(log.output[known])
+            gyro = split_run(time[rows], log.output[known][rows])
+            by_rate_alone, by_heading_alone = (
+                _explains(gyro, each) for each in (motion_from_rates(time, rate[known]), motion))
+            if by_rate_alone != by_heading_alone:
+                by_rate = by_rate_alone
+    remarks = [f'The reference heading is known in {counts[1]} samples only; the rate, known in '
+               f'{counts[0]}, is used.'] if by_rate and 2 * counts[1] < counts[0] else []
+    if contradiction:
+        remarks.append(f'The reference rate {contradiction} the reference heading; the '
+                       f'{"rate" if by_rate else "heading"} is used: check both, and leave '
+                       'the wrong one out.')
     return (replace(log, reference_heading=None) if by_rate
             else replace(log, reference_rate=None)), remarks
+
+
+def _explains(gyro: RunPieces, motion: Motion) -> bool:
+    """Tell whether a motion explains more than half of what the gyro turned."""
+    _, _, delay = fit_profile(gyro, motion, COURSE_TREATMENT.largest_delay)
+    left = gyro.gyro_angle - gyro.reference_angle(motion, delay)
+    return bool(np.var(left) < 0.5 * np.var(gyro.gyro_angle))
 
 
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:

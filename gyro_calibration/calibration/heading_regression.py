@@ -57,7 +57,7 @@ from gyro_calibration.heading.integration import integrate, integrate_with_curva
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_holes, mark_rows, MISALIGNMENT_DEVIATION,
-    quantization_step, robust_deviation, white_noise_deviation)
+    quantization_step, robust_deviation, rounding_errors, white_noise_deviation)
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
@@ -127,6 +127,7 @@ class ReferenceTreatment:
     # whether its errors are small enough to show a random walk of the bias, and events
     is_fine: bool
     errs_as_heading: bool  # whether it has errors of a heading, not of an integrated rate
+    is_followed: bool = False  # whether the motion may follow it, late and with another size
     wide_prior: tuple[float, float] = _WIDE_PRIOR  # of scale factor error and bias, rad/s
 
     @property
@@ -141,7 +142,7 @@ COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0
 HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
                                        True)
 _TREATMENTS = {
-    'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
+    'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False, is_followed=True),
     # on the host of the gyro: small delays, as a swing agrees again a period later
     'encoder': replace(HEADING_TREATMENT,
                        prior=(*HEADING_TREATMENT.prior[:2], MAX_ENCODER_OFFSET / _DELAY_SIGMAS)),
@@ -194,6 +195,7 @@ class Spans:
     # begin and end of each hole in the output that is as long as a span, s, shape (k, 2); over a
     # span that meets one, nothing is compared, and its observation is 0
     holes: Array
+    output_step: float  # quantization step of the output, rad/s; 0 without one
     adds_up: bool  # whether the reference is never lost, as odometry, which adds up its errors
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
@@ -297,6 +299,24 @@ class Spans:
         """Return the length of each rest, s, shape (r,)."""
         assert self.log.time is not None
         return np.diff(self.log.time[self.rests])[:, 0]
+
+    @cached_property
+    def rest_rounding(self) -> float:
+        """
+        Return the standard deviation of the mean output of all rests by its steps, rad/s.
+
+        Where the noise is small compared with a step, they have one code and one error.
+        """
+        rows = mark_rows(self.rests, len(self.log))
+        if not (self.output_step and rows.any()):
+            return 0.0
+        output = np.asarray(self.log.output)
+        variance = np.average([np.var(output[first:last + 1]) for first, last in self.rests],
+                              weights=np.diff(self.rests)[:, 0]) / self.output_step ** 2
+        if variance > 0.25:  # as with a noise of half a step, which averages it out
+            return 0.0
+        return self.output_step * math.sqrt(rounding_errors(
+            np.array([variance]), np.array([float(rows.sum())]))[0])
 
     def gyro_stamps(self, time: Array) -> Array:
         """Return the stamps of the gyro at times of the reference, s."""
@@ -466,14 +486,23 @@ class Spans:
         around = np.searchsorted(self.time - begin, rest_times.mean(axis=(1, 2))) - 1
         np.subtract.at(waves, np.clip(around, 0, len(waves) - 1), rows)
         waves = np.concatenate([waves, rows])
-        if self.treatment.is_fine:
-            return waves, parts
-        # a smoothed course errs in proportion to the acceleration, by less than this, s²
-        smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0),
-                                (_SMOOTHING_DEVIATION, _SMOOTHING_DEVIATION))
-        return (np.column_stack([waves, self.acceleration_changes()]),
-                [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
-                 smoothing])
+        # column and size of what is shared by spans or rests
+        single = []
+        if self.rest_rounding:
+            single.append(('rounding', np.append(np.zeros(len(self.time) - 1),
+                                                 self.rest_durations), self.rest_rounding))
+        # a smoothed course errs in proportion to the acceleration, by less than this, s²; the
+        # variance of the times by which a motion is late is seldom above their mean squared
+        smoothing = (0.5 * self.delay ** 2 * self.treatment.is_followed if self.treatment.is_fine
+                     else _SMOOTHING_DEVIATION)
+        if smoothing:
+            single.append(('smoothing', self.acceleration_changes(), smoothing))
+        for name, column, size in single:
+            waves = np.column_stack([waves, column])
+            parts = [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
+                     SharedNoise(name, np.append(np.zeros(waves.shape[1] - 1), 1.0),
+                                 (size, size))]
+        return waves, parts
 
     def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
@@ -558,7 +587,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
-                 find_holes(time[measured_rows], length),
+                 find_holes(time[measured_rows], length), quantization_step(measured),
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
 
 
@@ -1047,7 +1076,8 @@ def find_drift(log: Log) -> tuple[float, float] | None:
         at_rest, means, np.array([len(half) for half in halves], dtype=float))
     freedom = (one + other) ** 2 / (one ** 2 / freedom_of_one + other ** 2 / freedom_of_other
                                     + 1e-300)
-    drift, deviation = of_rests[0] - of_motion[0], math.sqrt(one + other)
+    drift = of_rests[0] - of_motion[0]
+    deviation = math.hypot(math.sqrt(one + other), spans.rest_rounding)
     if abs(drift) <= student.ppf(0.995, freedom) * deviation:
         return None
     # the bias on each way from rest to rest, and that of the rests around it

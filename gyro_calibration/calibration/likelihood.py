@@ -519,10 +519,12 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
     """
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
-    All samples of a constant reading count as one. At the first and the last the gyro rests if
+    Of a value that was held, as it changes by several steps at once, it is the first sample. All
+    samples of a constant reading count as one. At the first and the last the gyro rests if
     they last much longer than the readings next to them; then their samples share one error.
     """
-    run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
+    change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
+    run = np.cumsum(change > 0.5 * step)
     begins = np.flatnonzero(np.diff(run, prepend=-1))
     ends = np.append(begins[1:], len(run)) - 1
     durations = motion.time[ends] - motion.time[begins]
@@ -533,8 +535,8 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
         rest_columns[0, 0], rest_columns[-1, 1] = (
             durations[end] > max(block, 2.0 * durations[next_to])
             for end, next_to in ((0, 1), (-1, -2)))
-    variance = np.where(rest_columns.any(axis=1), 1.0, np.bincount(run))
-    kept = is_used[run]
+    variance = np.where(rest_columns.any(axis=1) | ~is_used, 1.0, np.bincount(run))
+    kept = is_used[run] | (change > 1.5 * step)
     return _ReferencePoints(motion.time[kept], motion.heading[kept], variance[run[kept]],
                             rest_columns[run[kept]])
 

@@ -31,6 +31,8 @@ from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
+#: Delays of the gyro behind a reference that are tried, s.
+_TRIAL_DELAYS = tuple(0.1 * each for each in range(-15, 16))
 #: Largest error of an exact reference heading as a share of the difference of the headings over a
 #: second: a fifth of its variance.
 _MAX_HEADING_ERROR_SHARE = 0.25
@@ -128,32 +130,42 @@ def heading_difference(log: Log) -> HeadingDifference:
     Separate the difference of the headings of gyro and reference by its growth over time.
 
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    a lag, a scale factor and a misalignment of the axis are fitted. An error that was smoothed
-    shows at lags beyond its time constant.
+    a lag, a scale factor and a misalignment of the axis are fitted, the delay to second order from
+    the best of some. An error that was smoothed shows at lags beyond its time constant.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
-    output = bridge_gaps(log.output)
+    stamps, output = log.time, bridge_gaps(log.output)
     own = np.isfinite(log.reference_heading)
     if own.sum() < 2 * _BLOCK_SAMPLES:
         return HeadingDifference(0.0, 0.0)
-    turned, slope, output, heading, time = (each[own] for each in (
-        integrate_with_curvature(log.time, output), np.gradient(output, log.time), output,
-        log.reference_heading, log.time))
-    crossing = cross_rotation(log)[own].T
+    signals = [integrate_with_curvature(stamps, output), output, np.gradient(output, stamps)]
+    heading, time, *crossing = (each[own] for each in (
+        log.reference_heading, stamps, *cross_rotation(log).T))
     # a slow reference has its values at the samples next to its own instants
     apart = np.diff(time)
     interval = float(apart[apart < 2.0 * np.median(apart)].mean())
     longest = max(round(_COMPARISON_SPAN / interval), 4)
-    variance = {}
-    for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
+
+    def find_variance(lag: int, delay: float) -> float:
+        """Return the variance of second differences, rad²; nan where too few are known."""
+        at = time + delay
+        delayed = [np.interp(at, stamps, each) for each in signals]
         off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
-                         for each in (heading - turned, turned, output, slope, *crossing))
-        known = np.abs(time[2 * lag:] - time[:-2 * lag] - 2.0 * lag * interval) < interval
-        if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
-            columns = np.column_stack(motions)[known]
-            left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
-            variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
-                                       / float(stats.norm.isf(0.05))) ** 2
+                         for each in (heading - delayed[0], *delayed, *crossing))
+        known = ((np.abs(time[2 * lag:] - time[:-2 * lag] - 2.0 * lag * interval) < interval)
+                 & (at[:-2 * lag] >= stamps[0]) & (at[2 * lag:] <= stamps[-1]))
+        if np.count_nonzero(known) <= 2 * _BLOCK_SAMPLES:
+            return math.nan
+        columns = np.column_stack(motions)[known]
+        left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
+        return float(np.quantile(np.abs(left), 0.9)) ** 2 / float(stats.norm.isf(0.05)) ** 2
+
+    at_delays = {delay: find_variance(longest, delay) for delay in _TRIAL_DELAYS}
+    # a delay that explains less than half is chance
+    delay = min((0.0, *at_delays), key=lambda each: at_delays[each] * (2.0 if each else 1.0))
+    variance = {lag / longest: find_variance(lag, delay) for lag in (
+        *(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest)}
+    variance = {part: each for part, each in variance.items() if not math.isnan(each)}
     whole = variance.pop(1.0, 0.0)
     error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
                         for part, each in variance.items())])

@@ -227,8 +227,10 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
     local = mean + (change - np.roll(change, 1)) / (1.0 + before + after)
     code = np.unique(np.rint(local), return_inverse=True)[1]
-    # a ramp may begin within a block: those next to one are no evidence of the noise
-    weight = count * np.where(quiet & before & after, 1.0, 1e-6)
+    # a ramp may begin within a block: those next to one are no evidence of the noise, nor those in
+    # which the rate changes by a tenth of a step
+    slow = np.abs(np.roll(mean, -2) - np.roll(mean, 2)) < 4.0 * 0.1
+    weight = count * np.where(quiet & before & after & slow, 1.0, 1e-6)
     total: Array = np.bincount(code, weight).astype(float)
     squares = rounding_errors(np.bincount(code, weight * np.minimum(variance, 1.0)) / total, total)
     error = step * np.sqrt(np.where(quiet, squares[code], 0.0))

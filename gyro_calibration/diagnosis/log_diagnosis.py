@@ -24,8 +24,8 @@ from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInst
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, common_channels, constant_channels, is_named, observed_range, PART_OF_LOG, RESPONSE,
-    unnamed_variable)
+    Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
+    PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
     add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected, next_experiment,
     REFERENCES, SINGLE_EVENT_REMEDY, untestable_causes)
@@ -53,7 +53,7 @@ from gyro_calibration.diagnosis.residuals import (
     NOISE_NAMES, residual_curves)
 from gyro_calibration.diagnosis.search import (
     complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
-    Scored, Search, search_causes, Selection, start_search)
+    refine_shape, Scored, Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
@@ -282,6 +282,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
     follows = follows_rate(replays) and (is_command or is_late(plain))
     settled = None
     if not follows:
+        replays = _drop_unknown_ends(plain, rate)
         found = _search_replays(replays, rate, on_progress)
         replays = found.search.problem.replays
         responds = RESPONSE in {each.cause for each in found.causes}
@@ -306,6 +307,21 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
         found = replace(found, unexplained=[Unexplained(
             'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
     return replace(found, remarks=[_SETTLED_REMARK] if settled else [])
+
+
+def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
+    """Return the logs of a fit without samples of which a delay or lag hides the motion."""
+    late, likelihood = max((refine_shape(plain, effect_candidate(name, sign * 0.1))
+                            for name, sign in (('time_offset', 1.0), ('time_offset', -1.0),
+                                               ('bandwidth', 1.0))), key=lambda each: each[1])
+    replays, size = plain.problem.replays, late.shapes[0]
+    if p_value(late.cause, likelihood - plain.log_likelihood) > rate:
+        return replays
+    # a lag that begins with the log has decayed to less than 1 % after five time constants
+    first, last = max(size, 0.0) * (5.0 if late.cause == 'bandwidth' else 1.0), max(-size, 0.0)
+    times = [each.channels.time for each in replays]
+    return [drop_samples(each, (time < time[0] + first) | (time > time[-1] - last))
+            for each, time in zip(replays, times)]
 
 
 def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgress,

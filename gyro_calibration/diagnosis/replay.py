@@ -25,6 +25,8 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 import math
 
+from gyro_calibration.calibration.heading_regression import COURSE_TREATMENT
+from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.diagnosis.gates import (
     heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
     spline_rate)
@@ -35,6 +37,7 @@ from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
@@ -410,8 +413,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     noise = 0.0
     if is_heading:
         noise = heading_step / math.sqrt(12.0) or _largest_heading_noise(
-            (log.output - _fit_output(log.output[kept], smooth[kept], smooth))[kept], place,
-            interval)
+            _residual_without_delay(time, log.output, smooth)[kept], place, interval)
         smooth = _without_noise(smooth, noise / interval)
     every = max(1, math.ceil((place[-1] + 1) / MAX_POINTS))
     if model is not None and log.temperature is None:  # simulated at the reference temperature
@@ -577,6 +579,21 @@ def _heading_rates(time: Array, heading: Array) -> tuple[Array, Array]:
     return np.where(near, np.nan, rate), rate
 
 
+def _residual_without_delay(time: Array, output: Array, rate: Array) -> Array:
+    """Return what the rate at the best delay leaves of the output, rad/s."""
+    known = np.isfinite(output)
+    _, _, delay = fit_profile(split_run(time[known], output[known]),
+                              motion_from_rates(time, rate), COURSE_TREATMENT.largest_delay)
+    left = output
+    for _ in range(3):  # the slope, in which noise has no part, shows what the delay lacks
+        late = np.interp(time - delay, time, rate)
+        columns = np.column_stack([np.ones(len(time)), late, np.gradient(late, time)])
+        values = np.linalg.lstsq(columns[known], output[known], rcond=None)[0]
+        delay -= float(values[2] / values[1]) if values[1] else 0.0
+        left = output - columns @ values
+    return left
+
+
 def _largest_heading_noise(residual: Array, grid_index: NDArray[np.intp],
                            interval: float) -> float:
     """
@@ -602,22 +619,24 @@ def _without_noise(rate: Array, noise: float) -> Array:
     """
     Return the rate of a heading without white noise, where the motion does not exceed it.
 
-    The noise is that of the heading over the interval, rad/s. In the cosine transform of blocks,
-    coefficients that it reaches are 0 (Donoho and Johnstone 1994), in a mean over the places of
-    the blocks. Fast motion remains, and in rests no noise is left, which would pass for a motion
-    that the gyro does not show.
+    The noise is that of the heading over the interval, rad/s. In blocks, the coefficients of
+    orthogonal polynomials that it reaches are 0 (Donoho and Johnstone 1994), in a mean over the
+    places of the blocks. Fast motion remains, and in rests no noise is left, which would pass for
+    a motion that the gyro does not show.
     """
     size, count = _BLOCK_SAMPLES, len(rate)
     gain = spline_derivative_gain(np.arange(8 * size) * math.pi / (8 * size - 1))
-    basis = dct(np.eye(size), norm='ortho', axis=0)
+    # a smooth motion has few of these coefficients, and many of cosines
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, size),
+                                                          size - 1))[0].T
     variance = np.diag(basis @ toeplitz(idct(gain, type=1)[:size]) @ basis.T)
     largest = noise * np.sqrt(2.0 * math.log(count) * variance)
     total = np.zeros(count)
     for shift in range(0, size, size // 4):
         padded = np.pad(rate, (shift, -(count + shift) % size), mode='edge')
-        blocks = dct(padded.reshape(-1, size), norm='ortho', axis=1)
+        blocks = padded.reshape(-1, size) @ basis.T
         blocks[np.abs(blocks) < largest] = 0.0
-        total += idct(blocks, norm='ortho', axis=1).ravel()[shift:shift + count]
+        total += (blocks @ basis).ravel()[shift:shift + count]
     return total / 4.0
 
 

@@ -168,13 +168,26 @@ def test_a_reference_that_is_computed_from_the_gyro_is_refused(heading):
 
 
 @pytest.mark.parametrize('factor, late, said', [(1.05, 0.0, '1.05'), (0.95, 0.1, '0.95'),
-                                                (1.0, 0.1, ''), (1.005, 0.0, '')])
+                                                (1.005, 0.0, '1.005'), (1.0, 0.1, ''),
+                                                (1.0003, 0.0, '')])
 def test_references_that_contradict_each_other_are_remarked(factor, late, said):
     rate = factor * SWING.rate_at(NOISY.time - late)
     noise = 0.1 * DEGREE * np.random.default_rng(65).standard_normal(len(rate))
     remark = calibrate({'': replace(NOISY, reference_rate=rate + noise)}, method='likelihood'
                        ).remarks[0]
     assert remark.startswith(f'The reference rate turns {said}') == bool(said), remark
+
+
+@pytest.mark.parametrize('factor, noise', [(1.0 / DEGREE, 0.0), (0.0, 0.1 * DEGREE)],
+                         ids=['deg/s', 'noise alone'])
+def test_of_references_that_contradict_each_other_the_gyro_shows_the_right_one(factor, noise):
+    rate = factor * SWING.rate_at(NOISY.time)
+    rate += noise * np.random.default_rng(66).standard_normal(len(rate))
+    heading = NOISY.reference_heading.copy()
+    heading[np.arange(len(heading)) % 10 > 0] = np.nan  # known in less than half of the samples
+    found = calibrate_encoder(replace(NOISY, reference_rate=rate, reference_heading=heading))
+    assert 'the heading is used' in found.remarks[0]
+    assert found.fit.scale_factor_error == pytest.approx(S, abs=5e-4)
 
 
 @pytest.mark.parametrize('size', [0.5, 100.0, 1e6])
@@ -244,6 +257,32 @@ def test_steps_that_are_the_same_in_each_period_are_no_error_of_a_shaft(hertz):
     error, stated = run_motion((hertz, 'encoder', 0.0, 50))[:, 0]
     assert abs(error) < 1e-3
     assert abs(error) < 2.0 * stated
+
+
+@pytest.mark.parametrize('bias', [0.3, -0.35, 0.9])
+def test_the_code_at_which_a_coarse_output_rests_is_not_its_bias(bias):
+    generator, time = np.random.default_rng(67), np.arange(6000) / 50.0
+    moves = (time // 20.0) % 2.0 == 1.0
+    rate = 15.0 * DEGREE * np.sin(0.2 * np.pi * time) * moves
+    heading = 75.0 * DEGREE / np.pi * (1.0 - np.cos(0.2 * np.pi * time)) * moves
+    output = rate + (bias + 0.02 * generator.standard_normal(len(time))) * DEGREE
+    step = 2.0 * DEGREE
+    found = calibrate_encoder(Log(time=time, output=np.round(output / step) * step,
+                                  reference_heading=heading)).fit
+    deviation = math.sqrt(found.covariance[1, 1])
+    assert abs(found.bias - bias * DEGREE) < 3.0 * deviation
+    assert deviation < step / math.sqrt(12.0)
+
+
+def test_a_held_heading_with_fine_steps_is_no_encoder_that_moves_step_by_step():
+    generator, time = np.random.default_rng(68), np.arange(20000) / 100.0
+    rate = 30.0 * DEGREE * np.sin(0.2 * np.pi * time) * ((time // 10.0) % 3.0 == 1.0)
+    noise = 0.02 * DEGREE * generator.standard_normal((2, len(time)))
+    heading = (np.cumsum(rate) / 100.0 + noise[0])[np.arange(len(time)) // 10 * 10]
+    step = 0.001 * DEGREE
+    found = calibrate_encoder(Log(time=time, output=(1.0 + S) * rate + B + noise[1],
+                                  reference_heading=np.round(heading / step) * step)).fit
+    assert (found.scale_factor_error, found.bias) == pytest.approx((S, B), abs=5e-4)
 
 
 def test_less_than_a_revolution_is_stated():

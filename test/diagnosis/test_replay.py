@@ -290,3 +290,16 @@ def test_a_coarse_output_at_few_rates_leaves_open_what_its_rounding_may_do(seed)
     for name, true, largest in (('bias', bias, 1e-3), ('scale_factor_error', scale, 1e-3)):
         value, deviation = values[name]
         assert abs(value - true) < 6.0 * deviation < 6.0 * largest, (name, value, deviation)
+
+
+@pytest.mark.parametrize('late', [-0.1, 0.5])
+def test_a_heading_of_another_clock_is_late_and_nothing_else(late):
+    """At the ends, the motion of the gyro is not known; and no smoothing passes for a lag."""
+    generator, time = np.random.default_rng(1), np.arange(6000) / 50.0
+    paces, phases = generator.uniform(0.06, 1.9, 6), generator.uniform(0.0, 6.3, 6)
+    rate = 20.0 * DEGREE * np.sin(np.outer(time, paces) + phases).sum(axis=1)
+    heading = -20.0 * DEGREE * (np.cos(np.outer(time - late, paces) + phases) / paces).sum(axis=1)
+    output = 1.005 * rate + (0.2 + 0.1 * generator.standard_normal(len(time))) * DEGREE
+    found = diagnose([Log(time=time, output=output, reference_heading=heading)], generator)
+    assert [each.effect for each in found.findings] == ['time_offset']
+    assert found.findings[0].parameters['time_offset'].estimate == pytest.approx(-late, abs=1e-3)
