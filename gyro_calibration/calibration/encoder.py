@@ -170,6 +170,11 @@ def calibrate_encoder(log: Log, method: str | None = None,
             sampled = replace(log, reference_heading=interpolate_reference(
                 log.time, log.reference_heading))
             method = 'course' if is_course(sampled) or is_noisy(sampled) else 'likelihood'
+            longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
+            if longest < 0.5 * motion.duration and (
+                    hole := _find_turn_in_hole(time, output, motion)):
+                method = 'course'
+                chosen.append(f'{hole}, over which they are not compared')
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps = _bridge_jumps(log)
@@ -203,7 +208,9 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
     limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET, max_heading_error=15.0 * DEGREE)
-    _refuse_turn_in_hole(time, output, motion)
+    if hole := _find_turn_in_hole(time, output, motion):
+        raise DataRefused(f'{hole}: use --method course, or fit the log before or after it (--to, '
+                          '--from), or correct the stamps')
     refuse_one_speed(motion, limits)
     refuse_dead(output)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
@@ -405,16 +412,15 @@ def _find_holes(time: Array) -> Array:
     return find_holes(time, max(MAX_BLOCK_DURATION, 2.5 * float(np.median(np.diff(time)))))
 
 
-def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:
-    """Refuse a log whose reference turns in a hole of the samples, where the gyro is not known."""
+def _find_turn_in_hole(time: Array, output: Array, motion: Motion) -> str:
+    """Return what the reference turns in a hole of the samples, as a clause; '' where nothing."""
     for begin, end in _find_holes(time):
         turned = float(motion.heading_at(end) - motion.heading_at(begin))
         by_gyro = 0.5 * float(np.interp([begin, end], time, output).sum()) * (end - begin)
         if abs(turned - by_gyro) > MAX_FOLLOWED_RESIDUAL:
-            raise DataRefused(
-                f'the gyro has no samples for {end - begin:.1f} s from {begin:.1f} s on, in which '
-                f'the reference turns by {abs(turned) / DEGREE:.0f} deg: use --method course, or '
-                'fit the log before or after it (--to, --from), or correct the stamps')
+            return (f'the gyro has no samples for {end - begin:.1f} s from {begin:.1f} s on, in '
+                    f'which the reference turns by {abs(turned) / DEGREE:.0f} deg')
+    return ''
 
 
 def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:

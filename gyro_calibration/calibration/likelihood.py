@@ -972,7 +972,7 @@ class DeviatingStretch:
 
 #: A turn that the profile does not contain, by hand or by a single slip: standard deviation of its
 #: rate, rad/s, and its prior odds.
-EXCESS_RATE_DEVIATION, EXCESS_TURN_ODDS = 0.0175, 0.1
+EXCESS_RATE_DEVIATION, _EXCESS_TURN_ODDS = 0.0175, 0.1
 #: Largest number of places of a run at which a stretch begins or ends.
 _MAX_EDGES = 150
 
@@ -1011,7 +1011,7 @@ def _average_over_stretch(
         (estimate.dof - 1.0) * np.log1p(-np.minimum(
             found.all_explained_squares / total_squares, 1.0 - 1e-15))
         + np.log1p(found.column_squares * (EXCESS_RATE_DEVIATION / noise_deviation) ** 2))
-    odds = (EXCESS_TURN_ODDS * float(np.exp(np.minimum(logarithms, 100.0)).sum())
+    odds = (_EXCESS_TURN_ODDS * float(np.exp(np.minimum(logarithms, 100.0)).sum())
             / max(len(logarithms), 1))  # the mean over all stretches, each against none
     widened = replace(data, columns=np.insert(data.columns, 4, stretch_column, axis=1),
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))

@@ -31,7 +31,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 #: Least step rate of an encoder, 1/s, at which a dead zone is searched for.
-MIN_ENCODER_STEP_RATE = 20.0
+_MIN_ENCODER_STEP_RATE = 20.0
 #: Times of a bias step, and of a bump, that are tried in all logs together.
 MAX_STEP_TIMES = 64
 #: Lack of log-likelihood at the ends of the interval of 95 % of the time of a step: a random walk
@@ -41,12 +41,12 @@ MAX_STEP_TIME_LACK = -math.log(1.0 - math.sqrt(0.95))
 MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 
 #: Shortest thermal lag, s; a shorter one equals a sensitivity to the temperature rate.
-MIN_THERMAL_LAG = 12.0
+_MIN_THERMAL_LAG = 12.0
 
 #: Prefix of the name of structure without a name, which its variable follows; and the name of an
 #: error that is proportional to the rate in a part of a log.
-UNNAMED_PREFIX = '~'
-PART_OF_LOG = f'{UNNAMED_PREFIX}rate and time'
+_UNNAMED_PREFIX = '~'
+PART_OF_LOG = f'{_UNNAMED_PREFIX}rate and time'
 
 #: Columns of one log: (replay) -> arrays of shape (n,).
 ColumnFunction = Callable[[Replay], Sequence[Array]]
@@ -199,7 +199,7 @@ def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
         'warm_up': [(each,) for each in np.geomspace(
             duration / 100.0, duration * 0.7, 9).tolist()],
         'thermal_lag': [(each,) for each in np.geomspace(
-            MIN_THERMAL_LAG, min(duration, 3000.0), 8).tolist()],
+            _MIN_THERMAL_LAG, min(duration, 3000.0), 8).tolist()],
         'thermal_hysteresis': [(1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)],
         'bias_temperature': [(middle,)], 'scale_factor_temperature': [(middle,)],
         # that of data sheets, mean and first temperature; of two that are as likely, a few kelvin
@@ -237,7 +237,7 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
         return
     # At a lower step rate the quantization of the encoder passes for a dead zone.
     slowest = max(1e-5 * fastest,
-                  MIN_ENCODER_STEP_RATE * max(each.heading_step for each in replays))
+                  _MIN_ENCODER_STEP_RATE * max(each.heading_step for each in replays))
     distortions = {
         'sine_response': [angle / fastest for angle in (0.5, 1.0, 1.5, 2.0)],
         'dead_zone': np.geomspace(slowest, 0.5 * fastest, 14).tolist(),
@@ -258,24 +258,24 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 
 #: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
-WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
+_WAVE_COUNTS, _SPLINE_KNOTS = range(1, 13), 8
 #: Linear response of a motion to its reference rate; lags between which it is constant, s.
-RESPONSE = f'{UNNAMED_PREFIX}rate_change'
+RESPONSE = f'{_UNNAMED_PREFIX}rate_change'
 _RESPONSE_LAGS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 1.6, 2.4)
 #: Widths of a bump in time as shares of the duration.
-BUMP_WIDTHS = (0.01, 0.05)
+_BUMP_WIDTHS = (0.01, 0.05)
 
 Variable = Callable[[Replay], Array]
 
 
 def is_named(candidate: Candidate) -> bool:
     """Tell whether a candidate is a cause, not structure without a name."""
-    return not candidate.cause.startswith(UNNAMED_PREFIX)
+    return not candidate.cause.startswith(_UNNAMED_PREFIX)
 
 
 def unnamed_variable(candidate: Candidate) -> str:
     """Return the variable of a structure without a name."""
-    return candidate.cause[len(UNNAMED_PREFIX):]
+    return candidate.cause[len(_UNNAMED_PREFIX):]
 
 
 def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
@@ -285,11 +285,11 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
 
     variables = dict(_scaled_variables(replays))
     for name, of in variables.items():
-        for count in WAVE_COUNTS if name in ('rate', 'temperature') else ():
+        for count in _WAVE_COUNTS if name in ('rate', 'temperature') else ():
             yield _unnamed_term(name, _wave_columns(of, np.pi * count))
         yield _unnamed_term(name, _spline_columns(of))
     if 'rate' in variables:
-        for number in WAVE_COUNTS[1:]:
+        for number in _WAVE_COUNTS[1:]:
             yield _unnamed_term('heading', _wave_columns(heading, number))
         for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
                              ('supply', 1)):
@@ -309,7 +309,7 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
             for part in combinations(begin + each.duration * np.linspace(0.0, 1.0, ends), 2):
                 if part[1] - part[0] < 0.99 * each.duration:
                     yield _part_of_log(*part, run, each.duration / (ends - 1))
-        for width in BUMP_WIDTHS:
+        for width in _BUMP_WIDTHS:
             count = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
                 yield _unnamed_term('time', _bump_columns(moment, width * each.duration), run,
@@ -318,7 +318,7 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
 
 def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = None,
                   *shapes: float) -> Candidate:
-    return Candidate(UNNAMED_PREFIX + name, shapes, columns, log_index)
+    return Candidate(_UNNAMED_PREFIX + name, shapes, columns, log_index)
 
 
 def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable]]:
@@ -354,7 +354,7 @@ def _wave_columns(phase: Variable, number: float,
 
 
 def _spline_columns(variable: Variable) -> ColumnFunction:
-    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, SPLINE_KNOTS - 2), [1.0] * 3])
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, _SPLINE_KNOTS - 2), [1.0] * 3])
     # their sum is constant, as the bias is
     return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
 

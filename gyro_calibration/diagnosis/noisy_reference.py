@@ -60,7 +60,7 @@ from scipy.stats import t as student
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Standard deviations of a value that is found in 95 % of logs.
-DETECTION_SIGMAS = 4.8
+_DETECTION_SIGMAS = 4.8
 _CLOCK_REMEDY = ('synchronize the clocks of gyro and reference; the model does not contain it')
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
@@ -79,7 +79,7 @@ _METHOD_TEXT = (
 _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropped_samples',
                   'unit_error', 'quantization', 'saturation'}
 #: Largest number of parts of a log for cross-fitting.
-FOLD_COUNT = 5
+_FOLD_COUNT = 5
 #: Largest effect along the rate that is established, as a share of the rate: two standard
 #: deviations of the prior of a scale factor error. Larger ones result from several similar columns
 #: that nearly cancel each other.
@@ -204,7 +204,7 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                 known['cause'] = 'The gyro has a time offset from its reference.'
         yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
                            max(chance, MIN_PROBABILITY), confounders,
-                           minimum_detectable=DETECTION_SIGMAS * deviation,
+                           minimum_detectable=_DETECTION_SIGMAS * deviation,
                            evidence=f'evidence from {effective:.0f} stretches', **known)
 
 
@@ -229,7 +229,7 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
             name, {name: Estimate.from_half_width(float(fit.values[place]), fit.half_width(place),
                                                   CAUSES[name].unit)},
             max(chance, MIN_PROBABILITY), ['vibration_rectification'],
-            minimum_detectable=DETECTION_SIGMAS * deviation,
+            minimum_detectable=_DETECTION_SIGMAS * deviation,
             evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias')
 
 
@@ -277,7 +277,7 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     shown = make_finding(
         term.cause, parameters, found_cause.p_value,
         [other for other in found_cause.probability if other != term.cause],
-        minimum_detectable=(DETECTION_SIGMAS * within / NORMAL_QUANTILE_975
+        minimum_detectable=(_DETECTION_SIGMAS * within / NORMAL_QUANTILE_975
                             if len(values) == 1 else None),
         evidence=(f'{NORMAL_QUANTILE_975 * abs(size) / within:.3g} sigma from zero'
                   if found_cause.is_established and term.is_single_event else
@@ -448,7 +448,7 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
                 'reference_once_per_rev': 'a course over ground has no shaft'}.get(
                     cause.name, 'the errors of the reference hide it over short spans')
 
-    seen = {each.cause for each in (*propose_terms(plain), *plain.causes)}
+    seen = {each.cause for each in (*_propose_terms(plain), *plain.causes)}
     return untestable_causes(seen | _ALWAYS_TESTED, [
         channel for channel in MIN_CHANNEL_RANGE if getattr(plain.spans.log, channel) is None],
         reason)
@@ -510,7 +510,7 @@ class FoundCause:
     probability: dict[str, float]  # of the cause and of its alternatives, by name
 
 
-def propose_terms(fit: SpanFit) -> list[CauseTerm]:
+def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
     """
     Return the causes that headings over spans can show, for the channels that the log has.
 
@@ -545,7 +545,7 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
     fit_with = cache(lambda *causes: fit_spans(fit.spans, causes))
     steps = _find_steps(fit, fit_with, (), false_alarm_rate)
-    found, candidates = list(steps), propose_terms(fit)
+    found, candidates = list(steps), _propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in candidates
                if not each.is_single_event and each.cause != SINE_RESPONSE.name}
@@ -744,7 +744,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     simplest = min(equivalent.values(), key=complexity)
     # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring
     # ones, and fifths of the log
-    numbers, count = np.arange(data.stretch_count), min(FOLD_COUNT, data.stretch_count)
+    numbers, count = np.arange(data.stretch_count), min(_FOLD_COUNT, data.stretch_count)
     folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
              for sets in ([numbers[fold::count] for fold in range(count)],
                           np.array_split(numbers, count))]

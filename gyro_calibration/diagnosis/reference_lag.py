@@ -142,7 +142,7 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     plain = replace(replay, command=replay.channels.rate)
     grid, command = plain.held_command
     limits = _likely_limits(plain)
-    limited = plain.with_command(limit_acceleration(command, plain.interval, limits)[grid])
+    limited = plain.with_command(_limit_acceleration(command, plain.interval, limits)[grid])
     # at first, and after a hole, the motion follows commands that are not in the log
     time = plain.channels.time
     known = time[np.isfinite(plain.reference)]
@@ -245,7 +245,7 @@ def _response_transforms(replay: Replay, kernels: Array) -> Array:
         replay.channels.output - replay.reference)])
 
 
-def limit_acceleration(command: Array, interval: float, limits: Array) -> Array:
+def _limit_acceleration(command: Array, interval: float, limits: Array) -> Array:
     """
     Return a rate that follows a command as fast as two limits allow, rad/s, shape (n,).
 
@@ -289,7 +289,7 @@ def _likely_limits(replay: Replay) -> Array:
 
     def cost(limits: Array) -> float:
         # any response that is linear between lags
-        total = np.cumsum(np.cumsum(limit_acceleration(
+        total = np.cumsum(np.cumsum(_limit_acceleration(
             command, replay.interval, np.exp(limits))))
         delayed = np.array([total[lags[-1] - each:][:count] for each in lags])
         columns = np.diff(np.diff(delayed, axis=0) / np.diff(lags)[:, None], axis=0)

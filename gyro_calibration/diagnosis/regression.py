@@ -258,7 +258,7 @@ class RegressionFit:
     @cached_property
     def _profile_deviations(self) -> dict[tuple[int, int], float]:
         """Return standard deviations of discontinuous shapes, by cause and index."""
-        return {(place, -1 - shape): profile_deviation(self, place, shape)
+        return {(place, -1 - shape): _profile_deviation(self, place, shape)
                 for place, known in enumerate(self.causes)
                 for shape in fitted_shape_indices(known)
                 if shape not in smooth_shapes(known)}
@@ -307,7 +307,7 @@ class RegressionFit:
         new = replay
         for known in self.causes:
             if is_rate_distortion(known.cause):
-                before, new = new, with_distorted_rate(new, ((known.cause, known.shapes),))
+                before, new = new, _with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.causes):
@@ -374,12 +374,12 @@ def is_rate_distortion(name: str) -> bool:
 
 
 @lru_cache(maxsize=16)
-def with_distorted_rate(replay: Replay,
-                        distortions: tuple[tuple[str, tuple[float, ...]], ...]) -> Replay:
+def _with_distorted_rate(replay: Replay,
+                         distortions: tuple[tuple[str, tuple[float, ...]], ...]) -> Replay:
     """Return a log with the rate that the gyro senses, distorted by causes with their shapes."""
     if not distortions:
         return replay
-    before, (name, shapes) = with_distorted_rate(replay, distortions[:-1]), distortions[-1]
+    before, (name, shapes) = _with_distorted_rate(replay, distortions[:-1]), distortions[-1]
     distortion = CATALOGUE[name].distortion
     assert distortion is not None
     return before.with_rate(distortion(before.channels.rate, before.channels.time, *shapes))
@@ -402,7 +402,7 @@ def _transforms_without_causes(replays: tuple[Replay, ...],
 
 def forget_fits() -> None:
     """Release the logs and columns that fits keep for the next ones."""
-    for kept in (with_distorted_rate, _transforms, _transforms_without_causes, _shape_derivative,
+    for kept in (_with_distorted_rate, _transforms, _transforms_without_causes, _shape_derivative,
                  _fit_causes):
         kept.cache_clear()
 
@@ -418,7 +418,7 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> Regre
 def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> RegressionFit:
     distortions = tuple((each.cause, each.shapes)
                         for each in causes if is_rate_distortion(each.cause))
-    distorted = tuple(with_distorted_rate(each, distortions) for each in problem.replays)
+    distorted = tuple(_with_distorted_rate(each, distortions) for each in problem.replays)
     residual, rate = _transforms_without_causes(problem.replays, distorted)
     columns, owners, widths = [rate[None]], [(-1, 0)], []
     for place, known in enumerate(causes):
@@ -621,7 +621,7 @@ def _changed_likelihood(fit: RegressionFit, added: int, squares: Array,
 
 # deviations of discontinuous shapes
 
-def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
+def _profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
     """Return the standard deviation of a shape by the profile of the likelihood, to 1 %."""
     candidate = fit.causes[cause_index]
     rest = fit_causes(fit.problem, fit.causes[:cause_index] + fit.causes[cause_index + 1:])
@@ -643,8 +643,8 @@ def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) ->
     return max(ends) / NORMAL_QUANTILE_975
 
 
-def shifted_evidence(fit: RegressionFit, candidate: Candidate, shape_index: int,
-                     half_range: float) -> tuple[Array, Array]:
+def _shifted_evidence(fit: RegressionFit, candidate: Candidate, shape_index: int,
+                      half_range: float) -> tuple[Array, Array]:
     """Return shifts of a shape in a range, and the evidence of a candidate at each of them."""
     shifts = np.linspace(-half_range, half_range, 2 * MAX_STEP_TIMES + 1)
     columns = np.concatenate([candidate_transforms(with_shape(
@@ -659,7 +659,7 @@ def _time_deviation(fit: RegressionFit, candidate: Candidate, shape_index: int) 
     half_range, last = candidate.half_width or 0.0, max(
         each.duration for each in fit.problem.replays)
     while True:
-        shifts, evidence = shifted_evidence(fit, candidate, shape_index, half_range)
+        shifts, evidence = _shifted_evidence(fit, candidate, shape_index, half_range)
         likely = evidence >= evidence[len(shifts) // 2] - MAX_STEP_TIME_LACK
         largest = float(np.abs(shifts[likely]).max() + shifts[1] - shifts[0])
         if largest < half_range or half_range > last:

@@ -142,7 +142,7 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
-MAX_POINTS = 50_000
+_MAX_POINTS = 50_000
 #: Number of terms of the rounding error of an output, their least size as a share of the noise,
 #: and least noise in steps.
 _ROUNDING_TERMS, _LEAST_ROUNDING, _LEAST_ROUNDED_NOISE = 32, 1e-2, 1e-3
@@ -415,7 +415,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
         noise = heading_step / math.sqrt(12.0) or _largest_heading_noise(
             _residual_without_delay(time, log.output, smooth)[kept], place, interval)
         smooth = _without_noise(smooth, noise / interval)
-    every = max(1, math.ceil((place[-1] + 1) / MAX_POINTS))
+    every = max(1, math.ceil((place[-1] + 1) / _MAX_POINTS))
     if model is not None and log.temperature is None:  # simulated at the reference temperature
         prepared_log = replace(prepared_log,
                                temperature=np.full(len(log), model.reference_temperature))
@@ -515,16 +515,11 @@ def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tu
 def _reference_rates(log: Log, time: Array) -> tuple[Array, Array]:
     """Return the reference rate for the comparison, and the one without gaps for effects."""
     if log.reference_rate is not None:
-        return log.reference_rate, _interpolate_gaps(time, log.reference_rate)
+        known = np.isfinite(log.reference_rate)  # delays and lags of effects need all
+        return log.reference_rate, np.interp(time, time[known], log.reference_rate[known])
     if log.reference_heading is not None:
         return _heading_rates(time, log.reference_heading)
     return np.zeros(len(time)), np.zeros(len(time))
-
-
-def _interpolate_gaps(time: Array, values: Array) -> Array:
-    """Return values with interpolated gaps, which delays and lags of effects need."""
-    known = np.isfinite(values)
-    return np.interp(time, time[known], values[known])
 
 
 @cache

@@ -50,18 +50,18 @@ from scipy.stats import chi2, norm
 
 #: Penalties in log-likelihood: of a fitted shape, at least, and of each column beyond the first;
 #: and of a structure without a name.
-VALUE_PENALTY, UNNAMED_PENALTY = 1.2, 4.0
+VALUE_PENALTY, _UNNAMED_PENALTY = 1.2, 4.0
 #: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
 #: a disturbance that is not periodic.
-MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
+_MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
 #: Least number of periods of a tone in a log; slower variations are bias wander.
-MIN_TONE_PERIODS = 20
+_MIN_TONE_PERIODS = 20
 #: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
-SLIP_DURATIONS, MAX_SLIPS = (0.0, 0.1, 0.4), 20
+_SLIP_DURATIONS, _MAX_SLIPS = (0.0, 0.1, 0.4), 20
 #: Least time between two slips, and between a slip and a gap where the heading is rounded, s.
 _SLIP_INTERVAL = 1.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
-MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
+_MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 #: Half-width of the range in which a shape is refined, in logarithms.
 _SHAPE_RANGE = 0.8
 #: Effects of fixed amplitude that grow with their shapes.
@@ -70,9 +70,9 @@ _GROWING_EFFECTS = ('sine_response', 'time_offset', 'bandwidth', 'clock_rate')
 #: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
 #: same level, so that no single stretch establishes a cause.
 _LEVEL = 0.05
-MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
+MIN_PREDICTION_SIGMAS, _MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
 #: Number of stretches of all logs together.
-STRETCH_COUNT = 64
+_STRETCH_COUNT = 64
 #: Variables whose causes are named only if they have the same size in all logs.
 _REPEATING_VARIABLES = ('temperature', 'temperature_rate')
 
@@ -83,7 +83,7 @@ Scored = tuple[Candidate, float]
 
 def evidence_threshold(cause: str, rate: float) -> float:
     """Return the evidence that noise alone exceeds with a given probability: see `p_value`."""
-    return -math.log(rate) if cause in MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
+    return -math.log(rate) if cause in _MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
 
 
 def p_value(cause: str, evidence: float) -> float:
@@ -96,7 +96,7 @@ def p_value(cause: str, evidence: float) -> float:
     degrees of freedom less the logarithm of their number.
     """
     evidence = max(evidence, 0.0)
-    return math.exp(-evidence) if cause in MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
+    return math.exp(-evidence) if cause in _MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Search:
     candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
     # causes that are scanned for over all frequencies or times
-    scanned_causes: frozenset[str] = frozenset({'bias_step', *MAX_PER_LOG})
+    scanned_causes: frozenset[str] = frozenset({'bias_step', *_MAX_PER_LOG})
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
     # columns_cache, step_cache: caches of columns and of steps, by the named causes
@@ -176,8 +176,8 @@ def restrict_search(search: Search, replays: Sequence[Replay], causes: Collectio
 
 # one more cause
 
-def find_strongest(search: Search, causes: Sequence[Candidate],
-                   ) -> tuple[Candidate | None, list[Scored]]:
+def _find_strongest(search: Search, causes: Sequence[Candidate],
+                    ) -> tuple[Candidate | None, list[Scored]]:
     """
     Search for one more cause.
 
@@ -197,10 +197,10 @@ def find_strongest(search: Search, causes: Sequence[Candidate],
                  if (is_named(each) or each in significant) and evidence > 0.8 * top - 8.0]
     else:
         worth = [(each, evidence) for each, evidence in first
-                 if is_lasting(each) and p_value(
+                 if _is_lasting(each) and p_value(
                      each.cause, evidence - each.penalty) < SUSPECTED_RATE_FACTOR * search.rate]
     worth.sort(key=lambda each: -each[1])
-    steps = sorted((refine_shape(fit, each) for each, _ in worth[:MAX_CONFOUNDERS]),
+    steps = sorted((refine_shape(fit, each) for each, _ in worth[:_MAX_CONFOUNDERS]),
                    key=lambda step: -step[1])
     best = None
     if significant:
@@ -221,7 +221,7 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
     """
     found = search.candidate_evidence(fit)
     # A second cause of this kind would only correct the shape of the first.
-    taken = {each.cause for each in fit.causes if each.amplitude is not None or is_lasting(each)}
+    taken = {each.cause for each in fit.causes if each.amplitude is not None or _is_lasting(each)}
     first = []
     for cause, own in indices_by_cause(search.candidates).items():
         if cause not in taken and np.isfinite(found[own]).any():
@@ -229,8 +229,8 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
             mean = float(logsumexp(found[own])) - math.log(len(own))
             first.append((replace(search.candidates[best], penalty=float(found[best]) - mean),
                           float(found[best])))
-    scans = {'interference_tone': find_tones, 'reference_slip': find_slips,
-             'bias_step': find_steps}
+    scans = {'interference_tone': _find_tones, 'reference_slip': _find_slips,
+             'bias_step': _find_steps}
     first += [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)]
     likeliest = {each.cause: (each, evidence) for each, evidence in sorted(
         first, key=lambda scored: scored[1] - scored[0].penalty)}
@@ -261,14 +261,14 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
         candidate = moved(best.x)
     more = max(_free_column_count(candidate, fit.problem) - 1, 0)
     return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * more
-                       - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
+                       - candidate.penalty - (0.0 if is_named(candidate) else _UNNAMED_PENALTY))
 
 
 def _free_column_count(candidate: Candidate, problem: RegressionProblem) -> int:
     return 0 if candidate.amplitude is not None else len(candidate.columns(problem.replays[0]))
 
 
-def is_lasting(candidate: Candidate) -> bool:
+def _is_lasting(candidate: Candidate) -> bool:
     """
     Tell whether a cause acts in all logs and has a free size: only such causes are suspected.
 
@@ -277,13 +277,13 @@ def is_lasting(candidate: Candidate) -> bool:
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
 
-def find_suspected(search: Search, selected: Causes) -> Causes:
+def _find_suspected(search: Search, selected: Causes) -> Causes:
     """Return one more cause at `SUSPECTED_RATE_FACTOR` times the rate, if there is one."""
-    _, steps = find_strongest(search, selected)
+    _, steps = _find_strongest(search, selected)
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
     cause_names = {each.cause for each in selected}
     return next(((each,) for each, likelihood in steps
-                 if is_lasting(each) and each.cause not in cause_names and p_value(
+                 if _is_lasting(each) and each.cause not in cause_names and p_value(
                      each.cause, likelihood - score) < SUSPECTED_RATE_FACTOR * search.rate), ())
 
 
@@ -293,17 +293,17 @@ def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
     """Return the logs that may contain one more instance of a cause."""
     taken = [known.log_index for known in fit.causes if known.cause == cause]
     return [run
-            for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]]
+            for run in range(len(fit.problem.replays)) if taken.count(run) < _MAX_PER_LOG[cause]]
 
 
-def find_tones(fit: RegressionFit) -> list[Scored]:
+def _find_tones(fit: RegressionFit) -> list[Scored]:
     """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
     found, left = [], fit.whitened_series()
     for run in _logs_to_scan(fit, 'interference_tone'):
         each, white = fit.problem.replays[run], left[run]
         # Zero padding: a tone between two frequencies of the log would lose half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
-        lowest = 2 * MIN_TONE_PERIODS
+        lowest = 2 * _MIN_TONE_PERIODS
         if len(power) > 2 * lowest:
             best = lowest + int(power[lowest:-2].argmax())
             frequency = 0.5 * best / each.duration
@@ -330,7 +330,7 @@ def _amplitude(replay: Replay, values: Array, frequency: float) -> float:
     return float(2.0 * np.abs(np.mean(values[replay.valid] * wave)))
 
 
-def find_steps(fit: RegressionFit) -> list[Scored]:
+def _find_steps(fit: RegressionFit) -> list[Scored]:
     """
     Return the clearest step of the bias at any time, under the likeliest noise.
 
@@ -371,7 +371,7 @@ def find_steps(fit: RegressionFit) -> list[Scored]:
                           for each, own in zip(found, evidence)])
 
 
-def find_slips(fit: RegressionFit) -> list[Scored]:
+def _find_slips(fit: RegressionFit) -> list[Scored]:
     """Return the clearest jumps of the reference's heading, where it accelerates."""
     found, left = [], fit.whitened_series()
     factors = [own / each for own, each in zip(fit.whitening_factors(), fit.problem.split_by_log(
@@ -382,9 +382,10 @@ def find_slips(fit: RegressionFit) -> list[Scored]:
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
             tried = [_fit_slips(each, run, left[run], factors[run], moments,
-                                max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
+                                max(width, 0.5 * each.point_interval))
+                     for width in _SLIP_DURATIONS]
             # The largest number indicates a continuous disturbance, not slips.
-            if max(len(slips.shapes) - 1 for slips, _ in tried) < MAX_SLIPS:
+            if max(len(slips.shapes) - 1 for slips, _ in tried) < _MAX_SLIPS:
                 found += tried
     return _best_of_scan(found)
 
@@ -393,7 +394,7 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
                width: float) -> Scored:
     """Return slips of one duration, apart from each other, with evidence for the times scanned."""
     time = np.arange(replay.point_count) * replay.point_interval
-    likely = math.log(len(indices) * len(SLIP_DURATIONS))
+    likely = math.log(len(indices) * len(_SLIP_DURATIONS))
     size, deviation = _matched_filter(white, factor, time, width)
     wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
     value = 0.5 * (size[indices] / deviation) ** 2 - likely - VALUE_PENALTY
@@ -409,7 +410,7 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
-        if (value[place] <= 0.0 and chosen) or len(chosen) == MAX_SLIPS:
+        if (value[place] <= 0.0 and chosen) or len(chosen) == _MAX_SLIPS:
             break
         at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
         if all(abs(at - other) > _SLIP_INTERVAL for other in chosen):
@@ -447,7 +448,7 @@ def search_causes(search: Search) -> Causes:
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
                    complexity_penalty(each)
-                   + (0.0 if is_named(each) else UNNAMED_PENALTY) for each in named))
+                   + (0.0 if is_named(each) else _UNNAMED_PENALTY) for each in named))
 
 
 def _select_forward(search: Search) -> Causes:
@@ -456,11 +457,11 @@ def _select_forward(search: Search) -> Causes:
     for _ in range(2 * MAX_CAUSES):  # some are removed again
         if search.on_progress(None, f'search for causes, {len(named)} found'):
             break
-        one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
+        one_more = _find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
         more = _with_several(search, named) if one_more is None else (*named, one_more)
         if not more:
             break
-        named = eliminate_backward(search, refine_jointly(search, more))
+        named = _eliminate_backward(search, refine_jointly(search, more))
     return named
 
 
@@ -478,10 +479,10 @@ def _with_several(search: Search, causes: Causes) -> Causes:
     problem, grown, tried = search.problem, causes, []
     white = replace(
         search, columns_cache={}, step_cache={}, scanned_causes=frozenset(),
-        candidates=tuple(filter(is_lasting, search.candidates)), problem=replace(
+        candidates=tuple(filter(_is_lasting, search.candidates)), problem=replace(
             problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
             log_determinants=problem.log_determinants[:1]))
-    while len(grown) < MAX_CAUSES and (steps := find_steps(fit_causes(white.problem, grown))):
+    while len(grown) < MAX_CAUSES and (steps := _find_steps(fit_causes(white.problem, grown))):
         # the first of a pair may not be significant alone
         if len(grown) > len(causes) + 1 and p_value(
                 'bias_step', steps[0][1] - steps[0][0].penalty) > search.rate:
@@ -490,14 +491,14 @@ def _with_several(search: Search, causes: Causes) -> Causes:
         tried.append(grown)
     for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
                            key=lambda each: each[0].penalty - each[1])[:3]:
-        tried.append(eliminate_backward(
+        tried.append(_eliminate_backward(
             white, _refine_in_turn(white, (*grown, drift), len(causes))))
     evidence, best = max(((_joint_evidence(search, causes, each, len(tried)), each)
                           for each in tried if _are_apart(problem, each)),
                          default=(-math.inf, ()), key=lambda each: each[0])
     if evidence < 0.0:
         return ()
-    best = eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
+    best = _eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
     return best if len(best) > len(causes) + 1 else ()
 
 
@@ -587,7 +588,7 @@ def _evidence_alone(rest: RegressionFit, event: Candidate) -> float:
             - complexity_penalty(event))
 
 
-def eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Causes:
+def _eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Causes:
     """Remove causes that are not significant given the others and some kept, weakest first."""
     while causes:
         chances = [p_value(each.cause, evidence_for(search, (*causes, *kept), place))
@@ -601,7 +602,7 @@ def eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Cau
 
 # names
 
-def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
+def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     """
     Separate named causes from structure without a name.
 
@@ -612,7 +613,7 @@ def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
                  for each in causes if not is_named(each)}
     exceeded = {name for variable in variables for name in variable.split(' and ')}
     tones = [each.log_index for each in causes if each.cause == 'interference_tone']
-    if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
+    if any(tones.count(run) >= _MAX_PER_LOG['interference_tone'] for run in tones):
         exceeded.add('frequency')
     kept = [each for each in causes
             if is_named(each) and CAUSES[each.cause].along not in exceeded
@@ -622,7 +623,7 @@ def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
                          or CAUSES[each.cause].along not in variables))
     if len(kept) == len(causes):
         return causes, ()
-    left = eliminate_backward(search, refine_jointly(search, (*kept, *unnamed)))
+    left = _eliminate_backward(search, refine_jointly(search, (*kept, *unnamed)))
     keys = {(each.cause, each.log_index) for each in kept}
     return tuple(each for each in left
                  if (each.cause, each.log_index) in keys), unnamed
@@ -657,14 +658,14 @@ class Selection:
 def confirm_causes(search: Search, causes: Causes) -> Selection:
     """Withdraw names, confirm the others, and take the simplest of what the data allow."""
     search.on_progress(None, 'alternatives')
-    named, unnamed = withdraw_names(search, causes)
+    named, unnamed = _withdraw_names(search, causes)
     named, removed = _remove_unconfirmed(search, named, unnamed)
-    named, alternatives = choose_simplest(search, named, unnamed)
+    named, alternatives = _choose_simplest(search, named, unnamed)
     taken = {each.cause for each in named}
-    suspected = tuple(each for each in removed if is_lasting(each) and each.cause not in taken)
+    suspected = tuple(each for each in removed if _is_lasting(each) and each.cause not in taken)
     return Selection(named, alternatives, unnamed,
-                     suspected or find_suspected(search, (*named, *unnamed)),
-                     tuple(each for each in removed if not is_lasting(each)))
+                     suspected or _find_suspected(search, (*named, *unnamed)),
+                     tuple(each for each in removed if not _is_lasting(each)))
 
 
 def _remove_unconfirmed(search: Search, causes: Causes,
@@ -691,7 +692,7 @@ def _remove_unconfirmed(search: Search, causes: Causes,
 
 def prediction_sigmas(log_likelihood_gains: Array) -> float:
     """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
-    clipped_gains = np.clip(log_likelihood_gains, -MAX_STRETCH_GAIN, MAX_STRETCH_GAIN)
+    clipped_gains = np.clip(log_likelihood_gains, -_MAX_STRETCH_GAIN, _MAX_STRETCH_GAIN)
     scatter = float(np.std(clipped_gains, ddof=1)) * len(log_likelihood_gains) ** 0.5
     return (float(np.sum(clipped_gains)) / max(scatter, 1e-9) if np.sum(log_likelihood_gains) > 0.0
             else 0.0)
@@ -706,7 +707,7 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """
     full, found = fit_causes(search.problem, causes), []
     left = full.whitened_series()
-    count = max(STRETCH_COUNT // len(left), 1)
+    count = max(_STRETCH_COUNT // len(left), 1)
     stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
                               for run, each in enumerate(left)])
     off = np.concatenate(left)
@@ -741,8 +742,8 @@ def _size_sigmas(search: Search, causes: Causes) -> list[float]:
     return sigmas
 
 
-def choose_simplest(search: Search, named: Causes,
-                    unnamed: Causes) -> tuple[Causes, list[list[Scored]]]:
+def _choose_simplest(search: Search, named: Causes,
+                     unnamed: Causes) -> tuple[Causes, list[list[Scored]]]:
     """
     Replace each cause by its simplest alternative, and remove those that are not significant then.
 
@@ -754,8 +755,8 @@ def choose_simplest(search: Search, named: Causes,
         if simplest is not named[place]:
             named = refine_jointly(search, (*named[:place], simplest, *named[place + 1:]))
         sets.append(members)
-    kept = eliminate_backward(search, named, unnamed)
-    return (named, sets) if kept is named else choose_simplest(search, kept, unnamed)
+    kept = _eliminate_backward(search, named, unnamed)
+    return (named, sets) if kept is named else _choose_simplest(search, kept, unnamed)
 
 
 def _alternatives(search: Search, named: Causes, place: int,
@@ -766,7 +767,7 @@ def _alternatives(search: Search, named: Causes, place: int,
         return len(fitted_shape_indices(known)) + _free_column_count(known, search.problem)
 
     own = named[place]
-    _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
+    _, steps = _find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
     mine = max((score for each, score in steps if each.cause == own.cause), default=math.inf)
     members = [(each, mine - score) for each, score in steps
                if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(own, 0.0)]
