@@ -536,7 +536,8 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     What repeats itself with the motion is not noise of the fit, and what is slower than a piece
     shows in part only. What repeats itself at a place of the shaft shows between the places.
     """
-    scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence)
+    turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
+    scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence, turned)
     slope = scatter[0, 1] / scatter[1, 1]
     # the drift is that of a heading with the scale of the fit, whose error is one of the bias too
     own_variance = max(float(np.nan_to_num(fit.covariance[0, 0]))
@@ -545,12 +546,12 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation, of_scale)
                          / math.sqrt(scatter[1, 1])])
     covariance = scatter * np.outer(widening, widening)
-    turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
     # what the prior of the lag leaves open
     covariance[0, 0] = max(covariance[0, 0], own_variance)
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
-        covariance[0, 0] = max(covariance[0, 0], _scatter_between(place, fit.influence)[0, 0])
+        covariance[0, 0] = max(covariance[0, 0],
+                               _scatter_between(place, fit.influence, turned)[0, 0])
     # the components of a misalignment scatter as the scale factor error does
     widening = covariance[0, 0] / np.nan_to_num(fit.covariance[0, 0], nan=math.inf)
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
@@ -558,11 +559,20 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
                    misalignment_covariance=max(widening, 1.0) * fit.misalignment_covariance)
 
 
-def _scatter_between(group: NDArray[np.intp], influence: Array) -> Array:
-    """Return the covariance of (s, b) by sums over groups of blocks, with Student's factor."""
+def _scatter_between(group: NDArray[np.intp], influence: Array, turned: Array) -> Array:
+    """
+    Return the covariance of (s, b) by sums over groups of blocks, with Student's factor.
+
+    A few turns may determine s: what a group leaves is less by its share in the fit than what it
+    is in error (MacKinnon and White 1985), and the effective number of groups has the freedom.
+    """
+    leverage = np.array([np.gradient(turned) ** 2 + 1e-300, np.ones(len(turned))])
+    shares = np.array([np.bincount(group, each) / each.sum() for each in leverage])
     sums = np.array([np.bincount(group, values) for values in influence[:, :2].T])
-    dof = max(np.count_nonzero(np.bincount(group)) - 1, 1)
-    return (stats.t.ppf(0.975, dof) / stats.norm.ppf(0.975)) ** 2 * sums @ sums.T
+    sums /= np.maximum(1.0 - shares, 1e-3)
+    freedom = np.maximum(1.0 / np.sum(shares ** 2, axis=1) - 1.0, 1.0)
+    sums *= (stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))[:, None]
+    return np.asarray(sums @ sums.T)
 
 
 def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidual:
