@@ -117,8 +117,18 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
         if len(columns) != len(parts):
             raise InputError(f'{name}={text}: wanted the four columns of a quaternion, such as '
                              'attitude=qw/qx/qy/qz')
-        found |= {part: _find_column(header, name, column, units)
-                  for part, column in zip(parts, columns)}
+        for part, column in zip(parts, columns):
+            given, unit = column, next(iter(units))
+            if column not in header and ':' in column:
+                column, _, unit = column.rpartition(':')
+            if unit not in units:
+                raise InputError(f'{name}={given}: {unit} is no unit of it; wanted one of '
+                                 f'{", ".join(units)}{suggest_nearest(unit, units)}')
+            if column not in header:
+                raise InputError(f'{name}={given}: there is no column {column} among '
+                                 f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
+            offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
+            found[part] = Column(header.index(column), units[unit], offset)
     asked = {column.position for column in found.values()}
     for index, name in enumerate(header):
         quantity, factor = COLUMNS.get(_strip_axis(name, axis), ('', 0.0))
@@ -132,21 +142,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
         raise InputError(f'no gyro column among {_shorten(",".join(header))}; '
                          f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggest_columns(header)}')
     return found
-
-
-def _find_column(header: Sequence[str], name: str, text: str,
-                 units: Mapping[str, float]) -> Column:
-    column, unit = text, next(iter(units))
-    if text not in header and ':' in text:
-        column, _, unit = text.rpartition(':')
-    if unit not in units:
-        raise InputError(f'{name}={text}: {unit} is no unit of it; wanted one of '
-                         f'{", ".join(units)}{suggest_nearest(unit, units)}')
-    if column not in header:
-        raise InputError(f'{name}={text}: there is no column {column} among '
-                         f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
-    offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
-    return Column(header.index(column), units[unit], offset)
 
 
 def _strip_axis(name: str, axis: str) -> str:

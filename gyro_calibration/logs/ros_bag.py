@@ -269,7 +269,15 @@ class _McapReader:
         """Give the messages in a record; a truncated chunk is read up to its end."""
         try:
             if code == _RecordCode.CHUNK:
-                data = _read_chunk(body, torn, self._budget)
+                _, _, size, check = struct.unpack_from('<QQQI', body)
+                compression, place = _read_text(body, 28)
+                if size > MAX_RECORD_BYTES or compression not in ('', 'zstd', 'lz4'):
+                    raise _DamagedPart
+                data = body[place + 8:]
+                data = (_decompress_up_to(size, compression, data, self._budget) if compression
+                        else data[:size])
+                if not torn and (len(data) != size or check and zlib.crc32(data) != check):
+                    raise _DamagedPart
                 for inner, content in _iter_records(io.BytesIO(data), len(data), self._contents):
                     yield from self.read(inner, content) if inner != _RecordCode.CHUNK else ()
             elif code == _RecordCode.MESSAGE:
@@ -325,19 +333,6 @@ def read_metadata(path: str | Path) -> dict[str, str]:
                 with suppress(_DamagedPart, struct.error):
                     found |= _parse_metadata(body)[1] if code == _RecordCode.METADATA else {}
     return found
-
-
-def _read_chunk(body: bytes, torn: bool, budget: ExpansionBudget) -> bytes:
-    """Return the records of a chunk as bytes; of a truncated one those before its end."""
-    _, _, size, check = struct.unpack_from('<QQQI', body)
-    compression, place = _read_text(body, 28)
-    if size > MAX_RECORD_BYTES or compression not in ('', 'zstd', 'lz4'):
-        raise _DamagedPart
-    data = body[place + 8:]
-    data = _decompress_up_to(size, compression, data, budget) if compression else data[:size]
-    if not torn and (len(data) != size or check and zlib.crc32(data) != check):
-        raise _DamagedPart
-    return data
 
 
 def _pack_record(code: _RecordCode, *content: bytes) -> bytes:
@@ -459,8 +454,18 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
     with _open_database(source) as (database, tables):
-        channels, budget = _read_topics(database, tables, contents), ExpansionBudget(path)
-        size, last, count = path.stat().st_size, sys.maxsize, 0
+        try:
+            definitions = dict(database.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions')
+                if 'message_definitions' in tables else ())
+            channels = {number: contents.add_topic(str(topic), str(kind), encoding,
+                                                   str(definitions.get(kind, '')))
+                        for number, topic, kind, encoding in database.execute(
+                            'SELECT id, name, type, serialization_format FROM topics')}
+        except _DATABASE_ERRORS as error:
+            raise LogError('its list of topics cannot be read '
+                           f'({_describe_database_error(error)}); record again') from error
+        budget, size, last, count = ExpansionBudget(path), path.stat().st_size, sys.maxsize, 0
         with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
         try:
@@ -540,18 +545,3 @@ def _correct_page_count(source: Path, folder: Path) -> Path:
             file.seek(28)
             file.write((copy.stat().st_size // size).to_bytes(4, 'big'))
     return copy
-
-
-def _read_topics(database: sqlite3.Connection, tables: set[str],
-                 contents: Contents) -> dict[int, tuple[str, str] | None]:
-    try:
-        definitions = dict(database.execute(
-            'SELECT topic_type, encoded_message_definition FROM message_definitions')
-            if 'message_definitions' in tables else ())
-        return {number: contents.add_topic(str(topic), str(kind), encoding,
-                                           str(definitions.get(kind, '')))
-                for number, topic, kind, encoding in database.execute(
-                    'SELECT id, name, type, serialization_format FROM topics')}
-    except _DATABASE_ERRORS as error:
-        raise LogError('its list of topics cannot be read '
-                       f'({_describe_database_error(error)}); record again') from error
