@@ -66,7 +66,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                       f'{path}: {describe_error(error)}; {remedy(error, str(path))}')
         return 2
     if text is not None:
-        _print_text(text)
+        encoding = sys.stdout.encoding or 'utf-8'  # a file name may not be text
+        text = to_printable(text, allowed='\n').encode(encoding, 'backslashreplace').decode(
+            encoding)
+        try:
+            print(text, flush=True)
+        except BrokenPipeError:  # such as of `head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
@@ -85,17 +91,6 @@ def _load_effects(path: str) -> None:
         raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
                          f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'
                          'Effect') from None
-
-
-def _print_text(text: str) -> None:
-    """Print; a closed pipe, such as of `head`, or a file name that is not text is no error."""
-    encoding = sys.stdout.encoding or 'utf-8'
-    try:
-        print(
-            to_printable(text, allowed='\n').encode(encoding, 'backslashreplace').decode(encoding),
-            flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
@@ -129,7 +124,7 @@ def find_verbs() -> dict[str, str]:
             for name, text in texts.items() if '\ndef run(' in text}
 
 
-def make_parser(called: str = '') -> argparse.ArgumentParser:
+def make_parser(called: str) -> argparse.ArgumentParser:
     """Return the parser of the verbs; only the called one is imported, and has its arguments."""
     parser = _Parser(prog='gyro_calibration',
                      description='Calibrate, compensate and diagnose gyros with one axis.')

@@ -159,7 +159,6 @@ class _Recorder:
         raise NotImplementedError
 
     def finish(self) -> None:
-        """Write the last piece."""
         self.flush(is_due=True)
 
     def close(self) -> None:
@@ -195,14 +194,12 @@ class McapRecorder(_Recorder):
             self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
 
     def flush(self, is_due: bool = False) -> None:
-        """Write the messages so far as a chunk."""
         if self.writer.pending_bytes:
             head = b'' if self.size else self.writer.pack_header(
                 f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
             self.append(head + self.writer.pack_chunk())
 
     def finish(self) -> None:
-        """Write the last chunk and the index."""
         self.flush()
         if self.size:
             self.append(self.writer.pack_summary())
