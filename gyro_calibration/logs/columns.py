@@ -17,6 +17,7 @@ A name of the log format states quantity and unit. The user assigns other names,
 
 from collections.abc import Iterable, Mapping, Sequence
 import difflib
+import itertools
 import math
 import re
 import shlex
@@ -93,8 +94,8 @@ class Column(NamedTuple):
     offset: float = 0.0
 
 
-def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
-                 axis: str = 'z') -> dict[str, Column]:
+def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
+                 axis: str) -> dict[str, Column]:
     """
     Return the column of each quantity of a log, and of each part of an `ATTITUDE`.
 
@@ -166,11 +167,15 @@ def suggest_columns(header: Sequence[str]) -> str:
     """Suggest the option --columns for a header, or another name; '' without a suggestion."""
     names = [name for name in header if name not in COLUMNS and name == _shorten(name)
              and not set(name) & set(',=:')]
-    wanted = {}
-    for quantity in _COLUMN_ALIASES:
-        for name in names:
-            if quantity not in wanted and (unit := _guess_unit(name, quantity)):
-                wanted[quantity] = f'{quantity}={name}:{unit}'
+    wanted = dict[str, str]()
+    for quantity, alias in _COLUMN_ALIASES.items():
+        endings = {re.sub('[^a-z]', '', unit.lower()): unit
+                   for unit in _OPTION_QUANTITIES[quantity][1]}
+        endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
+        for name, (end, unit) in itertools.product(names, {**endings, '': 'UNIT'}.items()):
+            letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
+            if letters.endswith(end) and re.fullmatch(alias, letters.removesuffix(end)):
+                wanted.setdefault(quantity, f'{quantity}={name}:{unit}')
     if 'gyro' in wanted:
         attitude = '' if 'heading' in wanted else suggest_attitude(names)
         text = ','.join(filter(None, [*wanted.values(), attitude]))
@@ -188,19 +193,6 @@ def suggest_attitude(names: Iterable[str]) -> str:
     found = {name[-2:].lower(): name for name in names}
     parts = [found.get(f'q{axis}', '') for axis in ('w', *AXES)]
     return f'attitude={"/".join(parts)}' if all(parts) else ''
-
-
-def _guess_unit(name: str, quantity: str) -> str:
-    """Return the unit in a name of a quantity, UNIT without one; '' for another quantity."""
-    letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
-    units = _OPTION_QUANTITIES[quantity][1]
-    endings = {re.sub('[^a-z]', '', unit.lower()): unit for unit in units}
-    endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
-    for end, unit in {**endings, '': 'UNIT'}.items():
-        if letters.endswith(end) and re.fullmatch(_COLUMN_ALIASES[quantity],
-                                                  letters.removesuffix(end)):
-            return unit
-    return ''
 
 
 def _shorten(text: str) -> str:

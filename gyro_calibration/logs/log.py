@@ -175,7 +175,14 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
         budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
-        while block := _read_block(lines, rows):
+        while True:
+            block, length = list[str](), 0  # fewer lines where they are long
+            while (length < _MAX_BLOCK_LENGTH and (
+                    more := list(itertools.islice(lines, min(rows - len(block), 256))))):
+                block += more
+                length += sum(map(len, more))
+            if not block:
+                break
             if budget:
                 budget.spend(sum(map(len, block)))
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
@@ -239,17 +246,6 @@ def _iter_lines(text: io.TextIOWrapper) -> Iterator[str]:
         yield from empty
         empty.clear()
         yield line
-
-
-def _read_block(lines: Iterator[str], rows: int) -> list[str]:
-    """Return the next lines: `rows` of them, or fewer where they are long."""
-    block: list[str] = []
-    length = 0
-    while (length < _MAX_BLOCK_LENGTH
-            and (more := list(itertools.islice(lines, min(rows - len(block), 256))))):
-        block += more
-        length += sum(map(len, more))
-    return block
 
 
 def _limit_length(lines: Iterator[str]) -> Iterator[str]:
@@ -619,10 +615,25 @@ def refuse_wrapped(log: Log) -> None:
         return
     known = np.flatnonzero(np.isfinite(log.reference_heading))
     time, change = log.time[known], np.diff(log.reference_heading[known])
-    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL_TURN_MARGIN
     # vehicles do not turn faster than 35 rad/s
-    jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time))
-                           | _turns_without_gyro(log, known))
+    is_jump = ((np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL_TURN_MARGIN)
+               & (np.abs(change) > 35.0 * np.diff(time)))
+    measured = np.isfinite(np.nan if log.output is None else log.output)
+    if log.output is not None and len(known) > 2 and measured.sum() > 2:
+        # gaps with full turns that the gyro lacks
+        output, stamps = log.output[measured], log.time[measured]
+        expected, factor = _heading_by_gyro(time, log.reference_heading[known], stamps, output)
+        turns = (change - np.diff(expected)) / (2.0 * math.pi)
+        # the integral of the gyro errs by less than its longest interval times its largest rate
+        pauses = np.diff(stamps)
+        begin = np.clip(np.searchsorted(stamps, time, 'right') - 1, 0, len(pauses) - 1)
+        longest = np.maximum.reduceat(pauses, begin)[:-1]
+        is_jump |= ((longest * np.abs(output).max() < _FULL_TURN_MARGIN * 2.0 * math.pi)
+                    & (np.rint(turns) != 0.0)
+                    & (np.abs(turns - np.rint(turns)) < _FULL_TURN_MARGIN)
+                    & (known[1:] > known[:-1] + 1)
+                    & (1.0 / MAX_PLAUSIBLE_FACTOR < abs(factor) < MAX_PLAUSIBLE_FACTOR))
+    jumps = np.flatnonzero(is_jump)
     if len(jumps) and not (log.output is not None and _is_in_degrees(
             time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
@@ -630,27 +641,6 @@ def refuse_wrapped(log: Log) -> None:
                  ' that the gyro does not show, first in the gap that ends at')
         raise DataRefused(f'the reference heading jumps by a full turn{where} '
                           f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
-
-
-def _turns_without_gyro(log: Log, known: NDArray[np.intp]) -> Mask:
-    """Tell which gaps between known reference headings hold full turns that the gyro lacks."""
-    assert log.time is not None and log.reference_heading is not None
-    measured = np.zeros(0, dtype=np.intp) if log.output is None else np.flatnonzero(
-        np.isfinite(log.output))
-    if len(known) < 3 or len(measured) < 3:
-        return np.zeros(max(len(known) - 1, 0), dtype=bool)
-    assert log.output is not None
-    at, output, stamps = log.time[known], log.output[measured], log.time[measured]
-    expected, factor = _heading_by_gyro(at, log.reference_heading[known], stamps, output)
-    turns = (np.diff(log.reference_heading[known]) - np.diff(expected)) / (2.0 * math.pi)
-    # the integral of the gyro errs by less than its longest interval times its largest rate
-    pauses = np.diff(stamps)
-    begin = np.clip(np.searchsorted(stamps, at, 'right') - 1, 0, len(pauses) - 1)
-    longest = np.maximum.reduceat(pauses, begin)[:-1]
-    certain = longest * np.abs(output).max() < _FULL_TURN_MARGIN * 2.0 * math.pi
-    is_whole = (np.rint(turns) != 0.0) & (np.abs(turns - np.rint(turns)) < _FULL_TURN_MARGIN)
-    return np.asarray(certain & is_whole & (known[1:] > known[:-1] + 1)
-                      & (1.0 / MAX_PLAUSIBLE_FACTOR < abs(factor) < MAX_PLAUSIBLE_FACTOR))
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:

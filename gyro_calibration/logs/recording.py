@@ -84,7 +84,6 @@ class _TopicBuffer:
         return len(self._stamps)
 
     def add(self, message: Message) -> None:
-        """Store the quantities of a message; count a damaged one."""
         try:
             stamp, numbers = cdr.parse(message.data, self._layout)
             self._received.append(message.received)
@@ -97,7 +96,6 @@ class _TopicBuffer:
         self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
     def sort_by_arrival(self) -> _TopicSeries:
-        """Return the messages in the order of receipt."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
         series = _TopicSeries(self.topic, self.kind, np.frombuffer(self._stamps, np.int64),

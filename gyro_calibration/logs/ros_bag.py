@@ -361,7 +361,6 @@ class McapWriter:
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes of the messages that are not yet in a chunk."""
         return len(self._records)
 
     def pack_header(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
@@ -493,7 +492,16 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
         reason: Exception | None = None
         for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
             try:
-                file = source if mode != 'copy' else _correct_page_count(source, Path(folder))
+                file = source
+                if mode == 'copy':
+                    file = Path(shutil.copy(source, folder))
+                    with open(file, 'r+b') as copy:
+                        head = copy.read(100)
+                        if len(head) == 100:
+                            size = int.from_bytes(head[16:18], 'big')
+                            size = 1 << 16 if size == 1 else max(size, 1)
+                            copy.seek(28)
+                            copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
                 database, tables = _connect(file, mode.replace('copy', 'mode=ro'))
             except _DATABASE_ERRORS as error:
                 reason = error
@@ -532,16 +540,3 @@ def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
     except BaseException:
         database.close()
         raise
-
-
-def _correct_page_count(source: Path, folder: Path) -> Path:
-    """Return a copy of a truncated database with its page count corrected, as SQLite wants it."""
-    copy = Path(shutil.copy(source, folder))
-    with open(copy, 'r+b') as file:
-        head = file.read(100)
-        if len(head) == 100:
-            size = int.from_bytes(head[16:18], 'big')
-            size = 1 << 16 if size == 1 else max(size, 1)
-            file.seek(28)
-            file.write((copy.stat().st_size // size).to_bytes(4, 'big'))
-    return copy
