@@ -193,7 +193,7 @@ class Connection:
     and ports in place of a `SerialPort`.
     """
 
-    def __init__(self, port: str, protocol: str = AUTO, baud: int = 0,
+    def __init__(self, port: str, protocol: str, baud: int = 0,
                  settings: Settings | None = None,
                  on_change: Callable[[ConnectionState], None] = lambda state: None,
                  clock: Callable[[], float] = read_steady_clock,
@@ -242,7 +242,7 @@ class Connection:
                     yield from self._read(stop)
                 except PortError as error:
                     self._close()
-                    self._set_failed(str(error), self._reopen_delay)
+                    self._set_state('failed', str(error), self._reopen_delay)
                     begin = self._read_clock()
                     stop.wait(self._reopen_delay)
                     self.waited_duration += self._read_clock() - begin
@@ -260,18 +260,32 @@ class Connection:
         """Find protocol and baud; they stay unknown only after a stop."""
         # The port stays open, since opening it restarts many microcontrollers, which then need
         # some time until they send.
-        self._set_state(ConnectionState('listening'))
+        self._set_state('listening')
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:
             tried: list[Recognition] = []
             for baud in self._bauds:
                 port.set_baud(baud)
-                tried.append(self._recognize(port, end, stop))
+                # within 1 s after the first byte
+                data, opened, last, due = b'', self._read_clock(), math.inf, 0.0
+                while True:
+                    if stop.is_set():
+                        return
+                    data += port.read()
+                    now = self._read_clock()
+                    if not data and now - opened > _SILENCE_TIMEOUT:
+                        self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), end)
+                    if data and now >= due:
+                        recognized = recognize_protocol(data, self._settings)
+                        due, last = now + _ATTEMPT_INTERVAL, min(last, now + _LISTENING_DURATION)
+                        if recognized.protocol is not None or now >= last:
+                            break
                 if stop.is_set():
                     return
-                found = tried[-1].protocol
+                tried.append(recognized)
+                found = recognized.protocol
                 if found is not None:
-                    self.detected = tried[-1].summary
+                    self.detected = recognized.summary
                     try:
                         self._set_protocol(found, baud)
                     except ValueError as error:
@@ -283,28 +297,13 @@ class Connection:
                 f'bytes come on {self._pattern}, but no protocol was recognized at '
                 f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.summary}', end)
 
-    def _recognize(self, port: SerialPort, deadline: float, stop: threading.Event) -> Recognition:
-        """Return the result of the recognition within 1 s after the first byte."""
-        data, opened, end, due = b'', self._read_clock(), math.inf, 0.0
-        while not stop.is_set():
-            data += port.read()
-            now = self._read_clock()
-            if not data and now - opened > _SILENCE_TIMEOUT:
-                self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), deadline)
-            if data and now >= due:
-                recognition = recognize_protocol(data, self._settings)
-                due, end = now + _ATTEMPT_INTERVAL, min(end, now + _LISTENING_DURATION)
-                if recognition.protocol is not None or now >= end:
-                    return recognition
-        return recognize_protocol(b'', self._settings)
-
     def _report_or_raise(self, problem: str, deadline: float) -> None:
         """Report a problem while the port stays open; raise `PortError` after a time."""
         now = self._read_clock()
         if now >= deadline:
             raise PortError(problem)
         if problem != self.state.problem:
-            self._set_failed(problem, deadline - now)
+            self._set_state('failed', problem, deadline - now)
 
     def _read(self, stop: threading.Event) -> Iterator[_Chunk]:
         """Open the port, listen if the protocol is unknown, and read until a loss of the port."""
@@ -337,7 +336,7 @@ class Connection:
                 self._samples, self._last_stamp = self._samples + len(samples), stamps[-1]
                 if self.state.name != 'reading':
                     self._reopen_delay = _ATTEMPT_INTERVAL
-                    self._set_state(ConnectionState('reading'))
+                    self._set_state('reading')
                 yield _Chunk(samples, stamps, now)
                 received, begin, counts = received + len(samples), now, []
                 continue
@@ -383,13 +382,10 @@ class Connection:
         return (f'nothing comes on {self._pattern} for {limit:g} s: check the power and the wires '
                 'of the gyro')
 
-    def _set_failed(self, problem: str, waiting: float) -> None:
-        self.last_error = problem
-        self._set_state(ConnectionState('failed', problem, waiting))
-
-    def _set_state(self, state: ConnectionState) -> None:
-        self.state = state
-        self._on_change(state)
+    def _set_state(self, name: str, problem: str = '', retry_delay: float = 0.0) -> None:
+        self.last_error = problem or self.last_error
+        self.state = ConnectionState(name, problem, retry_delay)
+        self._on_change(self.state)
 
     def _close(self) -> None:
         if self._port is not None:

@@ -34,6 +34,7 @@ import time
 
 from gyro_calibration.driver.protocols import Sample
 
+_STEADY_CLOCK_ID = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
 _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock drifts visibly
@@ -194,7 +195,6 @@ class _LatenessTest:
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
 
     def has_slowed(self, number: float, arrival: float, slope: float) -> bool:
-        """Tell whether the samples are late since their rate fell."""
         assert self.late_since is not None
         return (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
 
@@ -305,7 +305,7 @@ class SampleClock:
         if lateness < -0.5 * bound:
             excess = unit and unit * round(-lateness / (unit * period))
             if excess and excess <= self._uncertain_losses:
-                return self._renumber(self._uncertain_since, -excess)
+                return self._renumber(-excess)
             if not unit:  # a wrong time of the device: the apparent losses are cancelled
                 self.lost_count -= self._newly_lost
             if unit != 1:
@@ -318,11 +318,11 @@ class SampleClock:
             else:
                 assert self._lateness.late_since is not None
                 self._uncertain_since, self._lateness.late_since = self._lateness.late_since, None
-                return self._renumber(self._uncertain_since, lost)
+                return self._renumber(lost)
         return 0
 
-    def _renumber(self, since: float, offset: int) -> int:
-        self._line.shift(since, offset)
+    def _renumber(self, offset: int) -> int:
+        self._line.shift(self._uncertain_since, offset)
         self.lost_count += offset
         self._uncertain_losses += offset
         return offset
@@ -336,9 +336,6 @@ class SampleClock:
 def read_steady_clock() -> float:
     """Return seconds of the steady clock, including suspension of the host if supported."""
     return time.clock_gettime(_STEADY_CLOCK_ID)
-
-
-_STEADY_CLOCK_ID = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 
 def read_clock_pair(steady_clock: Callable[[], float],

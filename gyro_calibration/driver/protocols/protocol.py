@@ -204,11 +204,9 @@ class Protocol:
         return encode
 
     def nominal_rate(self, settings: Settings) -> float:
-        """Return the samples per second, as set or of the format."""
         return settings.sample_rate or self.rate
 
     def sends_angles(self, settings: Settings) -> bool:
-        """Return whether the device sends angles since its last sample, as set or by default."""
         return self.increments if settings.increments is None else settings.increments
 
     def sample_rate_warning(self, settings: Settings, period: float) -> str:
@@ -264,7 +262,6 @@ class Decoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Return the number of bytes outside of frames."""
         return self._splitter.discarded_bytes + self._refused_bytes
 
     def feed(self, data: bytes) -> list[Sample]:
