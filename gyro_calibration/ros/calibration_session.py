@@ -122,7 +122,6 @@ class CalibrationRun:
 
     @property
     def progress(self) -> float:
-        """Return the completed fraction, 0 to 1."""
         return min(self.elapsed / self.max_duration, 1.0)
 
     @property

@@ -17,7 +17,7 @@ It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import math
 import os
 from pathlib import Path
@@ -60,7 +60,6 @@ class _NodeClock:
         self._clock = node.get_clock()
 
     def simulated(self) -> float | None:
-        """Return the time of a simulation, s; None where there is none."""
         clock = self._clock
         if isinstance(clock, ROSClock) and clock.ros_time_is_active:
             return clock.now().nanoseconds / NSEC_PER_SEC
@@ -166,8 +165,6 @@ class CompensationNode(Node):
         if self._pending_answer:
             self._answer_finished_run()
 
-    # Publishers
-
     def _publish(self, imu: Imu, corrected: CorrectedSample) -> None:
         """Publish the received message with its z corrected, and the heading."""
         sec, nanosec = divmod(corrected.stamp, NSEC_PER_SEC)
@@ -209,7 +206,6 @@ class CompensationNode(Node):
             self._yaw_rate.publish(rate)
 
     def _publish_status(self) -> None:
-        """Publish the latched state of the calibration."""
         store, run = self._pipeline.store, self._pipeline.session.run
         calibration = store.model.self_calibration
         values: dict[str, object] = {
@@ -228,7 +224,6 @@ class CompensationNode(Node):
         self._status.publish(status_array(self, 'calibration', (level, message, values)))
 
     def _poll_graph(self) -> None:
-        """Poll publishers, receivers, clocks and the level of the report."""
         self._pipeline.update_publishers(self._publishers_on(self._samples.topic_name))
         outputs = (each.topic_name for each in (self._imu, self._heading, self._yaw_rate))
         self._pipeline.output_conflict = next((
@@ -440,47 +435,42 @@ class CompensationReport:
         if silent > 1.0:
             why = journal.event if 'refused_samples' in growing else 'is the driver running?'
             return ERROR, f'no samples on imu/data_raw for {silent:.0f} s: {why}'
-        for warning in filter(None, self._warnings(growing)):
-            return WARN, warning
-        tracked = pipeline.estimator.tracker.slowest_detectable_rate > 0.0
-        return OK, 'the heading is published' + (
-            '' if tracked else '; the bias is not estimated at rest')
 
-    def _warnings(self, growing: set[str]) -> Iterator[str]:
-        """Give the warnings, the most important first; some are ''."""
-        pipeline, event = self._pipeline, self._pipeline.journal.event
+        # the warnings, the most important first
         estimator, store, monitor = pipeline.estimator, pipeline.store, pipeline.monitor
         low, high = estimator.model.valid_temperatures
-        for name, text in {
-                'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
-                'refused_temperatures': event,
-                'lost_samples': 'samples are lost: check the cable, the baud rate and the load of '
-                'the computer; the heading is integrated over the gaps, and its variance includes '
-                'them',
-                'beyond_range': 'the rate is beyond the calibrated range; the correction is '
-                'extrapolated',
-                'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
-                f'{high:g} degC; the correction is extrapolated, and its variance increases',
-        }.items():
-            if name in growing:
-                yield text
+        warnings = [text for name, text in {
+            'restarts': journal.event, 'repeated_stamps': journal.event,
+            'refused_samples': journal.event, 'refused_temperatures': journal.event,
+            'lost_samples': 'samples are lost: check the cable, the baud rate and the load of the '
+            'computer; the heading is integrated over the gaps, and its variance includes them',
+            'beyond_range': 'the rate is beyond the calibrated range; the correction is '
+            'extrapolated',
+            'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
+            f'{high:g} degC; the correction is extrapolated, and its variance increases',
+        }.items() if name in growing]
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
-            yield ('no temperature comes; the model is used at its reference temperature of '
-                   f'{estimator.model.reference_temperature:g} degC')
+            warnings.append('no temperature comes; the model is used at its reference temperature '
+                            f'of {estimator.model.reference_temperature:g} degC')
         elif estimator.temperature is not None and estimator.is_temperature_lost:
-            yield (f'the temperature is missing; {estimator.temperature:.1f} degC, the last one, '
-                   'is held, and the standard deviation of the bias increases')
-        for channel in ('supply', 'specific_force'):
-            if (estimator.current_model.uses_channel(channel)
-                    and channel not in pipeline.journal.channels):
-                yield (f'the model needs the {channel.replace("_", " ")}, which no message '
-                       'contains; that effect is left out')
-        yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-                    pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
-                    pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
-                    store.calibration_hint, store.shared_hint, monitor.bias_alarm,
-                    monitor.noise_alarm, estimator.calibration_message, estimator.bias_message,
-                    store.table_hint)
+            warnings.append(f'the temperature is missing; {estimator.temperature:.1f} degC, the '
+                            'last one, is held, and the standard deviation of the bias increases')
+        warnings += [f'the model needs the {channel.replace("_", " ")}, which no message '
+                     'contains; that effect is left out'
+                     for channel in ('supply', 'specific_force')
+                     if estimator.current_model.uses_channel(channel)
+                     and channel not in journal.channels]
+        warnings += filter(None, (
+            pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
+            pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
+            pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
+            store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
+            estimator.calibration_message, estimator.bias_message, store.table_hint))
+        if warnings:
+            return WARN, warnings[0]
+        tracked = estimator.tracker.slowest_detectable_rate > 0.0
+        return OK, 'the heading is published' + (
+            '' if tracked else '; the bias is not estimated at rest')
 
 
 def _stamp_ns(header: Any) -> int:

@@ -245,7 +245,7 @@ class HealthMonitor:
         return time - self._samples[0][0] >= REST_DURATION
 
     def examine_stretch(self, bias_variance: float, age: float,
-                        is_announced: bool = False) -> _RestResult | None:
+                        is_announced: bool) -> _RestResult | None:
         """Test the complete stretch as `examine_stretch` does, and start the next one."""
         time, output, rate = np.array(self._samples).T
         self.restart()

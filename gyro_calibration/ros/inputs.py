@@ -80,9 +80,8 @@ class NodeParameter:
 
 
 def parameter_values(table: Sequence[NodeParameter],
-                     given: Mapping[str, object] | None = None) -> SimpleNamespace:
+                     given: Mapping[str, object]) -> SimpleNamespace:
     """Return the values of a table by attribute: checked given values, else defaults."""
-    given = given or {}
     return SimpleNamespace(**{each.attribute: each.check(given[each.name]) if each.name in given
                               else each.default for each in table})
 

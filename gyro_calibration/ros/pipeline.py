@@ -547,19 +547,6 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._trusted_heading = tracker.heading, tracker.variance
 
-    def _detect_interleaving(self, stamp: int) -> None:
-        """Count samples that follow too soon to be of the same publisher."""
-        # A restarted driver that sends twice as fast as before is refused while the middleware
-        # lists the killed one. Delayed samples also follow too soon, until they have caught up.
-        usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
-        interval, behind = stamp - self._last_stamp, self._backlog
-        begins = self._clock.steady() - self._last_arrival > FAULT_DURATION
-        self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
-                                               NSEC_PER_SEC * FAULT_DURATION)
-        self._interleaved_count += not (2.0 * interval > usual or behind)
-        if self._interleaved_count > 1:
-            self._refuse_all(self.publisher_conflict)
-
     def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
