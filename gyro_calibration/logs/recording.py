@@ -185,9 +185,23 @@ class _LogBuilder:
         self._notes = [f'ROS 2 recording {name}']
 
     def build(self, rate: float | None) -> Log:
-        wanted = self._topics.gyro
-        gyro = self._topic_series(
-            self._find_topic(wanted, 'gyro') if wanted else self._find_only_imu())
+        found = [topic for topic in self._topics_of_type({cdr.IMU})
+                 if not _is_same_topic(topic, self._topics.reference)]
+        if self._topics.gyro:
+            found = [self._find_topic(self._topics.gyro, 'gyro')]
+        elif len(found) > 1:
+            raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
+        elif not found:
+            reasons = ''.join(f' ({note})' for note in self._contents.notes)
+            others = self._topics_of_type({
+                kind for kind, definition in self._contents.definitions.items()
+                if kind not in _REFERENCE_TYPES
+                and 'rate' in cdr.parse_layout(definition).quantities})
+            remedy = (f'select {_join_names(others, "or")} with --topic' if others
+                      else 'record the topic of the gyro')
+            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; '
+                           f'{remedy}')
+        gyro = self._topic_series(found[0])
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.topic} declares that it reports no angular velocity; name '
                            'another by --topic')
@@ -236,21 +250,6 @@ class _LogBuilder:
                                                   output)
         return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
                    notes=(*self._notes, *self._contents.notes))
-
-    def _find_only_imu(self) -> str:
-        found = [topic for topic in self._topics_of_type({cdr.IMU})
-                 if not _is_same_topic(topic, self._topics.reference)]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
-        reasons = ''.join(f' ({note})' for note in self._contents.notes)
-        others = self._topics_of_type({
-            kind for kind, definition in self._contents.definitions.items()
-            if kind not in _REFERENCE_TYPES and 'rate' in cdr.parse_layout(definition).quantities})
-        remedy = (f'select {_join_names(others, "or")} with --topic' if others
-                  else 'record the topic of the gyro')
-        raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; {remedy}')
 
     def _find_topic(self, wanted: str, role: str) -> str:
         topic = next((topic for topic in self._contents.topics if _is_same_topic(topic, wanted)),

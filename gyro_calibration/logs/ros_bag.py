@@ -20,12 +20,13 @@ size. Existing libraries have no such limits and refuse truncated files: rosbags
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, ExitStack, suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
 import importlib
 import io
+from itertools import repeat
 import os
 from pathlib import Path
 import re
@@ -135,7 +136,13 @@ def read_messages(path: str | Path, contents: Contents,
     for file in list_recording_files(path):
         read = _read_mcap if _recording_suffix(file) == '.mcap' else _read_database
         try:
-            with _open_uncompressed(file) as source:
+            with ExitStack() as stack:
+                source, packed = file, stack.enter_context(open_regular_file(file))
+                if file.suffix == '.zstd':  # a temporary decompressed copy is read
+                    source = Path(stack.enter_context(tempfile.TemporaryDirectory(
+                        prefix='gyro_calibration_'))) / file.stem
+                    with open(source, 'wb') as copy:
+                        copy.writelines(_decompress('zstd', packed, ExpansionBudget(file)))
                 yield from read(source, file, contents, on_place)
             done += file.stat().st_size
         except LogError as error:
@@ -152,20 +159,6 @@ def read_messages(path: str | Path, contents: Contents,
 def _recording_suffix(path: Path) -> str | None:
     name = path.name.removesuffix('.zstd')
     return next((kind for kind in ('.mcap', '.db3') if name.endswith(kind)), None)
-
-
-@contextmanager
-def _open_uncompressed(path: Path) -> Iterator[Path]:
-    """Give the path of a file, or of a temporary decompressed copy."""
-    with open_regular_file(path) as packed:
-        if path.suffix != '.zstd':
-            yield path
-            return
-        with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
-            source = Path(folder) / path.stem
-            with open(source, 'wb') as file:
-                file.writelines(_decompress('zstd', packed, ExpansionBudget(path)))
-            yield source
 
 
 def _decompress(compression: str, packed: BinaryIO, budget: ExpansionBudget) -> Iterator[bytes]:
@@ -491,22 +484,40 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
         for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
+            file = source
+            if mode == 'copy':
+                file, mode = Path(shutil.copy(source, folder)), 'mode=ro'
+                with open(file, 'r+b') as copy:
+                    head = copy.read(100)
+                    if len(head) == 100:
+                        size = int.from_bytes(head[16:18], 'big')
+                        size = 1 << 16 if size == 1 else max(size, 1)
+                        copy.seek(28)
+                        copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
             try:
-                file = source
-                if mode == 'copy':
-                    file = Path(shutil.copy(source, folder))
-                    with open(file, 'r+b') as copy:
-                        head = copy.read(100)
-                        if len(head) == 100:
-                            size = int.from_bytes(head[16:18], 'big')
-                            size = 1 << 16 if size == 1 else max(size, 1)
-                            copy.seek(28)
-                            copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
-                database, tables = _connect(file, mode.replace('copy', 'mode=ro'))
+                database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
             with closing(database):
+                try:
+                    database.text_factory = partial(str, encoding='utf-8', errors='replace')
+                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
+                    # SQLite. A query is ended after a million steps plus ten per byte.
+                    thousands = repeat(0, file.stat().st_size // 100 + 1000)
+                    database.set_progress_handler(partial(next, thousands, 1), 1000)
+                    if sys.version_info >= (3, 11):
+                        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
+                    database.execute('PRAGMA trusted_schema = OFF')
+                    tables = {name for name, text in database.execute(
+                        "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+                        if name in ('topics', 'messages', 'message_definitions')
+                        and str(text).upper().startswith('CREATE TABLE')
+                        and not any(hidden for *_, hidden in database.execute(
+                            f'PRAGMA table_xinfo({name})'))}
+                except _DATABASE_ERRORS as error:
+                    reason = error
+                    continue
                 if not {'topics', 'messages'} <= tables:
                     raise LogError('is a database, but not a ROS 2 recording with tables of '
                                    'stored columns; name a recording')
@@ -518,25 +529,3 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
 
 def _describe_database_error(error: Exception | None) -> str:
     return _to_short_line(str(error) or 'it needs more memory than the limit')
-
-
-def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
-    database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
-    try:
-        database.text_factory = partial(str, encoding='utf-8', errors='replace')
-        # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite. A query
-        # is ended after a million steps plus ten per byte.
-        thousands = iter(range(file.stat().st_size // 100 + 1000))
-        database.set_progress_handler(lambda: next(thousands, None) is None, 1000)
-        if sys.version_info >= (3, 11):
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
-        database.execute('PRAGMA trusted_schema = OFF')
-        tables = {name for name, text in database.execute(
-            "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-            if name in ('topics', 'messages', 'message_definitions')
-            and str(text).upper().startswith('CREATE TABLE')
-            and not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
-        return database, tables
-    except BaseException:
-        database.close()
-        raise
