@@ -45,8 +45,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # for example from a shell variable that is not set
             if value == '' or isinstance(value, list) and '' in value:
                 raise InputError(f'{name.replace("_", "-")} is empty; give a value or omit it')
+        # Only the command line names Python files to be run; models and logs cannot.
         for path in given.catalogue:
-            _load_effects(path)
+            spec = spec_from_file_location('effects_of_the_user', path)
+            if spec is None or spec.loader is None or not Path(path).is_file():
+                raise InputError(f'{path} is not a Python file; wanted one, .py, with a list '
+                                 'EFFECTS')
+            module = module_from_spec(spec)
+            try:
+                spec.loader.exec_module(module)
+                add_effects(module.EFFECTS)
+                register_causes(module.EFFECTS)
+            except Exception as error:
+                raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
+                                 f'{error}); wanted EFFECTS, a list of '
+                                 'gyro_calibration.model.effects.Effect') from None
         answer = given.run(given)
         text = (None if answer is None else answer.text if not given.json
                 else format_json(answer.data))
@@ -74,23 +87,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:  # such as of `head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
-
-
-def _load_effects(path: str) -> None:
-    """Run a Python file and add the effects of its list EFFECTS to the catalogue."""
-    # Only the command line names such a file; models and logs cannot.
-    spec = spec_from_file_location('effects_of_the_user', path)
-    if spec is None or spec.loader is None or not Path(path).is_file():
-        raise InputError(f'{path} is not a Python file; wanted one, .py, with a list EFFECTS')
-    module = module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-        add_effects(module.EFFECTS)
-        register_causes(module.EFFECTS)
-    except Exception as error:
-        raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
-                         f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'
-                         'Effect') from None
 
 
 class _Parser(argparse.ArgumentParser):
