@@ -348,8 +348,7 @@ class Connection:
             # shows the period.
             deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)
             if now >= min(begin + 0.5 * timeout * (len(counts) + 1), deadline):
-                counts.append(
-                    (self._read_bytes, decoder.device_faults, decoder.refused_samples))
+                counts.append((self._read_bytes, decoder.device_faults, decoder.refused_samples))
                 if len(counts) > 1:
                     problem = self._explain_silence(counts[-2], counts[-1], timeout)
                     self._report_or_raise(problem, deadline)

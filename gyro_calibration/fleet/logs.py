@@ -41,8 +41,7 @@ from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns, fit_noise_grid, heading_noise)
 from gyro_calibration.calibration.selection import SelectedEffects
-from gyro_calibration.diagnosis.gates import (
-    is_at_rest, refuse_mismatch, refuse_unusable)
+from gyro_calibration.diagnosis.gates import is_at_rest, refuse_mismatch, refuse_unusable
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
@@ -462,8 +461,7 @@ def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
     return {'value': float(value), 'deviation': float(deviation), 'unit': unit}
 
 
-def _calibrate_log(log: Log,
-                   technology: str) -> tuple[str, GyroModel, tuple[float, float] | None]:
+def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[float, float] | None]:
     """
     Return the method of calibration of a log, its model, and the time offset of its reference.
 

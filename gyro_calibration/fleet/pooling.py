@@ -57,7 +57,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtr
 from scipy.stats import qmc
 
-IntegerArray = NDArray[np.intp]
+_IntegerArray = NDArray[np.intp]
 #: The estimated standard deviations, and the share of the stated variance that is independent
 #: between logs.
 UNITS, DRIVES, POWER_ONS, OWN_SHARE = 'units', 'drives', 'power_ons', 'own_share'
@@ -72,8 +72,8 @@ class Observations:
 
     value: Array
     deviation: Array  # standard deviation that the log states, in the unit of the value
-    unit: IntegerArray  # number of the unit of each log, from 0 on
-    drive: IntegerArray  # number of the drive, from 0 on, or -1 where a log stands alone
+    unit: _IntegerArray  # number of the unit of each log, from 0 on
+    drive: _IntegerArray  # number of the drive, from 0 on, or -1 where a log stands alone
     #: Fixed effects in addition to the mean, such as age, shape (n, k).
     columns: Array = field(default_factory=lambda: np.empty((0, 0)))
     slope_count: int = 0  # of the first columns whose effect may differ from unit to unit, up to 2
@@ -95,7 +95,7 @@ class Interval:
     deviation: Any = math.nan
 
 
-def _sum_matrix(place: IntegerArray, terms: Array, size: int) -> Any:
+def _sum_matrix(place: _IntegerArray, terms: Array, size: int) -> Any:
     """Return the matrix that sums weights of logs times terms, shape (logs, ...), into places."""
     count = terms[0].size
     logs = np.repeat(np.arange(len(terms)), count)
@@ -179,7 +179,7 @@ class _Solution:
             np.log(variance).sum(axis=1) + np.linalg.slogdet(within)[1].sum(axis=1)
             + diagonal[:, -1] ** 2) - np.log(diagonal[:, :-1]).sum(axis=1)
 
-    def moments(self, fixed: Array, unit: IntegerArray, drive: IntegerArray,
+    def moments(self, fixed: Array, unit: _IntegerArray, drive: _IntegerArray,
                 weights: Array) -> tuple[Array, Array]:
         """Return means and variances of linear functions, shape (points, k)."""
         columns = np.zeros((len(self._tau), len(unit), self._equations.columns - 1))
@@ -355,7 +355,7 @@ class PooledValue:
 
     # estimates
 
-    def _moments(self, unit: IntegerArray | None = None, drive: IntegerArray | None = None,
+    def _moments(self, unit: _IntegerArray | None = None, drive: _IntegerArray | None = None,
                  fixed: Array | None = None, part: int = 0, error: Array | float = 0.0,
                  **more: float) -> tuple[Array, Array]:
         """Return means and variances at each point, shape (points, k), in units of the values."""
@@ -440,7 +440,7 @@ def _log_prior(observed: Observations, variances: Mapping[str, Array]) -> Array:
             size = variances[name][:, None] if name != POWER_ONS else 0.0
             found = found + 0.5 * np.log(np.sum((size + mean) ** -2.0, axis=1))
 
-    def sums(group: IntegerArray, weights: Array) -> Array:
+    def sums(group: _IntegerArray, weights: Array) -> Array:
         matrix = _sum_matrix(np.maximum(group, 0), (group >= 0).astype(float), group.max() + 1)
         return np.asarray((matrix @ weights.T).T)
 
@@ -493,7 +493,7 @@ def find_outlying_groups(pooled: PooledValue, kind: str, names: Sequence[str],
     return found[:last]
 
 
-def find_changes(pooled: PooledValue, date: IntegerArray, units: Sequence[str],
+def find_changes(pooled: PooledValue, date: _IntegerArray, units: Sequence[str],
                  dates: Sequence[str], significance: float) -> list[Alarm]:
     """
     Return the most significant change of a unit between dates, beyond the scatter of power-ons.

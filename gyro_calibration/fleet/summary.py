@@ -84,7 +84,7 @@ class _ValueSummary:
 
 
 @dataclass(frozen=True)
-class TypeSummary:
+class _TypeSummary:
     """The results of one type."""
 
     name: str  # or ''
@@ -96,7 +96,7 @@ class TypeSummary:
     significance: float  # probability of a false alarm of each kind and value
 
 
-def summarize_types(records: Sequence[_LogRecord]) -> list[TypeSummary]:
+def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
     """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
@@ -117,8 +117,8 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[TypeSummary]:
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
         units, drives, dates = (_names(logs[kind], key) for key in ('unit', 'drive', 'date'))
-        summaries.append(TypeSummary(kind, units, drives, dates, logs[kind], found,
-                                     FALSE_ALARM_RATE / tests))
+        summaries.append(_TypeSummary(kind, units, drives, dates, logs[kind], found,
+                                      FALSE_ALARM_RATE / tests))
     return summaries
 
 
@@ -184,7 +184,7 @@ def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
             for name, *parts in zip(names, *vars(found).values())}
 
 
-def describe_type(summary: TypeSummary) -> Iterator[str]:
+def describe_type(summary: _TypeSummary) -> Iterator[str]:
     """Give the sentences on the origin of each value, its outliers and its changes."""
     meanings = {UNITS: 'is an error of the unit: most of its variance is between units',
                 DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
@@ -227,7 +227,7 @@ def describe_type(summary: TypeSummary) -> Iterator[str]:
                f'of {count.units} of {len(summary.units)} units: {origin[count.owner]}')
 
 
-def find_missing_effects(summary: TypeSummary) -> list[_ValueSummary]:
+def find_missing_effects(summary: _TypeSummary) -> list[_ValueSummary]:
     """Return the slow effects that repeat in all units, the most significant first."""
     slow = [each for each in summary.values.values()
             if each.is_slow and each.p_value < summary.significance]
@@ -247,7 +247,7 @@ class _EffectCount:
     chance: float  # p-value of the number of logs under false alarms only, times the candidates
 
 
-def count_effects(summary: TypeSummary) -> list[_EffectCount]:
+def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
     """
     Assign the established effects of diagnoses by the numbers of logs that show them.
 
@@ -287,7 +287,7 @@ def count_effects(summary: TypeSummary) -> list[_EffectCount]:
     return result
 
 
-def data(summary: TypeSummary) -> dict[str, Any]:
+def data(summary: _TypeSummary) -> dict[str, Any]:
     values = {}
     for value in summary.values.values():
         keys = {UNITS: 'between_units', POWER_ONS: 'between_power_ons', DRIVES: 'between_drives',
@@ -323,7 +323,7 @@ def _interval_data(interval: Interval) -> dict[str, Any]:
             'ci95': ends if all(map(math.isfinite, ends)) else None}
 
 
-def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
+def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     """
     Give for a further unit of a type, with the name '', and for each unit: name and model.
 
@@ -364,7 +364,7 @@ _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 're
             'samples', 'duration_s', 'sha256', 'page')
 
 
-def render_fleet_page(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
+def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
@@ -397,7 +397,7 @@ def render_fleet_page(types: Sequence[TypeSummary], records: Sequence[Mapping[st
     return render_page(f'Fleet: {title}', body)
 
 
-def _type_sections(summary: TypeSummary, key: str) -> Iterator[Markup]:
+def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
     name, of_type = summary.name or 'Type not stated', summary.values.values()
     per, drifts = {'age': '/year', 'temperature': '/K'}, any(each.slopes for each in of_type)
     heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
@@ -480,7 +480,7 @@ def _interval_chart(value: _ValueSummary, key: str, kind: str, intervals: Mappin
                  lines, x_names=list(intervals))
 
 
-def table_files(types: Sequence[TypeSummary],
+def table_files(types: Sequence[_TypeSummary],
                 records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """Return the content of files by name: values of logs, and of units, one row each, in SI."""
     found, log_rows, unit_rows = {}, [], []

@@ -268,8 +268,7 @@ class HealthMonitor:
         elif is_announced or several and not any(each.is_noise_normal for each in last):
             remedy = ('record a log at rest, and run allan or diagnose on it'
                       if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = ('' if is_announced or rest.noise_ratio < 1.0
-                      else ', or the robot vibrates')
+            shaken = '' if is_announced or rest.noise_ratio < 1.0 else ', or the robot vibrates'
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
                                 f'model{shaken}: {remedy}')
         if rest.is_bias_normal:

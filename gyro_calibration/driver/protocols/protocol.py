@@ -104,10 +104,10 @@ def to_signed_count(value: float, bits: int = 16) -> int:
 
 
 #: Parses a frame to a reading, or None if it is not valid; may use earlier frames.
-ParseFrame = Callable[[bytes], 'Reading | None']
+_ParseFrame = Callable[[bytes], 'Reading | None']
 #: Makes the bytes that an emulated device sends of a value, in its unit, and the further values
 #: of a sample; may use earlier samples. The sequence counts from 0 and never wraps.
-WriteFrame = Callable[[float, Sample], bytes]
+_WriteFrame = Callable[[float, Sample], bytes]
 
 
 def stateless(convert: Callable[..., _OutputT]) -> Callable[[Settings], Callable[..., _OutputT]]:
@@ -158,8 +158,8 @@ class Protocol:
     #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    parser: Callable[[Settings], ParseFrame]  # makes that of one connection
-    writer: Callable[[Settings], WriteFrame]  # makes that of one device
+    parser: Callable[[Settings], _ParseFrame]  # makes that of one connection
+    writer: Callable[[Settings], _WriteFrame]  # makes that of one device
     invert: bool = False  # whether the device counts clockwise turns positive
     full_scale: float = math.radians(2000.0)  # rad/s
     largest_count: int | None = None  # times the sensitivity it is the full scale
