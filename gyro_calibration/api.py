@@ -63,7 +63,7 @@ __all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_l
            'self_calibrate', 'simulate', 'track', 'write_log', 'write_model']
 
 #: A motion by its name or file, as (time, rate) in s and rad/s, or as the reference of a log.
-MotionLike = str | Path | tuple[Any, Any] | Log | Motion
+_MotionLike = str | Path | tuple[Any, Any] | Log | Motion
 
 
 def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
@@ -112,7 +112,7 @@ def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
             else model_file.read_model(source))
 
 
-def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: float = 100.0,
+def simulate(model: GyroModel, motion: _MotionLike = 'robot', *, sample_rate: float = 100.0,
              seed: int | None = None, temperature: Any = None) -> Log:
     """
     Return the log of a simulated gyro, with the true rate and heading as reference.
@@ -227,7 +227,7 @@ class Run(PrintedResult):
         return self._run.draw(path)
 
 
-def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel | None = None, *,
+def self_calibrate(log: Log, motion: _MotionLike | None = None, model: GyroModel | None = None, *,
                    method: str = 'likelihood') -> Run:
     """
     Find scale factor error and bias in about 20 s of known motion.
@@ -368,7 +368,7 @@ def _require_time(log: Log) -> tuple[Array, Array]:
     return log.time, log.output
 
 
-def _to_motion(motion: MotionLike) -> tuple[Motion, float]:
+def _to_motion(motion: _MotionLike) -> tuple[Motion, float]:
     """Return a motion, and the time of its beginning in a log, s."""
     if isinstance(motion, Motion):
         return motion, 0.0

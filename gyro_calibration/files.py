@@ -90,7 +90,6 @@ def describe_error(error: Exception) -> str:
 
 
 def remedy(error: OSError, path: str | Path) -> str:
-    """Return the remedy for a file that cannot be read or written."""
     words = _REMEDIES.get(error.errno or 0, 'make {path} readable and writable, or name another')
     return to_printable(words.format(path=path, folder=Path(path).parent))
 
@@ -103,8 +102,13 @@ def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.Buffere
     try:
         mode = os.fstat(handle).st_mode
         _require_regular_file(path, mode, allow_pipes)
-        if stat.S_ISFIFO(mode) and not _has_writer(handle):
-            raise OSError(errno.EINVAL, 'it is a pipe without a writer', str(path))
+        if stat.S_ISFIFO(mode):
+            waiting = select.poll()
+            waiting.register(handle, select.POLLIN)
+            if not waiting.poll(_PIPE_TIMEOUT_MS):
+                with suppress(BlockingIOError):  # of a writer that has not written yet
+                    os.read(handle, 1)
+                    raise OSError(errno.EINVAL, 'it is a pipe without a writer', str(path))
         os.set_blocking(handle, True)
         return open(handle, 'rb')
     except BaseException:
@@ -128,19 +132,6 @@ def _require_regular_file(path: str | Path, mode: int, allow_pipes: bool = False
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
         wanted = 'a file or a pipe' if allow_pipes else 'a file'
         raise OSError(number, f'it is {kind}, where {wanted} is wanted', str(path))
-
-
-def _has_writer(handle: int) -> bool:
-    """Tell whether a pipe has a writer, or gets one within the timeout."""
-    waiting = select.poll()
-    waiting.register(handle, select.POLLIN)
-    if waiting.poll(_PIPE_TIMEOUT_MS):
-        return True
-    try:
-        os.read(handle, 1)
-    except BlockingIOError:  # there is a writer that has not written yet
-        return True
-    return False
 
 
 def read_bytes(path: str | Path, max_size: int) -> bytes:
@@ -185,7 +176,16 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
         remove_leftovers(path)
         # A replacement is readable by its owner alone until it gets the mode of the old file; a
         # new file gets the mode that the umask allows.
-        handle, temporary = _create_temporary(path, 0o644 if old is None else 0o600)
+        mode = 0o644 if old is None else 0o600
+        while True:
+            temporary = str(path.parent / f'{_temporary_prefix(path)}{secrets.token_hex(4)}')
+            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+            with suppress(OSError):  # without locks, leftovers of killed writers may remain
+                # locked until it is closed or the process ends
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.fstat(handle).st_nlink:
+                break
+            os.close(handle)  # another writer removed it as a leftover before it was locked
         try:
             with os.fdopen(handle, 'wb') as file:
                 yield file
@@ -234,18 +234,6 @@ def keep_aside(path: Path) -> str:
         number += 1
     path.rename(other)
     return to_printable(f'what was in {path} is now in {other}')
-
-
-def _create_temporary(path: Path, mode: int) -> tuple[int, str]:
-    while True:
-        temporary = str(path.parent / f'{_temporary_prefix(path)}{secrets.token_hex(4)}')
-        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-        with suppress(OSError):  # without locks, leftovers of killed writers may remain
-            # locked until it is closed or the process ends
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.fstat(handle).st_nlink:
-            return handle, temporary
-        os.close(handle)  # another writer removed it as a leftover before it was locked
 
 
 def _temporary_prefix(path: Path) -> str:

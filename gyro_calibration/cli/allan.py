@@ -25,7 +25,7 @@ from typing import Any
 
 from gyro_calibration.allan.deviation import (
     allan_deviation, AllanChart, build_rest_record, RestRecord)
-from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
+from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
@@ -68,8 +68,25 @@ def run(given: argparse.Namespace) -> Answer:
         found.plot(given.picture)
     if given.out:
         write_model(given.out, found.put_into(verb.add_origin(given, model)))
-    return Answer([str(found)], {**_data(found), 'picture': given.picture, 'out': given.out},
-                  (given.picture, given.out))
+    record, chart, fit = found.record, found.chart, found.fit
+    figures = {figure.term.name: {'symbol': symbol, 'unit': figure.term.unit,
+                                  'value': figure.value, 'lower': figure.lower,
+                                  'upper': figure.upper, 'seen': bool(figure.value),
+                                  'standard_deviation': figure.standard_deviation}
+               for symbol, figure in fit.figures.items()}
+    columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower,
+               'upper': chart.upper, 'degrees_of_freedom': chart.degrees_of_freedom,
+               'differences': chart.difference_count, 'fit': fit.deviation(chart.time)}
+    return Answer([str(found)], {
+        'samples': len(record.rate), 'interval_s': record.interval,
+        'remarks': list(record.remarks), **figures,
+        'floor': {**chart.floor, 'reached': fit.is_floor_reached},
+        'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
+        'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
+        else {'standard_deviation': fit.process.standard_deviation,
+              'correlation_time_s': fit.process.correlation_time},
+        'chart': {name: values.tolist() for name, values in columns.items()},
+        'picture': given.picture, 'out': given.out}, (given.picture, given.out))
 
 
 @dataclass(frozen=True)
@@ -89,11 +106,34 @@ class NoiseFigures(PrintedResult):
         if not fit.is_floor_reached:
             floor_line += (' The deviation still falls at the end of the chart; record longer to '
                            'reach its minimum.')
-        return '\n'.join([
-            f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
-            f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks, floor_line,
-            *(_figure_line(symbol, figure) for symbol, figure in fit.figures.items()),
-            _fit_line(fit)])
+        lines = [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
+                 f'{len(record.rate) * record.interval:.5g} s at rest.',
+                 *record.remarks, floor_line]
+        for symbol, figure in fit.figures.items():
+            unit, factor = _DISPLAY_UNITS[symbol]
+            value, low, high = (each * factor for each in (
+                figure.value, figure.lower, figure.upper))
+            text = (f'{value:.4g} {unit}, 95 %: {low:.4g} to {high:.4g} ({figure.value:.4g} '
+                    f'{figure.term.unit}, {figure.lower:.4g} to {figure.upper:.4g})'
+                    if figure.value else f'not seen; below {high:.3g} {unit} '
+                    f'({figure.upper:.3g} {figure.term.unit})')
+            lines.append(f'{readable_name(figure.term.name).capitalize()} {symbol}: {text}.')
+        text = (f'The figures describe averaging times from {fit.min_time:.3g} to '
+                f'{fit.max_time:.4g} s')
+        if fit.min_time > fit.chart.time[0]:
+            text += '; shorter ones are affected by filters or interference in the gyro'
+        if fit.misfit:
+            text += (f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation '
+                     'unexplained, which the intervals include')
+        if fit.alternatives:
+            others = ' or '.join(' + '.join(each) for each in fit.alternatives)
+            text += f'; {others} fit nearly as well, and a longer record would distinguish them'
+        if fit.process:
+            size = fit.process.standard_deviation * _DISPLAY_UNITS['B'][1]
+            text += (f'; a Gauss-Markov process of {size:.3g} deg/h with a correlation time of '
+                     f'{fit.process.correlation_time:.3g} s describes them better than B and K, '
+                     'which approximate it and may be zero')
+        return '\n'.join([*lines, f'{text}.'])
 
     def put_into(self, model: GyroModel) -> GyroModel:
         """Return a model with these figures as its noise."""
@@ -112,52 +152,3 @@ def find_noise_figures(log: Log) -> NoiseFigures:
                                log.reference_heading)
     return NoiseFigures(record, allan_deviation(record.rate, record.interval),
                         fit_noise(record.rate, record.interval))
-
-
-def _figure_line(symbol: str, figure: NoiseFigure) -> str:
-    unit, factor = _DISPLAY_UNITS[symbol]
-    name = f'{readable_name(figure.term.name).capitalize()} {symbol}'
-    if not figure.value:
-        return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
-                f'({figure.upper:.3g} {figure.term.unit}).')
-    return (f'{name}: {figure.value * factor:.4g} {unit}, '
-            f'95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
-            f'({figure.value:.4g} {figure.term.unit}, {figure.lower:.4g} to {figure.upper:.4g}).')
-
-
-def _fit_line(fit: NoiseFit) -> str:
-    text = f'The figures describe averaging times from {fit.min_time:.3g} to {fit.max_time:.4g} s'
-    if fit.min_time > fit.chart.time[0]:
-        text += '; shorter ones are affected by filters or interference in the gyro'
-    if fit.misfit:
-        text += (f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation '
-                 'unexplained, which the intervals include')
-    if fit.alternatives:
-        others = ' or '.join(' + '.join(each) for each in fit.alternatives)
-        text += f'; {others} fit nearly as well, and a longer record would distinguish them'
-    if fit.process:
-        text += ('; a Gauss-Markov process of '
-                 f'{fit.process.standard_deviation * _DISPLAY_UNITS["B"][1]:.3g} deg/h '
-                 f'with a correlation time of {fit.process.correlation_time:.3g} s describes them '
-                 'better than B and K, which approximate it and may be zero')
-    return f'{text}.'
-
-
-def _data(found: NoiseFigures) -> dict[str, Any]:
-    record, chart, fit = found.record, found.chart, found.fit
-    figures = {figure.term.name: {'symbol': symbol, 'unit': figure.term.unit,
-                                  'value': figure.value, 'lower': figure.lower,
-                                  'upper': figure.upper, 'seen': bool(figure.value),
-                                  'standard_deviation': figure.standard_deviation}
-               for symbol, figure in fit.figures.items()}
-    columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower,
-               'upper': chart.upper, 'degrees_of_freedom': chart.degrees_of_freedom,
-               'differences': chart.difference_count, 'fit': fit.deviation(chart.time)}
-    return {'samples': len(record.rate), 'interval_s': record.interval,
-            'remarks': list(record.remarks), **figures,
-            'floor': {**chart.floor, 'reached': fit.is_floor_reached},
-            'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
-            'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
-            else {'standard_deviation': fit.process.standard_deviation,
-                  'correlation_time_s': fit.process.correlation_time},
-            'chart': {name: values.tolist() for name, values in columns.items()}}

@@ -62,7 +62,49 @@ def run(given: argparse.Namespace) -> Answer:
         raise InputError('--rest and --hindsight need no --threshold and a model with an angle '
                          'random walk; run allan to add it to the model')
     write_log_blocks(given.out, _compensate_and_count(given, model, found))
-    return _answer(given, model, found)
+    data: dict[str, Any] = {'out': given.out, **found.counts,
+                            'lost_samples': found.intervals.lost_samples,
+                            'longest_gap_s': found.intervals.longest_gap,
+                            'temperature_known': 'temperature' not in found.unknown}
+    lines = [f'{data["rows"]} rows compensated by {given.model}, written to {given.out}.']
+    if found.heading is not None:
+        # The deviation is zero where the model has neither noise nor covariance.
+        deviation = found.deviation if found.deviation > 0.0 else None
+        data.update(heading_rad=found.heading, heading_std_rad=deviation)
+        known = '' if deviation is None else f' +- {deviation / DEGREE:.2f}'
+        lines.append(f'Heading at the end: {found.heading / DEGREE:.2f}{known} deg.')
+    if found.errors:
+        sums, counts, last = zip(*found.errors)
+        mean = sum(sums) / sum(counts)
+        data.update(mean_heading_error_rad=mean, last_heading_error_rad=last[-1])
+        lines.append(f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the '
+                     f'end {last[-1] / DEGREE:.3f} deg.')
+        lines.append('Both headings start at 0 at the first row with a reference. This error '
+                     'includes its mean and a delay of the reference; the heading errors that fit '
+                     'prints exclude both.')
+    lines += [words for quantity, words in _MISSING_INPUTS.items() if quantity in found.unknown
+              and model.uses_channel(quantity.removeprefix('reference_'))]
+    lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
+              if term.effect.not_compensated]
+    if MAX_GAP < (interval := found.intervals.usual_interval) < math.inf:
+        lines.append(f'The samples are {interval:g} s apart, and the heading is that of a rate '
+                     f'which is constant meanwhile; {_INTERVAL_REMEDY}.')
+    for name, words in (
+            ('rows_without_output',
+             'rows have no output of the gyro; the heading is integrated across them.'),
+            ('refused_samples', 'rows have an implausible rate or temperature and are not used; '
+             'they count as lost.'),
+            ('lost_samples', 'samples are lost; the heading is integrated over gaps of up to '
+             f'{MAX_GAP:g} s, not over longer ones, in which the robot may have turned to any '
+             'direction; its standard deviation includes both.'),
+            ('temperature_clipped',
+             'rows are outside the calibrated temperatures; the correction is extrapolated, and '
+             'the standard deviation increases.'),
+            ('beyond_range', 'rows are beyond the calibrated rates; the correction is '
+             'extrapolated, or held where the model has no rate for the output.')):
+        if data[name]:
+            lines.append(f'{data[name]} {words}')
+    return Answer(lines, data)
 
 
 #: Other inputs of effects: quantity of a log -> the sentence where the log lacks it.
@@ -211,7 +253,23 @@ def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> Compens
         raise DataRefused(f'{name}: the samples are {interval:g} s apart, and standstill '
                           f'detection needs at least one in {MAX_GAP:g} s; {_INTERVAL_REMEDY}')
     time, output = LogCompensation(model).true_time(np.asarray(rows.time)), np.asarray(rows.output)
-    estimator, start_date = _make_estimator(model, rows, hindsight)
+    # Where stamps are no dates, the age of a calibration is unknown and assumed to be 0; those
+    # beyond 1e9 are s since 1970.
+    begin, used, calibration = float(np.asarray(rows.time)[0]), model, model.self_calibration
+    has_dates = begin > 1e9
+    start_date = 0.0 if has_dates else 1e9  # of time 0
+    now = start_date + begin
+    if not has_dates and calibration is not None and calibration.temperature is None:
+        temperatures = (np.zeros(0) if rows.temperature is None
+                        else rows.temperature[np.isfinite(rows.temperature)])
+        if len(temperatures):
+            calibration = replace(calibration, temperature=float(temperatures[0]))
+            used = with_self_calibration(model, calibration)
+    estimator = HeadingEstimator(used, BiasTable(used), Assumptions(), TrackerSettings(), now,
+                                 hindsight)
+    if not has_dates and calibration is not None:
+        estimator.use_calibration(with_self_calibration(used, replace(
+            calibration, time=datetime.fromtimestamp(now, timezone.utc).isoformat())), now)
     # the state of the wheels
     moving = None if rows.moving is None else [bool(each) for each in rows.moving]
     found = estimator.follow(time, output, start_date, rows.temperature, moving,
@@ -226,72 +284,3 @@ def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> Compens
         'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
         'rate_std_rad_s': np.sqrt(rate_variance), 'resting': resting.astype(float),
         'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals)
-
-
-def _make_estimator(model: GyroModel, log: Log,
-                    keeps_history: bool) -> tuple[HeadingEstimator, float]:
-    """Return the estimator of the log, and the date of time 0, s since 1970."""
-    # Where stamps are no dates, the age of a calibration is unknown and assumed to be 0.
-    assert log.time is not None
-    # stamps beyond 1e9 are s since 1970
-    has_dates, calibration = log.time[0] > 1e9, model.self_calibration
-    start_date = 0.0 if has_dates else 1e9
-    now = start_date + float(log.time[0])
-    if not has_dates and calibration is not None and calibration.temperature is None:
-        known = (np.zeros(0) if log.temperature is None
-                 else log.temperature[np.isfinite(log.temperature)])
-        if len(known):
-            model = with_self_calibration(model, replace(calibration, temperature=float(known[0])))
-    estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), TrackerSettings(), now,
-                                 keeps_history)
-    if not has_dates and calibration is not None:
-        when = datetime.fromtimestamp(now, timezone.utc).isoformat()
-        estimator.use_calibration(with_self_calibration(model, replace(
-            model.self_calibration or calibration, time=when)), now)
-    return estimator, start_date
-
-
-def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:
-    data: dict[str, Any] = {'out': given.out, **found.counts,
-                            'lost_samples': found.intervals.lost_samples,
-                            'longest_gap_s': found.intervals.longest_gap,
-                            'temperature_known': 'temperature' not in found.unknown}
-    lines = [f'{data["rows"]} rows compensated by {given.model}, written to {given.out}.']
-    if found.heading is not None:
-        # The deviation is zero where the model has neither noise nor covariance.
-        deviation = found.deviation if found.deviation > 0.0 else None
-        data.update(heading_rad=found.heading, heading_std_rad=deviation)
-        known = '' if deviation is None else f' +- {deviation / DEGREE:.2f}'
-        lines.append(f'Heading at the end: {found.heading / DEGREE:.2f}{known} deg.')
-    if found.errors:
-        sums, counts, last = zip(*found.errors)
-        mean = sum(sums) / sum(counts)
-        data.update(mean_heading_error_rad=mean, last_heading_error_rad=last[-1])
-        lines.append(f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the '
-                     f'end {last[-1] / DEGREE:.3f} deg.')
-        lines.append('Both headings start at 0 at the first row with a reference. This error '
-                     'includes its mean and a delay of the reference; the heading errors that fit '
-                     'prints exclude both.')
-    lines += [words for quantity, words in _MISSING_INPUTS.items() if quantity in found.unknown
-              and model.uses_channel(quantity.removeprefix('reference_'))]
-    lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
-              if term.effect.not_compensated]
-    if MAX_GAP < (interval := found.intervals.usual_interval) < math.inf:
-        lines.append(f'The samples are {interval:g} s apart, and the heading is that of a rate '
-                     f'which is constant meanwhile; {_INTERVAL_REMEDY}.')
-    for name, words in (
-            ('rows_without_output',
-             'rows have no output of the gyro; the heading is integrated across them.'),
-            ('refused_samples', 'rows have an implausible rate or temperature and are not used; '
-             'they count as lost.'),
-            ('lost_samples', 'samples are lost; the heading is integrated over gaps of up to '
-             f'{MAX_GAP:g} s, not over longer ones, in which the robot may have turned to any '
-             'direction; its standard deviation includes both.'),
-            ('temperature_clipped',
-             'rows are outside the calibrated temperatures; the correction is extrapolated, and '
-             'the standard deviation increases.'),
-            ('beyond_range', 'rows are beyond the calibrated rates; the correction is '
-             'extrapolated, or held where the model has no rate for the output.')):
-        if data[name]:
-            lines.append(f'{data[name]} {words}')
-    return Answer(lines, data)

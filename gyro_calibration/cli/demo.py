@@ -73,11 +73,42 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
+    """
+    Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
+
+    The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
+    motion of the robot; driver and compensation run as processes of their own, as on a robot. The
+    compensation drives the calibration, then a drive follows.
+    """
     if _MISSING:
         raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); source ROS 2, or '
                          'install gyro_calibration[ros,plot]')
     verb.require_folder(given.out)
-    return _run_demo(Path(given.out), given.seed)
+    out = Path(given.out)
+    out.mkdir(parents=True, exist_ok=True)
+    calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
+                                          out.absolute() / 'gyro')
+    calibration_file.unlink(missing_ok=True)
+    # The graph is separate from the network of a robot and from other graphs on this machine, so
+    # it needs no permissions in a secured one.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                      ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
+    write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
+    robot = _SimulatedRobot(XV3500.model, simulate_noise(
+        XV3500.noise, 30000, XV3500.interval, np.random.default_rng(given.seed)))
+    with ExitStack() as stack:
+        stack.enter_context(Emulator(find_protocol(_PROTOCOL), robot.samples(), link=port,
+                                     wait_for_reader=True))
+        stack.enter_context(_node_process('driver_node', port=port, protocol=_PROTOCOL))
+        stack.enter_context(_node_process('compensation_node', model_file=model_file,
+                                          calibration_file=calibration_file,
+                                          **{'calibration.drive': True}))
+        rclpy.init()
+        stack.callback(rclpy.try_shutdown)
+        client = _DemoClient(robot)
+        stack.callback(client.close)
+        begin = _calibrate_and_drive(client)
+    return _evaluate(out, robot, client, begin, given.seed)
 
 
 class _CallRefused(OSError):
@@ -197,42 +228,6 @@ def _node_process(module: str, **parameters: object) -> Iterator[None]:
             process.wait()
 
 
-def _run_demo(out: Path, seed: int) -> Answer:
-    """
-    Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
-
-    The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
-    motion of the robot; driver and compensation run as processes of their own, as on a robot. The
-    compensation drives the calibration, then a drive follows.
-
-    Raise `OSError` where a node does not answer, or the folder cannot be written to.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
-                                          out.absolute() / 'gyro')
-    calibration_file.unlink(missing_ok=True)
-    # The graph is separate from the network of a robot and from other graphs on this machine, so
-    # it needs no permissions in a secured one.
-    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
-                      ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
-    write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
-    robot = _SimulatedRobot(XV3500.model, simulate_noise(
-        XV3500.noise, 30000, XV3500.interval, np.random.default_rng(seed)))
-    with ExitStack() as stack:
-        stack.enter_context(Emulator(find_protocol(_PROTOCOL), robot.samples(), link=port,
-                                     wait_for_reader=True))
-        stack.enter_context(_node_process('driver_node', port=port, protocol=_PROTOCOL))
-        stack.enter_context(_node_process('compensation_node', model_file=model_file,
-                                          calibration_file=calibration_file,
-                                          **{'calibration.drive': True}))
-        rclpy.init()
-        stack.callback(rclpy.try_shutdown)
-        client = _DemoClient(robot)
-        stack.callback(client.close)
-        begin = _calibrate_and_drive(client)
-    return _evaluate(out, robot, client, begin, seed)
-
-
 def _calibrate_and_drive(client: _DemoClient) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
     total = round(CALIBRATION_MOTION.duration + 4.0 + _DRIVE_MOTION.duration)
@@ -246,7 +241,16 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
                               'programs, and run the demo again')
             time.sleep(0.02)
         bar.set_description('calibrating on the motion profile')
-        _calibrate(client, bar)
+        for attempt in range(1, _MAX_ATTEMPTS + 1):
+            try:
+                client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
+                break
+            except _CallRefused as refusal:  # this robot turns late on a busy machine
+                if attempt == _MAX_ATTEMPTS:
+                    raise
+                bar.total += CALIBRATION_MOTION.duration + 4.0
+                bar.write(f'{refusal}; the run is repeated', file=sys.stderr)
+                _wait(bar, 2.0)  # until the robot stands
         client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
         begin, started = time.time(), time.monotonic()
@@ -256,20 +260,6 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
         client.command_rate(0.0)
         _wait(bar, 0.5)
     return begin
-
-
-def _calibrate(client: _DemoClient, bar: tqdm) -> None:
-    """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
-    for attempt in range(1, _MAX_ATTEMPTS + 1):
-        try:
-            client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
-            return
-        except _CallRefused as refusal:
-            if attempt == _MAX_ATTEMPTS:
-                raise
-            bar.total += CALIBRATION_MOTION.duration + 4.0
-            bar.write(f'{refusal}; the run is repeated', file=sys.stderr)
-            _wait(bar, 2.0)  # until the robot stands
 
 
 def _wait(bar: tqdm, seconds: float) -> None:

@@ -16,8 +16,7 @@ example: gyro_calibration emulate --protocol kvh_dsp3000 --model model.yaml --mo
 """
 
 import argparse
-from collections.abc import Iterator
-from itertools import count, repeat
+from itertools import count, islice, repeat
 import json
 import math
 import signal
@@ -28,7 +27,7 @@ from gyro_calibration.cli.simulate import add_motion_options, simulate_log
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.files import InputError, to_printable
-from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.log import DataRefused
 import numpy as np
 
 
@@ -70,7 +69,14 @@ def run(given: argparse.Namespace) -> None:
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')
-    samples = _make_samples(time, output, log.temperature, given.repeat)
+    # the samples that have an output, once or, on request, again and again
+    known = np.isfinite(output)
+    times, outputs = time[known] - time[known][0], output[known].tolist()
+    temperatures = repeat(None) if log.temperature is None else log.temperature[known].tolist()
+    starts = count(0.0, float(times[-1] + np.median(np.diff(times))))
+    samples = (Sample(value, temperature, start + at)
+               for start in islice(starts, None if given.repeat else 1)
+               for at, value, temperature in zip(times.tolist(), outputs, temperatures))
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
     try:
@@ -88,15 +94,3 @@ def run(given: argparse.Namespace) -> None:
 def _handle_signals(handler: Any) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, handler)
-
-
-def _make_samples(time: Array, output: Array, temperature: Array | None,
-                  repeats: bool) -> Iterator[Sample]:
-    """Give the samples of a log that have an output, once or, on request, again and again."""
-    known = np.isfinite(output)
-    times, outputs = time[known] - time[known][0], output[known].tolist()
-    temperatures = repeat(None) if temperature is None else temperature[known].tolist()
-    length = float(times[-1] + np.median(np.diff(times)))
-    for start in count(0.0, length) if repeats else (0.0,):
-        yield from (Sample(output, temperature, start + time)
-                    for time, output, temperature in zip(times.tolist(), outputs, temperatures))

@@ -17,7 +17,7 @@ example: gyro_calibration fit table.csv --out model.yaml
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
@@ -33,7 +33,7 @@ from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
 from gyro_calibration.files import InputError, suggest_nearest
-from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
@@ -106,44 +106,47 @@ def run(given: argparse.Namespace) -> Answer:
         write_model(given.out, model)
     if given.picture:
         Fitted(model, found).plot(given.picture)
-    lines, data = (_answer_dwells(given, model, found) if isinstance(found, SelectedEffects)
-                   else _answer_heading(logs, model, found))
-    return Answer(lines, {'out': given.out, **_model_data(model), **data},
-                  (given.picture, given.surface, given.out))
-
-
-def _answer_dwells(given: argparse.Namespace, model: GyroModel,
-                   found: SelectedEffects) -> tuple[list[str], dict[str, Any]]:
-    fit = found.calibration
-    if given.surface:
-        plots.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range,
-                                 fit.used)
-    matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
-                   if term.effect.name == POLYNOMIAL), None)
-    lines = list(_dwell_lines(model, found))
-    if given.technology and not found.choices:
-        lines.append(f'--technology {given.technology} is stored in the model; it had no '
-                     'influence, since the effects were given.')
-    if given.matrix and matrix is not None:
-        lines += ['', 'C of eq. 11 for deg/s and degC, highest powers of temperature above, '
-                  'of the output to the left:',
-                  *(' '.join(f'{value: .8e}' for value in row) for row in matrix)]
-    return lines, {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
-                   'remarks': list(fit.dwells.remarks)}
-
-
-def _answer_heading(logs: Mapping[str, Log], model: GyroModel,
-                    found: EncoderCalibration) -> tuple[list[str], dict[str, Any]]:
-    ((path, log),), fit = logs.items(), found.fit
-    return ([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
-             *_heading_lines(model, found)],
-            {'method': found.method, 'time_offset_s': fit.time_offset,
-             'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
-             'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
-             **{f'{name}_heading_{when}_rad': getattr(residual, name)
-                for name in ('rms', 'largest') for when, residual in (
-                    ('before', found.residual_before), ('after', found.residual_after))},
-             'remarks': list(found.remarks)})
+    values: dict[str, dict[str, Any]] = {}
+    for effect, parameter, value, deviation in model.estimates():
+        half_width = NORMAL_QUANTILE_975 * deviation
+        values.setdefault(effect, {})[parameter.name] = {
+            'estimate': value, 'standard_deviation': deviation,
+            'ci95': [value - half_width, value + half_width] if math.isfinite(deviation) else None,
+            'unit': parameter.unit}
+    data = {'out': given.out, 'effects': values,
+            'covariance': None if model.covariance is None else model.covariance.tolist(),
+            'rate_range_rad_s': model.rate_range,
+            'temperature_range_degc': model.temperature_range,
+            'reference_temperature_degc': model.reference_temperature,
+            'technology': model.gyro.get('technology')}
+    if isinstance(found, SelectedEffects):
+        if given.surface:
+            plots.draw_error_surface(given.surface, model, model.rate_range,
+                                     model.temperature_range, found.calibration.used)
+        matrix = next((polynomial_to_matrix(term.effect, term.values).tolist()
+                       for term in model.terms if term.effect.name == POLYNOMIAL), None)
+        lines = list(_dwell_lines(model, found))
+        if given.technology and not found.choices:
+            lines.append(f'--technology {given.technology} is stored in the model; it had no '
+                         'influence, since the effects were given.')
+        if given.matrix and matrix is not None:
+            lines += ['', 'C of eq. 11 for deg/s and degC, highest powers of temperature above, '
+                      'of the output to the left:',
+                      *(' '.join(f'{value: .8e}' for value in row) for row in matrix)]
+        data |= {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
+                 'remarks': list(found.calibration.dwells.remarks)}
+    else:
+        ((path, log),), fit = logs.items(), found.fit
+        lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.',
+                 *_heading_lines(model, found)]
+        data |= {'method': found.method, 'time_offset_s': fit.time_offset,
+                 'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
+                 'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
+                 **{f'{name}_heading_{when}_rad': getattr(residual, name)
+                    for name in ('rms', 'largest') for when, residual in (
+                        ('before', found.residual_before), ('after', found.residual_after))},
+                 'remarks': list(found.remarks)}
+    return Answer(lines, data, (given.picture, given.surface, given.out))
 
 
 @dataclass(frozen=True)
@@ -169,22 +172,6 @@ class Fitted(PrintedResult):
             path, motion.time, motion.heading - motion.heading[0], found.residual_before.heading,
             found.residual_after.heading,
             'course over ground' if found.method == 'course' else 'reference')
-
-
-def _model_data(model: GyroModel) -> dict[str, Any]:
-    values: dict[str, dict[str, Any]] = {}
-    for effect, parameter, value, deviation in model.estimates():
-        half_width = NORMAL_QUANTILE_975 * deviation
-        values.setdefault(effect, {})[parameter.name] = {
-            'estimate': value, 'standard_deviation': deviation,
-            'ci95': [value - half_width, value + half_width] if math.isfinite(deviation) else None,
-            'unit': parameter.unit}
-    return {'effects': values,
-            'covariance': None if model.covariance is None else model.covariance.tolist(),
-            'rate_range_rad_s': model.rate_range,
-            'temperature_range_degc': model.temperature_range,
-            'reference_temperature_degc': model.reference_temperature,
-            'technology': model.gyro.get('technology')}
 
 
 def _dwell_data(selection: SelectedEffects) -> dict[str, Any]:
@@ -240,7 +227,23 @@ def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
                    f'{part.residual / DEGREE:10.4f} {part.deviation / DEGREE:8.4f} '
                    f'{part.rms / DEGREE:8.4f}')
         yield ''
-    yield from _choice_lines(selection)
+    if selection.choices:
+        yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
+    for choice in selection.choices:
+        numbers = ' '.join(
+            f'{format(value, digits) if math.isfinite(value) else "-":>{width}s}'
+            for value, digits, width in ((choice.error_without / DEGREE, '.4f', 8),
+                                         (choice.error_with / DEGREE, '.4f', 8),
+                                         (choice.p_value, '.1g', 7)))
+        yield wrap_line(f'{choice.effect:26s} {numbers}  '
+                        f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
+    for pair in selection.confounders:
+        remedy = ('no rate up to three times the fastest' if pair.distinguishing_rate is None
+                  else f'two dwells each way at {pair.distinguishing_rate / DEGREE:.0f} deg/s')
+        if not pair.is_distinguishable:
+            yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
+                            f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
+                            'would distinguish them.')
 
 
 def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
@@ -301,23 +304,3 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
     if not fit.dof:
         yield wrap_line('There are as many values as dwells, so their standard deviations are '
                         'unknown: add dwells.')
-
-
-def _choice_lines(selection: SelectedEffects) -> Iterator[str]:
-    if selection.choices:
-        yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
-    for choice in selection.choices:
-        numbers = ' '.join(
-            f'{format(value, digits) if math.isfinite(value) else "-":>{width}s}'
-            for value, digits, width in ((choice.error_without / DEGREE, '.4f', 8),
-                                         (choice.error_with / DEGREE, '.4f', 8),
-                                         (choice.p_value, '.1g', 7)))
-        yield wrap_line(f'{choice.effect:26s} {numbers}  '
-                        f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
-    for pair in selection.confounders:
-        remedy = ('no rate up to three times the fastest' if pair.distinguishing_rate is None
-                  else f'two dwells each way at {pair.distinguishing_rate / DEGREE:.0f} deg/s')
-        if not pair.is_distinguishable:
-            yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
-                            f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
-                            'would distinguish them.')

@@ -35,8 +35,7 @@ from gyro_calibration.fleet.logs import (
     compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models, COMPONENT_LABELS, describe_type, render_fleet_page, summarize_types, table_files,
-    TypeSummary)
+    build_models, COMPONENT_LABELS, describe_type, render_fleet_page, summarize_types, table_files)
 from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
@@ -74,9 +73,20 @@ def run(given: argparse.Namespace) -> Answer:
     folder = os.path.abspath(given.out)
     verb.require_folder(given.out)
     generator = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    records = _process_logs(given, [LogTask(entry, folder, given.technology, pattern, generator,
-                                            given.gyro_type or '', given.rate)
-                                    for entry in logs])
+    tasks = [LogTask(entry, folder, given.technology, pattern, generator, given.gyro_type or '',
+                     given.rate) for entry in logs]
+    done: dict[str, dict[str, Any]] = {}
+    try:
+        with (_make_executors(given) as (workers, create),
+              show_progress(f'0 of {len(tasks)} logs') as on_progress):
+            for task, record in run_tasks(process_log, tasks, workers, create):
+                done[task.entry.log] = (make_refused_record(task.entry, str(record))
+                                        if isinstance(record, WorkerLost) else record)
+                on_progress(len(done) / len(tasks), f'{len(done)} of {len(tasks)} logs')
+    except KeyboardInterrupt:
+        raise DataRefused(f'interrupted after {len(done)} of {len(tasks)} logs; run the same '
+                          'command again to continue') from None
+    records = _exclude_invalid([done[task.entry.log] for task in tasks])
     used = [each for each in records if each['status'] == DONE]
     if not used:
         first = records[0]
@@ -88,19 +98,24 @@ def run(given: argparse.Namespace) -> Answer:
     with show_progress('units, types and references'):
         types = summarize_types(used)
     for found in types:
-        lines += ['', *(wrap_line(each, 2 + len(each) - len(each.lstrip()))
-                        for each in _type_lines(found))]
+        counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
+            (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
+        texts = [f'{found.name or "Type not stated, pooled as one"}: {counts}.']
+        for value in found.values.values():
+            parts = [f'{label} {value.format_component(name)}'
+                     for name, label in COMPONENT_LABELS.items() if name in value.components]
+            texts.append(f'  {value.name}: {value.format_interval(value.mean)}; '
+                         f'{", ".join(parts)}')
+            if not value.is_slow:
+                texts.append('    ' + '; '.join(
+                    f'unit {to_printable(name)} {value.format_interval(interval)}'
+                    for name, interval in value.units.items()))
+        texts += [f'  {text}.' for text in describe_type(found)]
+        lines += ['', *(wrap_line(each, 2 + len(each) - len(each.lstrip())) for each in texts)]
     data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),
             'false_alarm_rate': FALSE_ALARM_RATE,
             'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in excluded],
             'types': [type_data(found) for found in types]}
-    written = _write_results(given, types, records, data)
-    lines += ['', f'Written to {given.out}: {", ".join(written)}.']
-    return Answer(lines, data)
-
-
-def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
-                   records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
                'report.html': render_fleet_page(types, records).encode(),
                **table_files(types, records)}
@@ -111,41 +126,13 @@ def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
             name = 'models/' + '-'.join(re.sub(r'[^\w.-]', '_', each)[:60] for each in words)
             while f'{name}.yaml' in content:
                 name += '_'
-            text = format_model(replace(model, origin={**model.origin, **verb.make_origin([])}))
-            content[f'{name}.yaml'] = text.encode()
+            content[f'{name}.yaml'] = format_model(replace(
+                model, origin={**model.origin, **verb.make_origin([])})).encode()
             names += [] if unit else [f'{name}.yaml']
-    for name, each in content.items():
-        write_atomically(Path(given.out) / name, each)
-    return names
-
-
-def _type_lines(summary: TypeSummary) -> Iterator[str]:
-    counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
-        (summary.records, 'log'), (summary.units, 'unit'), (summary.drives, 'drive')) if each)
-    yield f'{summary.name or "Type not stated, pooled as one"}: {counts}.'
-    for each in summary.values.values():
-        parts = [f'{label} {each.format_component(name)}'
-                 for name, label in COMPONENT_LABELS.items() if name in each.components]
-        yield f'  {each.name}: {each.format_interval(each.mean)}; {", ".join(parts)}'
-        if not each.is_slow:
-            yield '    ' + '; '.join(f'unit {to_printable(name)} {each.format_interval(interval)}'
-                                     for name, interval in each.units.items())
-    yield from (f'  {text}.' for text in describe_type(summary))
-
-
-def _process_logs(given: argparse.Namespace, tasks: Sequence[LogTask]) -> list[dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    try:
-        with (_make_executors(given) as (workers, create),
-              show_progress(f'0 of {len(tasks)} logs') as on_progress):
-            for task, record in run_tasks(process_log, tasks, workers, create):
-                found[task.entry.log] = (make_refused_record(task.entry, str(record))
-                                         if isinstance(record, WorkerLost) else record)
-                on_progress(len(found) / len(tasks), f'{len(found)} of {len(tasks)} logs')
-    except KeyboardInterrupt:
-        raise DataRefused(f'interrupted after {len(found)} of {len(tasks)} logs; run the same '
-                          'command again to continue') from None
-    return _exclude_invalid([found[task.entry.log] for task in tasks])
+    for name, text in content.items():
+        write_atomically(Path(given.out) / name, text)
+    lines += ['', f'Written to {given.out}: {", ".join(names)}.']
+    return Answer(lines, data)
 
 
 @contextmanager

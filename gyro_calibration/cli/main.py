@@ -45,8 +45,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # for example from a shell variable that is not set
             if value == '' or isinstance(value, list) and '' in value:
                 raise InputError(f'{name.replace("_", "-")} is empty; give a value or omit it')
+        # Only the command line names Python files to be run; models and logs cannot.
         for path in given.catalogue:
-            _load_effects(path)
+            spec = spec_from_file_location('effects_of_the_user', path)
+            if spec is None or spec.loader is None or not Path(path).is_file():
+                raise InputError(f'{path} is not a Python file; wanted one, .py, with a list '
+                                 'EFFECTS')
+            module = module_from_spec(spec)
+            try:
+                spec.loader.exec_module(module)
+                add_effects(module.EFFECTS)
+                register_causes(module.EFFECTS)
+            except Exception as error:
+                raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
+                                 f'{error}); wanted EFFECTS, a list of '
+                                 'gyro_calibration.model.effects.Effect') from None
         answer = given.run(given)
         text = (None if answer is None else answer.text if not given.json
                 else format_json(answer.data))
@@ -66,36 +79,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                       f'{path}: {describe_error(error)}; {remedy(error, str(path))}')
         return 2
     if text is not None:
-        _print_text(text)
+        encoding = sys.stdout.encoding or 'utf-8'  # a file name may not be text
+        text = to_printable(text, allowed='\n').encode(encoding, 'backslashreplace').decode(
+            encoding)
+        try:
+            print(text, flush=True)
+        except BrokenPipeError:  # such as of `head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
-
-
-def _load_effects(path: str) -> None:
-    """Run a Python file and add the effects of its list EFFECTS to the catalogue."""
-    # Only the command line names such a file; models and logs cannot.
-    spec = spec_from_file_location('effects_of_the_user', path)
-    if spec is None or spec.loader is None or not Path(path).is_file():
-        raise InputError(f'{path} is not a Python file; wanted one, .py, with a list EFFECTS')
-    module = module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-        add_effects(module.EFFECTS)
-        register_causes(module.EFFECTS)
-    except Exception as error:
-        raise InputError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
-                         f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'
-                         'Effect') from None
-
-
-def _print_text(text: str) -> None:
-    """Print; a closed pipe, such as of `head`, or a file name that is not text is no error."""
-    encoding = sys.stdout.encoding or 'utf-8'
-    try:
-        print(
-            to_printable(text, allowed='\n').encode(encoding, 'backslashreplace').decode(encoding),
-            flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
@@ -129,7 +120,7 @@ def find_verbs() -> dict[str, str]:
             for name, text in texts.items() if '\ndef run(' in text}
 
 
-def make_parser(called: str = '') -> argparse.ArgumentParser:
+def make_parser(called: str) -> argparse.ArgumentParser:
     """Return the parser of the verbs; only the called one is imported, and has its arguments."""
     parser = _Parser(prog='gyro_calibration',
                      description='Calibrate, compensate and diagnose gyros with one axis.')

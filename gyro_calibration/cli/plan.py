@@ -99,46 +99,7 @@ def run(given: argparse.Namespace) -> Answer:
         write_motion(given.out, plan.motion)
     if given.picture:
         draw_motion(given.picture, plan.motion, robot.rate)
-    return _answer(given, plan, rows, longer, can_follow(robot, CALIBRATION_MOTION))
-
-
-def _read_limits(path: str) -> RobotLimits:
-    """Read the limits of a robot; a `InputError` names what is missing, unknown or wrong."""
-    try:
-        content = read_settings(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
-                         'start with a copy of config/limits.yaml') from error
-    try:
-        given = validate('the file', content, dict.fromkeys(_LIMIT_FIELDS, _check_limit))
-    except InvalidValue as error:
-        raise InputError(f'{path}: {error}; config/limits.yaml is an example') from None
-    missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
-               if name not in given]
-    if missing:
-        raise InputError(f'{path}: {missing[0]} is missing; add the limit of the robot')
-    robot = RobotLimits(**{_LIMIT_FIELDS[name][0]: value if name == 'rest_s' else value * DEGREE
-                           for name, value in given.items()})
-    if robot.slowest > robot.rate:
-        raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
-                         'them')
-    return robot
-
-
-def _check_limit(place: str, value: Any) -> float:
-    name = place.rpartition('.')[2]
-    return parse_number(name, value, *_LIMIT_FIELDS[name][1])
-
-
-def write_motion(path: str, motion: Motion) -> None:
-    rows = zip(motion.time, motion.rate_at(motion.time) / DEGREE)
-    lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
-             *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]
-    write_atomically(path, ('\n'.join(lines) + '\n').encode())
-
-
-def _answer(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
-            longer: dict[float, Prediction], is_built_in_feasible: bool) -> Answer:
+    is_built_in_feasible = can_follow(robot, CALIBRATION_MOTION)
     angle, time = plan.motion.heading / DEGREE, plan.motion.time
     rate, planned, plain = plan.motion.rate_at(time), rows['planned'], rows['plain']
     scale_gain = plain.scale_deviation / planned.scale_deviation
@@ -167,6 +128,41 @@ def _answer(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
                                                            for seconds, row in longer.items()],
             'drive_s': given.drive, 'seed': given.seed, 'out': given.out}
     return Answer(lines, data, (given.picture, given.out))
+
+
+def _read_limits(path: str) -> RobotLimits:
+    """Read the limits of a robot; a `InputError` names what is missing, unknown or wrong."""
+    try:
+        content = read_settings(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
+                         'start with a copy of config/limits.yaml') from error
+
+    def check(place: str, value: Any) -> float:
+        name = place.rpartition('.')[2]
+        return parse_number(name, value, *_LIMIT_FIELDS[name][1])
+
+    try:
+        given = validate('the file', content, dict.fromkeys(_LIMIT_FIELDS, check))
+    except InvalidValue as error:
+        raise InputError(f'{path}: {error}; config/limits.yaml is an example') from None
+    missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
+               if name not in given]
+    if missing:
+        raise InputError(f'{path}: {missing[0]} is missing; add the limit of the robot')
+    robot = RobotLimits(**{_LIMIT_FIELDS[name][0]: value if name == 'rest_s' else value * DEGREE
+                           for name, value in given.items()})
+    if robot.slowest > robot.rate:
+        raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
+                         'them')
+    return robot
+
+
+def write_motion(path: str, motion: Motion) -> None:
+    rows = zip(motion.time, motion.rate_at(motion.time) / DEGREE)
+    lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
+             *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]
+    write_atomically(path, ('\n'.join(lines) + '\n').encode())
 
 
 def _row(name: str, row: Prediction) -> str:

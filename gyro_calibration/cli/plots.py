@@ -32,7 +32,7 @@ from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.files import open_replacement
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DEGREE, Mask
+from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import Motion
 import numpy as np
@@ -160,7 +160,7 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
 
 def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
                        temperature_range: tuple[float, float],
-                       dwells: Dwells | None = None) -> Any:
+                       dwells: Dwells | None) -> Any:
     """Draw the error that a model removes, over output and temperature (Ojeda et al., fig. 6)."""
     # without a range of temperatures at the reference temperature; dwells are dots
     output = np.linspace(*rate_range, 161)
@@ -169,7 +169,29 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
     figure, panels = _panels(1, 2 if has_temperature else 1,
                              (11, 5) if has_temperature else (7, 5))
     if has_temperature:
-        _draw_contours(panels[0, 0], model, output, np.linspace(*temperature_range, 81), dwells)
+        from matplotlib.ticker import MaxNLocator
+        axes, across = panels[0, 0], output / DEGREE
+        up = np.linspace(*temperature_range, 81)
+        grid, warmth = (each.ravel() for each in np.meshgrid(output, up))
+        error = (grid - model.rate(grid, warmth)).reshape(len(up), -1) / DEGREE
+        low, high = float(error.min()), float(error.max())
+        levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(low, max(high, low + 1e-6))
+        largest = float(np.abs(levels).max())
+        axes.grid(False)
+        axes.contourf(across, up, error, levels=levels, cmap=_DIVERGING_COLORMAP, alpha=0.8,
+                      vmin=-largest, vmax=largest, extend='both')
+        lines = axes.contour(across, up, error, levels=levels, colors='black', linewidths=0.8)
+        # each line has its label away from its ends and from the labels of its neighbours
+        places = [tuple(line[round((0.35, 0.5, 0.65)[number % 3] * (len(line) - 1))].tolist())
+                  for number, level in enumerate(lines.allsegs) for line in level
+                  if len(line) > 10]
+        for text in axes.clabel(lines, fontsize=9, manual=places):
+            text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
+        title = 'Error of the gyro by the model [deg/s]'
+        if dwells is not None and dwells.temperature is not None:
+            axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
+            title += '; dots: dwells'
+        axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]', title=title)
     temperatures = (np.linspace(*temperature_range, 4) if has_temperature
                     else np.array([model.reference_temperature]))
     axes = panels[0, -1]
@@ -188,30 +210,6 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
         'blue: below it.' if has_temperature else 'The error that the model removes.')
 
 
-def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array,
-                   dwells: Dwells | None) -> None:
-    from matplotlib.ticker import MaxNLocator
-    across, up = np.meshgrid(output, temperature)
-    error = (across - model.rate(across.ravel(), up.ravel()).reshape(across.shape)) / DEGREE
-    low, high = float(error.min()), float(error.max())
-    levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(low, max(high, low + 1e-6))
-    largest = float(np.abs(levels).max())
-    axes.grid(False)
-    axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING_COLORMAP, alpha=0.8,
-                  vmin=-largest, vmax=largest, extend='both')
-    lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
-    # each line has its label away from its ends and from the labels of its neighbours
-    places = [tuple(line[round((0.35, 0.5, 0.65)[number % 3] * (len(line) - 1))].tolist())
-              for number, level in enumerate(lines.allsegs) for line in level if len(line) > 10]
-    for text in axes.clabel(lines, fontsize=9, manual=places):
-        text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
-    title = 'Error of the gyro by the model [deg/s]'
-    if dwells is not None and dwells.temperature is not None:
-        axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
-        title += '; dots: dwells'
-    axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]', title=title)
-
-
 def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
     """Draw the errors of dwells before and after a model (figures 5 and 7 of Ojeda et al.)."""
     dwells, kept = calibration.dwells, calibration.scatter.inliers
@@ -225,9 +223,20 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
     figure, panels = _panels(2, len(columns), (5.5 * len(columns) + 0.5, 8))
     for column, (across, label, shade, shade_label) in enumerate(columns):
         for row, (error, name, when, more) in enumerate(rows):
-            axes = panels[row, column]
-            dots = _draw_errors(axes, across, error / DEGREE, kept, shade,
-                                _DIVERGING_COLORMAP if shade is rate else _SEQUENTIAL_COLORMAP)
+            axes, inside, outlying = panels[row, column], error[kept] / DEGREE, error[~kept]
+            dots = _draw_dots(axes, across[kept], inside, None if shade is None else shade[kept],
+                              _DIVERGING_COLORMAP if shade is rate else _SEQUENTIAL_COLORMAP)
+            # the scale is that of those kept; others beyond it are at the edge
+            low, high = float(inside.min()), float(inside.max())
+            margin = 0.12 * (high - low) or 1e-3
+            axes.set_ylim(low - margin, high + margin)
+            if len(outlying):
+                shown = np.clip(outlying / DEGREE, low - 0.6 * margin, high + 0.6 * margin)
+                beyond = ', at the edge: beyond it' if (shown != outlying / DEGREE).any() else ''
+                axes.plot(across[~kept], shown, 'x', color='black', markersize=8,
+                          label=f'{len(shown)} outlying{beyond}')
+                axes.legend(loc='best')
+            axes.axhline(0.0, color='black', linewidth=0.5)
             axes.set(xlabel=label, ylabel=name,
                      title=f'{when}: rms {rms(error[kept]) / DEGREE:.3g} deg/s' + more)
         if shade is not None:
@@ -236,24 +245,6 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
     return _save_figure(figure, path,
                         'Below: dots without a shape and without bands of one colour are noise; a '
                         'curve or a band is an effect that the model lacks.')
-
-
-def _draw_errors(axes: Any, across: Array, error: Array, is_inlier: Mask,
-                 colour_values: Array | None, colours: str) -> Any:
-    """Draw errors as coloured dots, on the scale of those kept; others beyond it at the edge."""
-    dots = _draw_dots(axes, across[is_inlier], error[is_inlier],
-                      None if colour_values is None else colour_values[is_inlier], colours)
-    low, high = float(error[is_inlier].min()), float(error[is_inlier].max())
-    margin = 0.12 * (high - low) or 1e-3
-    axes.set_ylim(low - margin, high + margin)
-    if not is_inlier.all():
-        shown = np.clip(error[~is_inlier], low - 0.6 * margin, high + 0.6 * margin)
-        beyond = ', at the edge: beyond it' if (shown != error[~is_inlier]).any() else ''
-        axes.plot(across[~is_inlier], shown, 'x', color='black', markersize=8,
-                  label=f'{len(shown)} outlying{beyond}')
-        axes.legend(loc='best')
-    axes.axhline(0.0, color='black', linewidth=0.5)
-    return dots
 
 
 def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:

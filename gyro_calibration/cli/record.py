@@ -96,7 +96,43 @@ def run(given: argparse.Namespace) -> Answer:
     if os.path.exists(given.out):
         raise InputError(_EXISTS.format(given.out))
     with _stop_event(given.seconds) as stop:
-        return _record((_PortSession if given.port else _TopicSession)(given, stop), given.out)
+        session = (_PortSession if given.port else _TopicSession)(given, stop)
+        recorder, start = session.recorder, time.monotonic()
+        last_flush = start
+
+        def on_chunk() -> None:
+            nonlocal last_flush
+            if time.monotonic() - last_flush >= _WRITE_INTERVAL:
+                recorder.flush()
+                last_flush = time.monotonic()
+                samples, lost = session.counts()
+                bar.set_postfix_str(f'{lost} lost', refresh=False)
+                bar.update(samples - bar.n)
+
+        try:
+            with tqdm(desc=to_printable(given.out), unit=' samples', leave=False,
+                      disable=None) as bar:
+                try:
+                    session.record(on_chunk)
+                finally:
+                    recorder.close()
+        except _DiskFull as error:
+            written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but '
+                       f'for the last {_WRITE_INTERVAL:g} s' if recorder.size
+                       else 'nothing was written')
+            raise DataRefused(
+                f'{error.strerror}; {written}: make room, then record again') from None
+        (samples, lost), seconds = session.counts(), time.monotonic() - start
+        if not samples:
+            with suppress(FileNotFoundError):  # other messages may have come
+                os.unlink(recorder.path)
+            raise DataRefused(f'no sample was received in {seconds:.1f} s{session.failure}; no '
+                              f'file was written: {session.remedy}')
+        data, remarks = session.conclude()
+    return Answer([f'{samples} samples in {seconds:.1f} s, {lost} lost, written to {given.out}.',
+                   *remarks],
+                  {'out': given.out, 'samples': samples, 'lost': lost, 'seconds': seconds,
+                   'bytes': os.path.getsize(given.out), **data, 'remarks': remarks})
 
 
 @contextmanager
@@ -159,7 +195,6 @@ class _Recorder:
         raise NotImplementedError
 
     def finish(self) -> None:
-        """Write the last piece."""
         self.flush(is_due=True)
 
     def close(self) -> None:
@@ -195,14 +230,12 @@ class McapRecorder(_Recorder):
             self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
 
     def flush(self, is_due: bool = False) -> None:
-        """Write the messages so far as a chunk."""
         if self.writer.pending_bytes:
             head = b'' if self.size else self.writer.pack_header(
                 f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
             self.append(head + self.writer.pack_chunk())
 
     def finish(self) -> None:
-        """Write the last chunk and the index."""
         self.flush()
         if self.size:
             self.append(self.writer.pack_summary())
@@ -276,43 +309,6 @@ def _recording_notes(**details: object) -> dict[str, str]:
 
 
 # Sources
-
-
-def _record(session: _PortSession | _TopicSession, out: str) -> Answer:
-    """Record until the end, close the file also after an error, and return the answer."""
-    recorder, start = session.recorder, time.monotonic()
-    last_flush = start
-
-    def on_chunk() -> None:
-        nonlocal last_flush
-        if time.monotonic() - last_flush >= _WRITE_INTERVAL:
-            recorder.flush()
-            last_flush = time.monotonic()
-            samples, lost = session.counts()
-            bar.set_postfix_str(f'{lost} lost', refresh=False)
-            bar.update(samples - bar.n)
-
-    try:
-        with tqdm(desc=to_printable(out), unit=' samples', leave=False, disable=None) as bar:
-            try:
-                session.record(on_chunk)
-            finally:
-                recorder.close()
-    except _DiskFull as error:
-        written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but for '
-                   f'the last {_WRITE_INTERVAL:g} s' if recorder.size else 'nothing was written')
-        raise DataRefused(f'{error.strerror}; {written}: make room, then record again') from None
-    (samples, lost), seconds = session.counts(), time.monotonic() - start
-    if not samples:
-        with suppress(FileNotFoundError):  # other messages may have come
-            os.unlink(recorder.path)
-        raise DataRefused(f'no sample was received in {seconds:.1f} s{session.failure}; no file '
-                          f'was written: {session.remedy}')
-    data, remarks = session.conclude()
-    return Answer([f'{samples} samples in {seconds:.1f} s, {lost} lost, written to {out}.',
-                   *remarks],
-                  {'out': out, 'samples': samples, 'lost': lost, 'seconds': seconds,
-                   'bytes': os.path.getsize(out), **data, 'remarks': remarks})
 
 
 class _PortSession:

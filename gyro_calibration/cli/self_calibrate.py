@@ -15,7 +15,6 @@ example: gyro_calibration self-calibrate run.csv --profile profile.csv --out mod
 """
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
@@ -94,11 +93,25 @@ def run(given: argparse.Namespace) -> Answer:
     plausible, output = plausible_rows(model, log), np.asarray(log.output)
     if not plausible.any() and np.isfinite(output).any():
         raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
-    by_turns = given.turns is not None
-    fit, is_used, data, lines = (
-        _calibrate_by_turns(given, model, log, plausible) if by_turns
-        else _calibrate_by_motion(given, model, log))
-    calibration = make_self_calibration(fit, 'turns' if by_turns else given.method, log, is_used)
+    data: dict[str, Any]
+    if given.turns is None:
+        method, (fit, is_used, data, lines) = given.method, _calibrate_by_motion(given, model, log)
+    else:
+        method, is_used = 'turns', plausible
+        rates = compensate_log(with_self_calibration(model, None), log)
+        marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE
+        found = calibrate_turns(np.asarray(log.time)[plausible], rates[plausible],
+                                None if given.turns == _NEAREST else given.turns,
+                                noise=model.noise, mark_deviation=marking,
+                                output=output[plausible])
+        fit, (before, after) = found.fit, found.rest_durations
+        data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': [before, after],
+                'marking_rad': marking}
+        direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
+        lines = [f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
+                 f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
+                 f'{marking / DEGREE:g} deg.']
+    calibration = make_self_calibration(fit, method, log, is_used)
     if given.out:
         write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
     first = as_sentence(f'{calibration}, from {is_used.sum()} samples')
@@ -117,11 +130,9 @@ def describe_unused_rows(log: Log, plausible: Mask) -> list[str]:
         (known & ~plausible, 'an implausible rate or temperature')) if rows.any()]
 
 
-#: A fit, the rows of the log that were used, further data and lines of the answer.
-_Result = tuple[ScaleBiasFit, Mask, dict[str, Any], list[str]]
-
-
-def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> _Result:
+def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> tuple[
+        ScaleBiasFit, Mask, dict[str, Any], list[str]]:
+    """Return the fit, the rows of the log that were used, data and lines of the answer."""
     try:
         motion, begin = ((read_motion(given.profile), np.asarray(log.time)[0]) if given.profile
                          else motion_from_log(log))
@@ -138,12 +149,26 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
         run = calibrate_run(log, model, motion, begin, given.method, reference)
     if given.picture:
         run.draw(given.picture)
-    lines = list(_fit_lines(run.fit, run.rest_check, given.method, motion.name))
+    lines, fit, check = list[str](), run.fit, run.rest_check
+    if given.method == 'likelihood':
+        lines.append(f'Delay of the gyro behind the {motion.name}: {fit.time_offset:.4f} '
+                     f'+- {fit.time_offset_deviation:.4f} s.')
+    if not math.isnan(fit.start_heading):
+        lines.append(f'The run began {fit.start_heading / DEGREE:.3f} '
+                     f'+- {fit.start_heading_deviation / DEGREE:.3f} deg from the first heading '
+                     'of the reference.')
+    if fit.goodness:
+        lines.append(f'{fit.goodness}.')
+    if check:
+        lines.append(f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} '
+                     f'deg/s; limit: {check.limit / DEGREE:.4f} deg/s.')
+    elif motion.name == 'profile' and given.method == 'likelihood':
+        lines.append('There is no rest of 3 s after the run. A steady turn of the robot '
+                     'throughout has the effect of a bias: leave it at rest after the run.')
     technology = model.gyro.get('technology', 'mems')
     if remark := describe_implausible_scale(
-            run.fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
+            fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
         lines.append(as_sentence(remark))
-    fit, check = run.fit, run.rest_check
     return fit, run.is_used, {
         'time_offset_s': fit.time_offset,
         'time_offset_standard_deviation_s': fit.time_offset_deviation,
@@ -192,46 +217,9 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
     return CalibratedRun(fit, check, run, time[run], rate[run], motion)
 
 
-def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log,
-                        plausible: Mask) -> _Result:
-    time, output, rates = (each[plausible] for each in (
-        np.asarray(log.time), np.asarray(log.output),
-        compensate_log(with_self_calibration(model, None), log)))
-    marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE
-    found = calibrate_turns(time, rates, None if given.turns == _NEAREST else given.turns,
-                            noise=model.noise, mark_deviation=marking, output=output)
-    direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
-    before, after = found.rest_durations
-    return found.fit, plausible, {
-        'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rest_durations),
-        'marking_rad': marking}, [
-        f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
-        f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
-        f'{marking / DEGREE:g} deg.']
-
-
 def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,
                           is_used: Mask) -> SelfCalibration:
     """Return a fit as the calibration of now, at the mean temperature of the rows used."""
     temperature = None if log.temperature is None else float(log.temperature[is_used].mean())
     return to_model_record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
                            temperature)
-
-
-def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,
-               reference: str) -> Iterator[str]:
-    if method == 'likelihood':
-        yield (f'Delay of the gyro behind the {reference}: {fit.time_offset:.4f} '
-               f'+- {fit.time_offset_deviation:.4f} s.')
-    if not math.isnan(fit.start_heading):
-        yield (f'The run began {fit.start_heading / DEGREE:.3f} '
-               f'+- {fit.start_heading_deviation / DEGREE:.3f} deg from the first heading '
-               'of the reference.')
-    if fit.goodness:
-        yield f'{fit.goodness}.'
-    if check:
-        yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
-               f'limit: {check.limit / DEGREE:.4f} deg/s.')
-    elif reference == 'profile' and method == 'likelihood':
-        yield ('There is no rest of 3 s after the run. A steady turn of the robot throughout '
-               'has the effect of a bias: leave it at rest after the run.')

@@ -37,7 +37,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
-Bins = list[tuple[float, float, Mask]]  # limits of each bin, and which errors lie in it
+_Bins = list[tuple[float, float, Mask]]  # limits of each bin, and which errors lie in it
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -63,9 +63,20 @@ def run(given: argparse.Namespace) -> Answer:
     log = verb.read(given)
     found = extract_dwells(log)
     with show_progress('fit of effects, and errors of turns'):
-        rate, is_inlier, remarks, data = (
-            _predict_by_fit(found, given.technology) if given.model is None
-            else _predict_by_model(given, read_model(given.model), log, found))
+        if given.model is not None:
+            rate, is_inlier, remarks, data = _predict_by_model(
+                given, read_model(given.model), log, found)
+        else:  # by models that are not fitted to the sweep
+            calibration = select_effects(found, given.technology).calibration
+            names, used = [effect.name for effect in calibration.effects], calibration.used
+            parts = int(cross_validation_parts(used).max()) + 1
+            left_out = ('sweep to the other sweeps' if parts == len(np.unique(used.sweep))
+                        else f'{"turn" if parts == len(used) else f"of {parts} parts of the log"} '
+                        'to the others, as there are fewer than four sweeps')
+            remarks = [f'the model is {", ".join(names)}, which the data support; its values are '
+                       f'fitted for each {left_out}, so no turn is in the data of its model']
+            rate, is_inlier = calibration.left_out_rate, calibration.scatter.inliers
+            data = {'effects': names, 'left_out': True}
         errors = compute_turn_errors(select_dwells(found, is_inlier), rate[is_inlier],
                                      given.slowest * DEGREE)
     if given.out:
@@ -81,31 +92,41 @@ def run(given: argparse.Namespace) -> Answer:
     remarks = [*found.remarks, *errors.remarks, *remarks]
     if places := [place for place, good in zip(found.location, is_inlier) if not good]:
         remarks.append(f'{len(places)} outlying dwells are left out: {format_list(places)}')
-    rates = _rate_bins(errors, given.slowest * DEGREE)
-    temperatures = [] if errors.turns.temperature is None else [
-        each for each in equal_bins(errors.turns.temperature, 8) if each[2].any()]
-    return Answer(_lines(given, errors, rates, temperatures, remarks),
-                  {**_data(given, errors, rates, temperatures, remarks), **data},
-                  (given.out, given.picture))
 
-
-def _predict_by_fit(found: Dwells,
-                    technology: str | None) -> tuple[Array, Mask, list[str], dict[str, Any]]:
-    """Return rates by models not fitted to the sweep, the dwells not outlying, and remarks."""
-    calibration = select_effects(found, technology).calibration
-    names, used = [effect.name for effect in calibration.effects], calibration.used
-    parts = int(cross_validation_parts(used).max()) + 1
-    left_out = ('sweep to the other sweeps' if parts == len(np.unique(used.sweep))
-                else f'{"turn" if parts == len(used) else f"of {parts} parts of the log"} to the '
-                'others, as there are fewer than four sweeps')
-    remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
-              f'for each {left_out}, so no turn is in the data of its model')
-    return (calibration.left_out_rate, calibration.scatter.inliers, [remark],
-            {'effects': names, 'left_out': True})
+    # bins around 1, 2, 4, ... times the slowest rate, in each sense. A limit just below the
+    # fastest turn would make a nearly empty bin. Limits lie between the doubled rates, as those
+    # are the rates that are commanded.
+    turns, slowest = errors.turns, given.slowest * DEGREE
+    speed = np.abs(turns.rate)
+    bins = max(1, math.floor(math.log2(2.13 * speed.max() / slowest)))
+    edges = [slowest, *(0.75 * slowest * 2.0 ** number for number in range(1, bins)),
+             float(speed.max())]
+    in_bin = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, bins - 1)
+    both = [each for place, (low, high) in enumerate(zip(edges, edges[1:])) for each in (
+        (low, high, (in_bin == place) & (turns.rate > 0.0)),
+        (-high, -low, (in_bin == place) & (turns.rate < 0.0)))]
+    rates = sorted((each for each in both if each[2].any()), key=lambda each: each[0])
+    temperatures = [] if turns.temperature is None else [
+        each for each in equal_bins(turns.temperature, 8) if each[2].any()]
+    ratios = [before / after if after > 0.0 else None
+              for before, after in zip(_sizes(errors.static), _sizes(errors.modelled))]
+    return Answer(_lines(given, errors, rates, temperatures, remarks), {
+        'turns': len(turns), 'slowest_rad_s': slowest,
+        **_error_data(errors, np.ones(len(turns), dtype=bool)),
+        'ratio_rms': ratios[0], 'ratio_largest': ratios[1],
+        'by_rate': _bin_data('rad_s', errors, rates),
+        'by_temperature': _bin_data('degc', errors, temperatures),
+        'rate_rad_s': turns.rate.tolist(), 'temperature_degc': None
+        if turns.temperature is None else turns.temperature.tolist(),
+        'static_rad_per_turn': errors.static.tolist(),
+        'modelled_rad_per_turn': errors.modelled.tolist(),
+        'sweep': turns.sweep.tolist(), 'place': list(turns.location), 'remarks': remarks,
+        **data}, (given.out, given.picture))
 
 
 def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
                       found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+    """Return the rates of dwells, which of them are not outlying, remarks, and data."""
     result = compensate(model, found.output, found.temperature)
     names = [term.effect.name for term in model.terms]
     clipped, beyond = (int(np.count_nonzero(each))
@@ -136,23 +157,7 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
         'beyond_range': beyond}
 
 
-def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
-    """Return the limits of bins around 1, 2, 4, ... times the slowest rate, and what lies in."""
-    rate = errors.turns.rate
-    speed = np.abs(rate)
-    # A limit just below the fastest turn would make a nearly empty bin. Limits lie between the
-    # doubled rates, as those are the rates that are commanded.
-    bins = max(1, math.floor(math.log2(2.13 * speed.max() / slowest)))
-    edges = [slowest, *(0.75 * slowest * 2.0 ** number for number in range(1, bins)),
-             float(speed.max())]
-    places = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, bins - 1)
-    found = [each for place, (low, high) in enumerate(zip(edges, edges[1:])) for each in (
-        (low, high, (places == place) & (rate > 0.0)),
-        (-high, -low, (places == place) & (rate < 0.0)))]
-    return sorted((each for each in found if each[2].any()), key=lambda each: each[0])
-
-
-def _lines(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatures: Bins,
+def _lines(given: argparse.Namespace, errors: TurnErrors, rates: _Bins, temperatures: _Bins,
            remarks: list[str]) -> Iterator[str]:
     rms_phrase, largest_phrase = (
         (f'{before / DEGREE:.3g} deg ({100.0 * before / math.tau:.2g} %)',
@@ -173,7 +178,7 @@ def _sizes(errors: Array) -> tuple[float, float]:
     return rms(errors), float(np.abs(errors).max())
 
 
-def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
+def _table(title: str, errors: TurnErrors, bins: _Bins) -> Iterator[str]:
     if not bins:
         return
     yield ''
@@ -187,28 +192,11 @@ def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
             for each in (errors.static, errors.modelled) for value in _sizes(each[mask]))
 
 
-def _data(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatures: Bins,
-          remarks: list[str]) -> dict[str, Any]:
-    turns = errors.turns
-    ratios = [before / after if after > 0.0 else None
-              for before, after in zip(_sizes(errors.static), _sizes(errors.modelled))]
-    return {'turns': len(turns), 'slowest_rad_s': given.slowest * DEGREE,
-            **_error_data(errors, np.ones(len(turns), dtype=bool)),
-            'ratio_rms': ratios[0], 'ratio_largest': ratios[1],
-            'by_rate': _bin_data('rad_s', errors, rates),
-            'by_temperature': _bin_data('degc', errors, temperatures),
-            'rate_rad_s': turns.rate.tolist(), 'temperature_degc': None
-            if turns.temperature is None else turns.temperature.tolist(),
-            'static_rad_per_turn': errors.static.tolist(),
-            'modelled_rad_per_turn': errors.modelled.tolist(),
-            'sweep': turns.sweep.tolist(), 'place': list(turns.location), 'remarks': remarks}
-
-
 def _error_data(errors: TurnErrors, mask: Mask) -> dict[str, dict[str, float]]:
     return {name: dict(zip(('rms_rad_per_turn', 'largest_rad_per_turn'), _sizes(each[mask])))
             for name, each in (('static', errors.static), ('modelled', errors.modelled))}
 
 
-def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]:
+def _bin_data(unit: str, errors: TurnErrors, bins: _Bins) -> list[dict[str, Any]]:
     return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
              **_error_data(errors, mask)} for low, high, mask in bins]

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import errno
 import glob
 import math
-from operator import sub
+from operator import attrgetter, sub
 import os
 import select
 from statistics import fmean
@@ -134,7 +134,7 @@ _LISTENING_DURATION = 1.0
 
 
 @dataclass(frozen=True)
-class Chunk:
+class _Chunk:
     """Samples that arrived at one time, by the steady clock of the host, s."""
 
     samples: list[Sample]
@@ -193,7 +193,7 @@ class Connection:
     and ports in place of a `SerialPort`.
     """
 
-    def __init__(self, port: str, protocol: str = AUTO, baud: int = 0,
+    def __init__(self, port: str, protocol: str, baud: int = 0,
                  settings: Settings | None = None,
                  on_change: Callable[[ConnectionState], None] = lambda state: None,
                  clock: Callable[[], float] = read_steady_clock,
@@ -233,16 +233,16 @@ class Connection:
                                 past.device_faults + decoder.device_faults,
                                 past.discarded_bytes + decoder.discarded_bytes)
 
-    def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
+    def chunks(self, stop: threading.Event) -> Iterator[_Chunk]:
         """Give samples as they arrive, until the event is set; the port is then closed."""
         # While the port is missing, no chunk is given.
         try:
             while not stop.is_set():
                 try:
-                    yield from self._read(self._open(stop), stop)
+                    yield from self._read(stop)
                 except PortError as error:
                     self._close()
-                    self._set_failed(str(error), self._reopen_delay)
+                    self._set_state('failed', str(error), self._reopen_delay)
                     begin = self._read_clock()
                     stop.wait(self._reopen_delay)
                     self.waited_duration += self._read_clock() - begin
@@ -256,38 +256,36 @@ class Connection:
                                  self._last_stamp)
         self.protocol, self.baud = protocol, baud
 
-    def _open(self, stop: threading.Event) -> SerialPort:
-        """Open the port, listen if the protocol is unknown, and request the gyro to send."""
-        path = resolve_port(self._pattern)
-        self.path = os.path.realpath(path)
-        self._port = port = self._make_port(path, self.baud if self.protocol else self._bauds[0])
-        port.open()
-        self.open_count += 1
-        if self.protocol is None:
-            self._listen(port, stop)
-        if self.protocol is not None:
-            assert self._decoder is not None and self.clock is not None
-            port.write(self.protocol.startup)
-            self._decoder.reset()
-            self.clock.interrupt()
-        return port
-
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
         """Find protocol and baud; they stay unknown only after a stop."""
         # The port stays open, since opening it restarts many microcontrollers, which then need
         # some time until they send.
-        self._set_state(ConnectionState('listening'))
+        self._set_state('listening')
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:
             tried: list[Recognition] = []
             for baud in self._bauds:
                 port.set_baud(baud)
-                tried.append(self._recognize(port, end, stop))
+                # within 1 s after the first byte
+                data, opened, last, due = b'', self._read_clock(), math.inf, 0.0
+                while True:
+                    if stop.is_set():
+                        return
+                    data += port.read()
+                    now = self._read_clock()
+                    if not data and now - opened > _SILENCE_TIMEOUT:
+                        self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), end)
+                    if data and now >= due:
+                        recognized = recognize_protocol(data, self._settings)
+                        due, last = now + _ATTEMPT_INTERVAL, min(last, now + _LISTENING_DURATION)
+                        if recognized.protocol is not None or now >= last:
+                            break
                 if stop.is_set():
                     return
-                found = tried[-1].protocol
+                tried.append(recognized)
+                found = recognized.protocol
                 if found is not None:
-                    self.detected = tried[-1].summary
+                    self.detected = recognized.summary
                     try:
                         self._set_protocol(found, baud)
                     except ValueError as error:
@@ -299,33 +297,29 @@ class Connection:
                 f'bytes come on {self._pattern}, but no protocol was recognized at '
                 f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.summary}', end)
 
-    def _recognize(self, port: SerialPort, deadline: float, stop: threading.Event) -> Recognition:
-        """Return the result of the recognition within 1 s after the first byte."""
-        data, opened, end, due = b'', self._read_clock(), math.inf, 0.0
-        while not stop.is_set():
-            data += port.read()
-            now = self._read_clock()
-            if not data and now - opened > _SILENCE_TIMEOUT:
-                self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), deadline)
-            if data and now >= due:
-                recognition = recognize_protocol(data, self._settings)
-                due, end = now + _ATTEMPT_INTERVAL, min(end, now + _LISTENING_DURATION)
-                if recognition.protocol is not None or now >= end:
-                    return recognition
-        return recognize_protocol(b'', self._settings)
-
     def _report_or_raise(self, problem: str, deadline: float) -> None:
         """Report a problem while the port stays open; raise `PortError` after a time."""
         now = self._read_clock()
         if now >= deadline:
             raise PortError(problem)
         if problem != self.state.problem:
-            self._set_failed(problem, deadline - now)
+            self._set_state('failed', problem, deadline - now)
 
-    def _read(self, port: SerialPort, stop: threading.Event) -> Iterator[Chunk]:
-        decoder, clock = self._decoder, self.clock
-        if decoder is None or clock is None:  # stopped while listening
+    def _read(self, stop: threading.Event) -> Iterator[_Chunk]:
+        """Open the port, listen if the protocol is unknown, and read until a loss of the port."""
+        path = resolve_port(self._pattern)
+        self.path = os.path.realpath(path)
+        self._port = port = self._make_port(path, self.baud if self.protocol else self._bauds[0])
+        port.open()
+        self.open_count += 1
+        if self.protocol is None:
+            self._listen(port, stop)
+        protocol, decoder, clock = self.protocol, self._decoder, self.clock
+        if protocol is None or decoder is None or clock is None:  # stopped while listening
             return
+        port.write(protocol.startup)
+        decoder.reset()
+        clock.interrupt()
         received, begin = 0, self._read_clock()
         last_request, counts = begin, list[tuple[int, int, int]]()
         while not stop.is_set():
@@ -334,20 +328,27 @@ class Connection:
             samples = decoder.feed(data)
             self._read_bytes += len(data)
             if samples:
-                yield self._make_chunk(samples, now)
+                stamps = clock.stamp_samples(samples, now)
+                if self._samples:
+                    longest = max(map(sub, stamps, [self._last_stamp, *stamps]))
+                    if longest > max(self.longest_gap, 1.5 * clock.period):
+                        self.longest_gap = longest
+                self._samples, self._last_stamp = self._samples + len(samples), stamps[-1]
+                if self.state.name != 'reading':
+                    self._reopen_delay = _ATTEMPT_INTERVAL
+                    self._set_state('reading')
+                yield _Chunk(samples, stamps, now)
                 received, begin, counts = received + len(samples), now, []
                 continue
             if not received and now - last_request >= _LISTENING_DURATION:
-                assert self.protocol is not None
-                port.write(self.protocol.startup)
+                port.write(protocol.startup)
                 last_request = now
             timeout = max(_SILENCE_TIMEOUT, _SILENCE_PERIODS * clock.period)
             # To open the port again would restart a board that still starts. The second sample
             # shows the period.
             deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)
             if now >= min(begin + 0.5 * timeout * (len(counts) + 1), deadline):
-                counts.append(
-                    (self._read_bytes, decoder.device_faults, decoder.refused_samples))
+                counts.append((self._read_bytes, decoder.device_faults, decoder.refused_samples))
                 if len(counts) > 1:
                     problem = self._explain_silence(counts[-2], counts[-1], timeout)
                     self._report_or_raise(problem, deadline)
@@ -380,26 +381,10 @@ class Connection:
         return (f'nothing comes on {self._pattern} for {limit:g} s: check the power and the wires '
                 'of the gyro')
 
-    def _make_chunk(self, samples: list[Sample], arrival: float) -> Chunk:
-        assert self.clock is not None
-        stamps = self.clock.stamp_samples(samples, arrival)
-        if self._samples:
-            longest = max(map(sub, stamps, [self._last_stamp, *stamps]))
-            if longest > max(self.longest_gap, 1.5 * self.clock.period):
-                self.longest_gap = longest
-        self._samples, self._last_stamp = self._samples + len(samples), stamps[-1]
-        if self.state.name != 'reading':
-            self._reopen_delay = _ATTEMPT_INTERVAL
-            self._set_state(ConnectionState('reading'))
-        return Chunk(samples, stamps, arrival)
-
-    def _set_failed(self, problem: str, waiting: float) -> None:
-        self.last_error = problem
-        self._set_state(ConnectionState('failed', problem, waiting))
-
-    def _set_state(self, state: ConnectionState) -> None:
-        self.state = state
-        self._on_change(state)
+    def _set_state(self, name: str, problem: str = '', retry_delay: float = 0.0) -> None:
+        self.last_error = problem or self.last_error
+        self.state = ConnectionState(name, problem, retry_delay)
+        self._on_change(self.state)
 
     def _close(self) -> None:
         if self._port is not None:
@@ -442,12 +427,10 @@ class Decimator:
             return
         stamps, samples = zip(*group, strict=True)
         begin = stamps[0]  # sums of seconds since 1970 would lose digits
-        output, *others = (_known_mean([getattr(sample, name) for sample in samples])
-                           for name in ('output', 'temperature', 'specific_force'))
+        temperatures, forces = (
+            [value for value in map(attrgetter(name), samples) if value is not None]
+            for name in ('temperature', 'specific_force'))
         yield SampleMean(begin + fmean(stamp - begin for stamp in stamps),
-                         Sample(output or 0.0, others[0], specific_force=others[1]), len(group))
-
-
-def _known_mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
+                         Sample(fmean(sample.output for sample in samples),
+                                fmean(temperatures) if temperatures else None,
+                                specific_force=fmean(forces) if forces else None), len(group))

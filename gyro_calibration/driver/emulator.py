@@ -71,8 +71,15 @@ class Emulator:
         os.close(slave)
         os.set_blocking(self._master, False)
         self._reader_poll.register(self._master, select.POLLIN)
+        if self.link is None:
+            return
         try:
-            self._make_link()
+            if self.link.exists() and not self.link.is_symlink():
+                raise FileExistsError(f'{self.link} is no link, so it is not replaced: give '
+                                      'another path for the link')
+            temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
+            os.symlink(self.path, temporary)
+            os.replace(temporary, self.link)
         except OSError:
             self.close()
             raise
@@ -127,16 +134,6 @@ class Emulator:
         self.stop()
         self._thread.join()
         self.close()
-
-    def _make_link(self) -> None:
-        if self.link is None:
-            return
-        if self.link.exists() and not self.link.is_symlink():
-            raise FileExistsError(f'{self.link} is no link, so it is not replaced: give another '
-                                  'path for the link')
-        temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
-        os.symlink(self.path, temporary)
-        os.replace(temporary, self.link)
 
     def _send(self, data: bytes) -> None:
         while data and not self._stop.is_set():

@@ -18,7 +18,7 @@ Estimation and removal of clock skew from network delay measurements, INFOCOM 19
 the sequence of the device, or its time, or a count. Lost samples without other evidence show as
 well: all later samples are late by whole periods; and samples counted twice arrive early.
 
-`ClockStepDetector` detects that a clock was set: a computer without a battery starts with a wrong
+`_ClockStepDetector` detects that a clock was set: a computer without a battery starts with a wrong
 date and is set by months when it finds a time server. `NodeTimeConverter` converts a steady clock
 to stamps of such a clock, `HostTimeConverter` converts its stamps to a continuous time.
 
@@ -26,7 +26,7 @@ No clock is read here, except by `read_steady_clock`: the caller gives the time 
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 import math
 from statistics import median
@@ -34,8 +34,7 @@ import time
 
 from gyro_calibration.driver.protocols import Sample
 
-_Point = tuple[float, float]
-
+_STEADY_CLOCK_ID = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
 _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock drifts visibly
@@ -58,12 +57,12 @@ _MEDIAN_SIZE = 8  # intervals of a device whose median is the usual one: three m
 _CLOCK_STEP_THRESHOLD = 0.1
 
 
-class LowerLine:
+class _LowerLine:
     """The line below all points of the last 20 s with the least sum of distances."""
 
     def __init__(self, slope: float):
         self.slope = slope
-        self.points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
+        self.points = deque[tuple[float, float]](maxlen=_WINDOW_BLOCKS)
         self._anchor = (0.0, 0.0)
         self._begin, self._block_begin = 0.0, -math.inf
 
@@ -86,7 +85,24 @@ class LowerLine:
             self.points[-1] = (x, y)
         else:
             return
-        self._fit()
+
+        # the corners of the lower convex hull
+        hull: list[tuple[float, float]] = []
+        for x, y in self.points:
+            while hull:
+                (a, height), (left, low) = hull[-1], hull[-2] if len(hull) > 1 else (0.0, 0.0)
+                is_above = (height - low) * (x - left) >= (y - low) * (a - left)
+                if a < x and not (len(hull) > 1 and is_above):
+                    break
+                hull.pop()
+            hull.append((x, y))
+        # its edge at the mean; of a single point the given slope remains
+        middle = sum(x for x, _ in self.points) / len(self.points)
+        begin, end = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),
+                          (hull[-1], None))
+        self._anchor = begin
+        if end is not None and end[1] > begin[1]:
+            self.slope = (end[1] - begin[1]) / (end[0] - begin[0])
 
     def shift(self, start: float, offset: float) -> None:
         """Shift the points from a height on along x, and drop points that they overtake."""
@@ -94,30 +110,6 @@ class LowerLine:
         first = moved[0][0] if moved else math.inf
         kept = [(x, y) for x, y in self.points if y < start and x < first]
         self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
-
-    def _fit(self) -> None:
-        # the edge of the lower hull over the mean; of a single point the given slope remains
-        hull = _lower_hull(self.points)
-        middle = sum(x for x, _ in self.points) / len(self.points)
-        left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),
-                           (hull[-1], None))
-        self._anchor = left
-        if right is not None and right[1] > left[1]:
-            self.slope = (right[1] - left[1]) / (right[0] - left[0])
-
-
-def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
-    """Return the corners of the lower convex hull of points in the order of x."""
-    hull: list[_Point] = []
-    for x, y in points:
-        while hull:
-            (a, height), (left, low) = hull[-1], hull[-2] if len(hull) > 1 else (0.0, 0.0)
-            is_above = (height - low) * (x - left) >= (y - low) * (a - left)
-            if a < x and not (len(hull) > 1 and is_above):
-                break
-            hull.pop()
-        hull.append((x, y))
-    return hull
 
 
 class _SampleCounter:
@@ -152,28 +144,22 @@ class _SampleCounter:
             # The number of missing samples by damaged bytes gives the number of wraps.
             advance += self._modulus * max(0, round((1 + missing - advance) / self._modulus))
             return advance, advance - 1
-        if sample.time is not None:
-            return self._advance_by_time(sample.time, missing, max_advance)
-        usual = self.mean_advance * (1 + missing)
-        self._time = None if self._time is None else self._time + usual / self._rate
+        time, usual = sample.time, self.mean_advance * (1 + missing)
+        if time is not None:
+            self.ambiguity = 0
+            largest = max_advance / self._rate
+            for earlier in (self._time, self._outlier_time):
+                if earlier is not None and _MIN_STAMP_STEP <= time - earlier <= largest:
+                    self._time, self._outlier_time = time, None
+                    by_time = (time - earlier) * self._rate
+                    self._advances.append(by_time)
+                    self.mean_advance = median(self._advances)
+                    is_known = len(self._advances) == _MEDIAN_SIZE
+                    return by_time, (max(0, round(by_time / self.mean_advance) - 1)
+                                     if is_known else 0)
+            self._outlier_time = time  # a single outlier in the time of the device
+        self._time = time if self._time is None else self._time + usual / self._rate
         return usual, missing
-
-    def _advance_by_time(self, time: float, missing: int, max_advance: float) -> tuple[float, int]:
-        self.ambiguity = 0
-        largest = max_advance / self._rate
-        elapsed = next((time - last for last in (self._time, self._outlier_time)
-                        if last is not None and _MIN_STAMP_STEP <= time - last <= largest), None)
-        if elapsed is None:  # a single outlier in the time of the device
-            self._outlier_time = time
-            advance = self.mean_advance * (1 + missing)
-            self._time = time if self._time is None else self._time + advance / self._rate
-            return advance, missing
-        self._time, self._outlier_time = time, None
-        advance = elapsed * self._rate
-        self._advances.append(advance)
-        self.mean_advance = median(self._advances)
-        is_known = len(self._advances) == _MEDIAN_SIZE
-        return advance, max(0, round(advance / self.mean_advance) - 1) if is_known else 0
 
 
 class _LatenessTest:
@@ -209,7 +195,6 @@ class _LatenessTest:
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
 
     def has_slowed(self, number: float, arrival: float, slope: float) -> bool:
-        """Tell whether the samples are late since their rate fell."""
         assert self.late_since is not None
         return (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
 
@@ -218,16 +203,16 @@ class SampleClock:
     """
     Stamps samples; stamps increase strictly.
 
-    Corrections by the line, see `LowerLine`, are slewed. A stamp jumps only where later arrivals
-    show that samples were lost. The nominal rate of the gyro, Hz, is used for the first samples
-    only: its clock is 2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0
-    without one, and `min_stamp` the last stamp of another clock.
+    Corrections by the line are slewed. A stamp jumps only where later arrivals show that samples
+    were lost. The nominal rate of the gyro, Hz, is used for the first samples only: its clock is
+    2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0 without one, and
+    `min_stamp` the last stamp of another clock.
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
         self._counter = _SampleCounter(rate, modulus)
         self._lateness = _LatenessTest()
-        self._line = LowerLine(1.0 / rate)
+        self._line = _LowerLine(1.0 / rate)
         self._last_number, self._slew_offset = 0.0, 0.0
         self._uncertain_losses, self._uncertain_since, self._newly_lost = 0, 0.0, 0
         self._last_stamp, self._last_arrival = min_stamp, -math.inf
@@ -261,18 +246,14 @@ class SampleClock:
         if not samples:
             return []
         self._last_arrival = arrival = max(arrival, self._last_arrival)
-        numbers = self._number_samples(samples, arrival)
-        if shift := self._correct_losses(numbers[-1], arrival):
-            numbers = [number + shift for number in numbers]
-        self._update_line(numbers[-1], arrival)
-        return self._make_increasing(
-            [self._line.value_at(number) + self._slew_offset for number in numbers], arrival)
-
-    def _number_samples(self, samples: Sequence[Sample], arrival: float) -> list[float]:
-        number, before = self._last_number, self.lost_count
-        numbers: list[float] = []
+        line, number, before, numbers = self._line, self._last_number, self.lost_count, []
         for sample in samples:
-            advance, lost = self._counter.advance(sample, self._max_advance(number, arrival))
+            # the largest advance to a sample that has arrived
+            margin = (0.5 * max(self.period, _MIN_LATENESS) if self.is_settled
+                      else _OUTLIER_LATENESS)
+            left = (arrival + margin - line.value_at(number)) / line.slope
+            advance, lost = self._counter.advance(
+                sample, max(left, 1.5 * self._counter.mean_advance) if line.points else math.inf)
             number += advance
             self.lost_count += lost
             numbers.append(number)
@@ -280,15 +261,38 @@ class SampleClock:
         if self._newly_lost:
             self._uncertain_losses += self._newly_lost
             self._uncertain_since = arrival
-        return numbers
+        if shift := self._correct_losses(number, arrival):
+            numbers = [each + shift for each in numbers]
 
-    def _max_advance(self, number: float, arrival: float) -> float:
-        """Return the largest advance from a number to a sample that has arrived."""
-        if not self._line.points:
-            return math.inf
-        margin = 0.5 * max(self.period, _MIN_LATENESS) if self.is_settled else _OUTLIER_LATENESS
-        left = (arrival + margin - self._line.value_at(number)) / self._line.slope
-        return max(left, 1.5 * self._counter.mean_advance)
+        # the new line, and the difference to the one before, which is slewed
+        line, number = self._line, numbers[-1]
+        is_first, expected, lowest = (
+            not line.time_span(), line.value_at(number) + self._slew_offset, -math.inf)
+        if self.is_settled and self._uncertain_losses and self._counter.ambiguity and (
+                arrival - self._uncertain_since < _LATE_DURATION):  # their number may be too large
+            lowest = line.value_at(number)
+        line.add(number, max(arrival, lowest))
+        elapsed, self._last_number = max(0.0, number - self._last_number) * line.slope, number
+        slew = 0.0 if is_first else expected - line.value_at(number)
+        slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANT)
+        self._slew_offset = min(slew, arrival - line.value_at(number))
+        stamps = [line.value_at(each) + self._slew_offset for each in numbers]
+
+        # mean square of a lateness that is linear from the first sample to the last
+        first, last = (arrival - stamp + self._slew_offset for stamp in (stamps[0], stamps[-1]))
+        late, (past, past_after) = ((first * first + first * last + last * last) / 3.0,
+                                    self._mean_squares)
+        weight = min(1.0, len(stamps) * self.period / _RECENT_DURATION)
+        self._mean_squares = (
+            past + weight * (late - past),
+            past_after + weight * (self._slew_offset * self._slew_offset - past_after))
+
+        # increasing stamps
+        if stamps[0] < self._last_stamp + _MIN_STAMP_STEP:
+            step = max((stamps[-1] - self._last_stamp) / len(stamps), _MIN_STAMP_STEP)
+            stamps = [self._last_stamp + step * (index + 1) for index in range(len(stamps))]
+        self._last_stamp = stamps[-1]
+        return stamps
 
     def _correct_losses(self, number: float, arrival: float) -> int:
         """Correct the count of lost samples by the arrivals; return the correction."""
@@ -301,7 +305,7 @@ class SampleClock:
         if lateness < -0.5 * bound:
             excess = unit and unit * round(-lateness / (unit * period))
             if excess and excess <= self._uncertain_losses:
-                return self._renumber(self._uncertain_since, -excess)
+                return self._renumber(-excess)
             if not unit:  # a wrong time of the device: the apparent losses are cancelled
                 self.lost_count -= self._newly_lost
             if unit != 1:
@@ -314,53 +318,24 @@ class SampleClock:
             else:
                 assert self._lateness.late_since is not None
                 self._uncertain_since, self._lateness.late_since = self._lateness.late_since, None
-                return self._renumber(self._uncertain_since, lost)
+                return self._renumber(lost)
         return 0
 
-    def _renumber(self, since: float, offset: int) -> int:
-        self._line.shift(since, offset)
+    def _renumber(self, offset: int) -> int:
+        self._line.shift(self._uncertain_since, offset)
         self.lost_count += offset
         self._uncertain_losses += offset
         return offset
 
     def _restart_line(self) -> None:
-        self._line = LowerLine(self._line.slope)
+        self._line = _LowerLine(self._line.slope)
         self._lateness = _LatenessTest()
         self._slew_offset, self._uncertain_losses = 0.0, 0
-
-    def _update_line(self, number: float, arrival: float) -> None:
-        line, is_first = self._line, not self._line.time_span()
-        before, lowest = line.value_at(number) + self._slew_offset, -math.inf
-        if self.is_settled and self._uncertain_losses and self._counter.ambiguity and (
-                arrival - self._uncertain_since < _LATE_DURATION):  # their number may be too large
-            lowest = line.value_at(number)
-        line.add(number, max(arrival, lowest))
-        elapsed, self._last_number = max(0.0, number - self._last_number) * line.slope, number
-        slew = 0.0 if is_first else before - line.value_at(number)
-        slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANT)
-        self._slew_offset = min(slew, arrival - line.value_at(number))
-
-    def _make_increasing(self, stamps: list[float], arrival: float) -> list[float]:
-        first, last = (arrival - stamp + self._slew_offset for stamp in (stamps[0], stamps[-1]))
-        weight = min(1.0, len(stamps) * self.period / _RECENT_DURATION)
-        # mean square of a lateness that is linear from the first sample to the last
-        late, (before, after) = ((first * first + first * last + last * last) / 3.0,
-                                 self._mean_squares)
-        self._mean_squares = (before + weight * (late - before),
-                              after + weight * (self._slew_offset * self._slew_offset - after))
-        if stamps[0] < self._last_stamp + _MIN_STAMP_STEP:
-            step = max((stamps[-1] - self._last_stamp) / len(stamps), _MIN_STAMP_STEP)
-            stamps = [self._last_stamp + step * (index + 1) for index in range(len(stamps))]
-        self._last_stamp = stamps[-1]
-        return stamps
 
 
 def read_steady_clock() -> float:
     """Return seconds of the steady clock, including suspension of the host if supported."""
     return time.clock_gettime(_STEADY_CLOCK_ID)
-
-
-_STEADY_CLOCK_ID = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 
 def read_clock_pair(steady_clock: Callable[[], float],
@@ -374,7 +349,7 @@ def read_clock_pair(steady_clock: Callable[[], float],
     return None
 
 
-class ClockStepDetector:
+class _ClockStepDetector:
     """Detects that a clock was set, by comparison with a steady one; all in s."""
 
     def __init__(self) -> None:
@@ -396,7 +371,7 @@ class NodeTimeConverter:
     """Conversion of a steady clock to that of a node, by a filtered difference of the two."""
 
     def __init__(self) -> None:
-        self.steps = ClockStepDetector()
+        self.steps = _ClockStepDetector()
         self._difference = math.nan
         self._steady_time, self._node_time, self._last_stamp = -math.inf, -math.inf, -math.inf
 
@@ -424,7 +399,7 @@ class HostTimeConverter:
     """Conversion of stamps to a continuous time, s, less the jumps of the clock of the host."""
 
     def __init__(self) -> None:
-        self.steps = ClockStepDetector()
+        self.steps = _ClockStepDetector()
         self._offset = 0.0
         # size and time on the steady clock, s; of all, and of those that no sample has shown
         self._recent_steps: list[tuple[float, float]] = []

@@ -41,8 +41,7 @@ from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns, fit_noise_grid, heading_noise)
 from gyro_calibration.calibration.selection import SelectedEffects
-from gyro_calibration.diagnosis.gates import (
-    is_at_rest, refuse_mismatch, refuse_unusable)
+from gyro_calibration.diagnosis.gates import is_at_rest, refuse_mismatch, refuse_unusable
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
@@ -165,7 +164,21 @@ def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
                     for line in _read_text(path).splitlines()
                     if line.strip() and not line.strip().startswith('#'))
     elif path.endswith('.csv') and os.path.exists(path) and (columns := _read_header(path)):
-        yield from _read_rows(path, columns)
+        if (not set(columns) <= {'log', *_ENTRY_KEYS} or 'log' not in columns
+                or len(set(columns)) < len(columns)):
+            raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any '
+                             f'of {", ".join(_ENTRY_KEYS)}, each once')
+        first, *lines = _read_text(path).splitlines()
+        for number, row in enumerate(csv.reader(lines, delimiter=find_delimiter(first)), 2):
+            if not any(map(str.strip, row)):
+                continue
+            if len(row) != len(columns):
+                raise InputError(f'{path}, line {number}: holds {len(row)} values, wanted '
+                                 f'{len(columns)} as in its first line')
+            stated = dict(zip(columns, map(str.strip, row)))
+            if not stated['log']:
+                raise InputError(f'{path}, line {number}: names no log')
+            yield FleetLog(_resolve_log_path(path, stated['log'])).fill_missing(stated)
     else:
         yield FleetLog(path)
 
@@ -195,24 +208,6 @@ def _resolve_log_path(path: str, log: str) -> str:
     return str(relative) if relative.exists() or not Path(log).exists() else log
 
 
-def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
-    if (not set(columns) <= {'log', *_ENTRY_KEYS} or 'log' not in columns
-            or len(set(columns)) < len(columns)):
-        raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
-                         f'{", ".join(_ENTRY_KEYS)}, each once')
-    first, *lines = _read_text(path).splitlines()
-    for number, row in enumerate(csv.reader(lines, delimiter=find_delimiter(first)), 2):
-        if not any(map(str.strip, row)):
-            continue
-        if len(row) != len(columns):
-            raise InputError(f'{path}, line {number}: holds {len(row)} values, wanted '
-                             f'{len(columns)} as in its first line')
-        stated = dict(zip(columns, map(str.strip, row)))
-        if not stated['log']:
-            raise InputError(f'{path}, line {number}: names no log')
-        yield FleetLog(_resolve_log_path(path, stated['log'])).fill_missing(stated)
-
-
 def compile_file_pattern(text: str) -> re.Pattern[str]:
     """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `InputError`."""
     parts = re.split(r'\{(\w*)\}', text)
@@ -224,7 +219,7 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
                               for place, part in enumerate(parts)))
 
 
-def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -> FleetLog:
+def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None) -> FleetLog:
     """Return an entry with its empty fields filled from file name, notes or metadata."""
     # in order of precedence: table, pattern of the user, notes and metadata, usual file names
     stem = re.sub(f'({"|".join(map(re.escape, sorted(_LOG_SUFFIXES, key=len, reverse=True)))})$',
@@ -442,15 +437,31 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
         'slow': {} if log.time is None else fit_slow_effects(log, offset[0] if offset else 0.0),
         'noise': {name: float(value) for name, value in vars(model.noise).items()},
         'diagnosis': None, 'page': ''}
-    return found if task.generator is None else {**found, **_summarize_diagnosis(task, log)}
+    if task.generator is None:
+        return found
+    try:
+        diagnosis = (diagnose_table(log, None) if log.time is None
+                     else diagnose([log], task.generator, names=[to_printable(path)]))
+    except (DataRefused, ArithmeticError, np.linalg.LinAlgError) as error:
+        found['diagnosis'] = {'verdict': 'refused', 'reason': _format_reason(error, path),
+                              'findings': []}
+        return found
+    page = task.record_path.with_suffix('.html')
+    write_atomically(page, render_report(diagnosis).encode())
+    found['page'] = f'logs/{page.name}'
+    found['diagnosis'] = {'verdict': diagnosis.verdict, 'reason': '', 'findings': [
+        {'effect': each.effect, 'status': each.status, 'p_value': each.p_value,
+         'ambiguous_with': list(each.ambiguous_with),
+         'parameters': {name: value.to_dict() for name, value in each.parameters.items()}}
+        for each in diagnosis.findings]}
+    return found
 
 
 def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
     return {'value': float(value), 'deviation': float(deviation), 'unit': unit}
 
 
-def _calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
-                                                                tuple[float, float] | None]:
+def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[float, float] | None]:
     """
     Return the method of calibration of a log, its model, and the time offset of its reference.
 
@@ -476,21 +487,3 @@ def _calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
         return 'dwells', fitted.model, None
     offset = fitted.fit.time_offset, fitted.fit.time_offset_deviation
     return fitted.method, fitted.model, None if math.isnan(offset[0]) else offset
-
-
-def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:
-    assert task.generator is not None
-    try:
-        found = (diagnose_table(log, None) if log.time is None
-                 else diagnose([log], task.generator, names=[to_printable(task.entry.log)]))
-    except (DataRefused, ArithmeticError, np.linalg.LinAlgError) as error:
-        return {'diagnosis': {'verdict': 'refused',
-                              'reason': _format_reason(error, task.entry.log), 'findings': []}}
-    page = task.record_path.with_suffix('.html')
-    write_atomically(page, render_report(found).encode())
-    findings = [{'effect': each.effect, 'status': each.status, 'p_value': each.p_value,
-                 'ambiguous_with': list(each.ambiguous_with),
-                 'parameters': {name: value.to_dict() for name, value in each.parameters.items()}}
-                for each in found.findings]
-    return {'diagnosis': {'verdict': found.verdict, 'reason': '', 'findings': findings},
-            'page': f'logs/{page.name}'}

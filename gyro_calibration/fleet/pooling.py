@@ -57,7 +57,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtr
 from scipy.stats import qmc
 
-IntegerArray = NDArray[np.intp]
+_IntegerArray = NDArray[np.intp]
 #: The estimated standard deviations, and the share of the stated variance that is independent
 #: between logs.
 UNITS, DRIVES, POWER_ONS, OWN_SHARE = 'units', 'drives', 'power_ons', 'own_share'
@@ -72,8 +72,8 @@ class Observations:
 
     value: Array
     deviation: Array  # standard deviation that the log states, in the unit of the value
-    unit: IntegerArray  # number of the unit of each log, from 0 on
-    drive: IntegerArray  # number of the drive, from 0 on, or -1 where a log stands alone
+    unit: _IntegerArray  # number of the unit of each log, from 0 on
+    drive: _IntegerArray  # number of the drive, from 0 on, or -1 where a log stands alone
     #: Fixed effects in addition to the mean, such as age, shape (n, k).
     columns: Array = field(default_factory=lambda: np.empty((0, 0)))
     slope_count: int = 0  # of the first columns whose effect may differ from unit to unit, up to 2
@@ -95,7 +95,7 @@ class Interval:
     deviation: Any = math.nan
 
 
-def _sum_matrix(place: IntegerArray, terms: Array, size: int) -> Any:
+def _sum_matrix(place: _IntegerArray, terms: Array, size: int) -> Any:
     """Return the matrix that sums weights of logs times terms, shape (logs, ...), into places."""
     count = terms[0].size
     logs = np.repeat(np.arange(len(terms)), count)
@@ -179,7 +179,7 @@ class _Solution:
             np.log(variance).sum(axis=1) + np.linalg.slogdet(within)[1].sum(axis=1)
             + diagonal[:, -1] ** 2) - np.log(diagonal[:, :-1]).sum(axis=1)
 
-    def moments(self, fixed: Array, unit: IntegerArray, drive: IntegerArray,
+    def moments(self, fixed: Array, unit: _IntegerArray, drive: _IntegerArray,
                 weights: Array) -> tuple[Array, Array]:
         """Return means and variances of linear functions, shape (points, k)."""
         columns = np.zeros((len(self._tau), len(unit), self._equations.columns - 1))
@@ -237,9 +237,31 @@ class PooledValue:
             observed, value=(observed.value - self._median) / self._value_scale,
             deviation=np.maximum(observed.deviation / self._value_scale, 1e-5),
             columns=self._fixed[:, 1:])
-        self.variance_names = _identifiable_variances(observed)
-        self._bounds = _variance_bounds(self._scaled, self.variance_names)
-        self._equations = _Equations(self._scaled, self._fixed, DRIVES in self.variance_names)
+
+        # the variances that the logs distinguish
+        logs = np.bincount(observed.unit)
+        self.variance_names = names = [UNITS] if np.count_nonzero(logs) > 1 else []
+        for name, column in zip(SLOPES, observed.columns.T[:observed.slope_count]):
+            # a slope of its own needs three logs of a unit, at different values of the column
+            unit_count = sum(len(np.unique(column[observed.unit == unit])) >= 3
+                             for unit in range(len(logs)))
+            names += [name] if unit_count > 1 else []
+        if not names or logs.max() > 1:
+            names.append(POWER_ONS)
+        drives = observed.drive[observed.drive >= 0]
+        if len(drives) and np.bincount(drives).max() > 1 and len(np.unique(drives)) > 1:
+            names += [DRIVES, OWN_SHARE]
+
+        # the ends of each coordinate: the logarithm of floor, and of floor plus largest
+        square, self._bounds = float(np.median(self._scaled.deviation ** 2)), {}
+        for name in names:
+            groups = {POWER_ONS: len(fixed), DRIVES: len(np.unique(observed.drive))}.get(
+                name, len(np.unique(observed.unit)))
+            floor = max(square * groups / len(fixed), 1e-8)
+            # the largest standard deviation is 30 times that of the values about their median
+            self._bounds[name] = ((0.02, 1.0) if name == OWN_SHARE
+                                  else (math.log(floor), math.log(floor + 30.0 ** 2)))
+        self._equations = _Equations(self._scaled, self._fixed, DRIVES in names)
         self._best_point = self._find_best_point()
         self._sample_points, self._sample_weights = self._sample_variances()
         self._cached_solution: _Solution | None = None
@@ -333,7 +355,7 @@ class PooledValue:
 
     # estimates
 
-    def _moments(self, unit: IntegerArray | None = None, drive: IntegerArray | None = None,
+    def _moments(self, unit: _IntegerArray | None = None, drive: _IntegerArray | None = None,
                  fixed: Array | None = None, part: int = 0, error: Array | float = 0.0,
                  **more: float) -> tuple[Array, Array]:
         """Return means and variances at each point, shape (points, k), in units of the values."""
@@ -365,9 +387,17 @@ class PooledValue:
         mean, variance = self._moments(**wanted)
         value = self._sample_weights @ mean
         deviation = np.sqrt(self._sample_weights @ (variance + (mean - value) ** 2))
-        low, high = (_mixture_quantile(mean, variance, self._sample_weights, chance)
-                     for chance in (0.025, 0.975))
-        return Interval(value, low, high, deviation)
+        # quantiles of the mixtures of normal distributions by bisection; the probability outside
+        # of these ends is negligible
+        bounds, spread = [], np.sqrt(variance)
+        for chance in (0.025, 0.975):
+            low, high = (mean - 40.0 * spread).min(axis=0), (mean + 40.0 * spread).max(axis=0)
+            for _ in range(70):
+                middle = 0.5 * (low + high)
+                is_below = self._sample_weights @ ndtr((middle - mean) / spread) < chance
+                low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
+            bounds.append(0.5 * (low + high))
+        return Interval(value, bounds[0], bounds[1], deviation)
 
     def p_value(self, **wanted: Any) -> Array:
         """Return the two-sided p-values of linear functions against 0, shape (k,)."""
@@ -398,36 +428,6 @@ class PooledValue:
                 min(float(extended.p_value(fixed=row)[0]) * len(columns), 1.0))
 
 
-def _identifiable_variances(observed: Observations) -> list[str]:
-    """Return the variances that the logs distinguish."""
-    logs = np.bincount(observed.unit)
-    names = [UNITS] if np.count_nonzero(logs) > 1 else []
-    for name, column in zip(SLOPES, observed.columns.T[:observed.slope_count]):
-        # a slope of its own needs three logs of a unit, at different values of the column
-        unit_count = sum(len(np.unique(column[observed.unit == unit])) >= 3
-                         for unit in range(len(logs)))
-        names += [name] if unit_count > 1 else []
-    if not names or logs.max() > 1:
-        names.append(POWER_ONS)
-    drives = observed.drive[observed.drive >= 0]
-    if len(drives) and np.bincount(drives).max() > 1 and len(np.unique(drives)) > 1:
-        names += [DRIVES, OWN_SHARE]
-    return names
-
-
-def _variance_bounds(observed: Observations, names: list[str]) -> dict[str, tuple[float, float]]:
-    """Return the ends of each coordinate: the logarithm of floor, and of floor plus largest."""
-    square, found = float(np.median(observed.deviation ** 2)), {}
-    for name in names:
-        groups = {POWER_ONS: len(observed.value), DRIVES: len(np.unique(observed.drive))}.get(
-            name, len(np.unique(observed.unit)))
-        floor = max(square * groups / len(observed.value), 1e-8)
-        # the largest standard deviation is 30 times that of the values about their median
-        found[name] = ((0.02, 1.0) if name == OWN_SHARE
-                       else (math.log(floor), math.log(floor + 30.0 ** 2)))
-    return found
-
-
 def _log_prior(observed: Observations, variances: Mapping[str, Array]) -> Array:
     """Return logarithms of Jeffreys' prior of the variances of groups, shape (points,)."""
     variance = _log_variances(observed, variances)
@@ -440,7 +440,7 @@ def _log_prior(observed: Observations, variances: Mapping[str, Array]) -> Array:
             size = variances[name][:, None] if name != POWER_ONS else 0.0
             found = found + 0.5 * np.log(np.sum((size + mean) ** -2.0, axis=1))
 
-    def sums(group: IntegerArray, weights: Array) -> Array:
+    def sums(group: _IntegerArray, weights: Array) -> Array:
         matrix = _sum_matrix(np.maximum(group, 0), (group >= 0).astype(float), group.max() + 1)
         return np.asarray((matrix @ weights.T).T)
 
@@ -460,18 +460,6 @@ def _replace_coordinate(point: Array, coordinate: int, values: Array) -> Array:
     found = np.tile(point, (len(values), 1))
     found[:, coordinate] = values
     return found
-
-
-def _mixture_quantile(mean: Array, variance: Array, weight: Array, probability: float) -> Array:
-    """Return quantiles of mixtures of normal distributions, shape (k,), by bisection."""
-    deviation = np.sqrt(variance)
-    # the probability of a mixture outside of this is negligible
-    low, high = (mean - 40.0 * deviation).min(axis=0), (mean + 40.0 * deviation).max(axis=0)
-    for _ in range(70):
-        middle = 0.5 * (low + high)
-        is_below = weight @ ndtr((middle - mean) / deviation) < probability
-        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
-    return np.asarray(0.5 * (low + high))
 
 
 @dataclass(frozen=True)
@@ -505,7 +493,7 @@ def find_outlying_groups(pooled: PooledValue, kind: str, names: Sequence[str],
     return found[:last]
 
 
-def find_changes(pooled: PooledValue, date: IntegerArray, units: Sequence[str],
+def find_changes(pooled: PooledValue, date: _IntegerArray, units: Sequence[str],
                  dates: Sequence[str], significance: float) -> list[Alarm]:
     """
     Return the most significant change of a unit between dates, beyond the scatter of power-ons.

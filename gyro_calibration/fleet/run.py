@@ -30,9 +30,9 @@ import resource
 import signal
 from typing import Any, TypeVar
 
-Task = TypeVar('Task')
-Found = TypeVar('Found')
-_WorkFunction = Callable[[Task], Found]
+_Task = TypeVar('_Task')
+_Found = TypeVar('_Found')
+_WorkFunction = Callable[[_Task], _Found]
 
 
 class WorkerLost(Exception):
@@ -92,8 +92,8 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 
 
-def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: int,
-              create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | WorkerLost]]:
+def run_tasks(work: _WorkFunction[_Task, _Found], tasks: Iterable[_Task], workers: int,
+              create: Callable[[int], Executor]) -> Iterator[tuple[_Task, _Found | WorkerLost]]:
     """
     Yield each task with its result when it is finished, or with `WorkerLost`.
 

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,8 @@ from gyro_calibration.diagnosis.words import (
     as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
-    Alarm, DRIVES, find_changes, find_outlying_groups, IntegerArray, Interval, Observations,
-    OWN_SHARE, PooledValue, POWER_ONS, SLOPES, UNITS)
+    Alarm, DRIVES, find_changes, find_outlying_groups, Interval, Observations, OWN_SHARE,
+    PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -42,17 +43,17 @@ from scipy.stats import binom
 
 COMPONENT_LABELS = {UNITS: 'between units', POWER_ONS: 'between power-ons',
                     DRIVES: 'common to a drive'}
-LogRecord = Mapping[str, Any]
+_LogRecord = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class ValueSummary:
+class _ValueSummary:
     """One value of a type; mappings over units and drives hold those with a log that has it."""
 
     name: str
     unit: str  # of the value, in SI
     is_slow: bool  # an effect that one log does not distinguish from the wander of the bias
-    records: Sequence[LogRecord]  # of the logs that hold it
+    records: Sequence[_LogRecord]  # of the logs that hold it
     components: Mapping[str, Interval]  # standard deviations
     mean: Interval  # of the type
     p_value: float  # of the mean against zero
@@ -83,19 +84,19 @@ class ValueSummary:
 
 
 @dataclass(frozen=True)
-class TypeSummary:
+class _TypeSummary:
     """The results of one type."""
 
     name: str  # or ''
     units: Sequence[str]  # names in natural order
     drives: Sequence[str]
     dates: Sequence[str]
-    records: Sequence[LogRecord]  # of the logs
-    values: Mapping[str, ValueSummary]
+    records: Sequence[_LogRecord]  # of the logs
+    values: Mapping[str, _ValueSummary]
     significance: float  # probability of a false alarm of each kind and value
 
 
-def summarize_types(records: Sequence[LogRecord]) -> list[TypeSummary]:
+def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
     """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
@@ -116,19 +117,19 @@ def summarize_types(records: Sequence[LogRecord]) -> list[TypeSummary]:
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
         units, drives, dates = (_names(logs[kind], key) for key in ('unit', 'drive', 'date'))
-        summaries.append(TypeSummary(kind, units, drives, dates, logs[kind], found,
-                                     FALSE_ALARM_RATE / tests))
+        summaries.append(_TypeSummary(kind, units, drives, dates, logs[kind], found,
+                                      FALSE_ALARM_RATE / tests))
     return summaries
 
 
-def _names(records: Sequence[LogRecord], key: str) -> list[str]:
+def _names(records: Sequence[_LogRecord], key: str) -> list[str]:
     """Return the names of units, drives or dates; 2 comes before 10."""
     return sorted({str(each[key]) for each in records} - {''},
                   key=lambda text: (len(text) if text.isdigit() else 0, text))
 
 
-def _summarize_value(name: str, slow: bool, records: Sequence[LogRecord],
-                     significance: float) -> ValueSummary:
+def _summarize_value(name: str, slow: bool, records: Sequence[_LogRecord],
+                     significance: float) -> _ValueSummary:
     key = 'slow' if slow else 'values'
     records = [each for each in records if name in each[key]]
     units, drives, dates = (_names(records, kind) for kind in ('unit', 'drive', 'date'))
@@ -137,7 +138,20 @@ def _summarize_value(name: str, slow: bool, records: Sequence[LogRecord],
         for kind, names in (('unit', units), ('drive', drives), ('date', dates)))
     value, deviation = (np.array([each[key][name][what] for each in records])
                         for what in ('value', 'deviation'))
-    columns = _covariates(records, unit)
+    # age, years, and temperature, K, less their means, where they vary within units
+    columns = {}
+    for over, known in (
+            ('age', [date.fromisoformat(each['date']).toordinal() / 365.25
+                     for each in records if each['date']]),
+            ('temperature', [float(each['temperature'])
+                             for each in records if each['temperature'] is not None])):
+        if len(known) == len(records):
+            column = np.array(known)
+            within = column - (np.bincount(unit, column) / np.bincount(unit))[unit]
+            if np.std(within) > 1e-9 * (1.0 + np.abs(column).max()):
+                columns[over] = column - column.mean()
+    if len(records) < len(set(unit.tolist())) + len(columns) + 2:
+        columns = {}  # slopes need logs enough in addition to the means of units
     pooled = PooledValue(Observations(value, deviation, unit, drive, np.column_stack(
         [*columns.values()]) if columns else np.empty((0, 0)), len(columns)))
 
@@ -151,7 +165,7 @@ def _summarize_value(name: str, slow: bool, records: Sequence[LogRecord],
     mean, *slopes = np.eye(1 + len(columns))
     found_drives = pooled.estimate(drive=np.arange(len(drives)),
                                    fixed=np.zeros((len(drives), len(mean))))
-    return ValueSummary(
+    return _ValueSummary(
         name, records[0][key][name]['unit'], slow, records, pooled.components, of_type(mean),
         float(pooled.p_value(fixed=mean[None])[0]), of_type(mean, units=1.0, power_ons=1.0),
         of_units(mean), of_units(0.0 * mean), of_units(mean, power_ons=1.0),
@@ -170,26 +184,28 @@ def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
             for name, *parts in zip(names, *vars(found).values())}
 
 
-def _covariates(records: Sequence[LogRecord], unit: IntegerArray) -> dict[str, Array]:
-    """Return age, years, and temperature, K, less their means, where they vary within units."""
-    days = [date.fromisoformat(each['date']).toordinal() for each in records if each['date']]
-    temperatures = [float(each['temperature'])
-                    for each in records if each['temperature'] is not None]
-    columns = {}
-    for name, column in (('age', np.array(days) / 365.25),
-                         ('temperature', np.array(temperatures))):
-        if len(column) == len(records):
-            within = column - (np.bincount(unit, column) / np.bincount(unit))[unit]
-            if np.std(within) > 1e-9 * (1.0 + np.abs(column).max()):
-                columns[name] = column - column.mean()
-    # slopes need logs enough in addition to the means of units
-    return columns if len(records) >= len(set(unit.tolist())) + len(columns) + 2 else {}
-
-
-def describe_type(summary: TypeSummary) -> Iterator[str]:
+def describe_type(summary: _TypeSummary) -> Iterator[str]:
     """Give the sentences on the origin of each value, its outliers and its changes."""
-    for each in summary.values.values():
-        yield from _describe_value(each)
+    meanings = {UNITS: 'is an error of the unit: most of its variance is between units',
+                DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
+                'between drives, and common to the units of a drive',
+                POWER_ONS: 'is not repeatable: most of its variance is between power-ons'}
+    for value in summary.values.values():
+        label = readable_name(value.name)
+        shares = {name: value.components[name] for name in meanings if name in value.components}
+        owner = max(shares, key=lambda name: shares[name].value, default='')
+        if owner and shares[owner].low > 0.0 and not value.is_slow:
+            yield f'{label} {meanings[owner]}'
+        for alarms, who, differs, of in (
+                (value.outlying_units, 'unit', 'differs from its type by', ''),
+                (value.outlying_drives, 'all units of drive', 'deviate by',
+                 ', an error of the reference'),
+                (value.changes, 'unit', 'changed by', '')):
+            for alarm in alarms:
+                since = f' on {alarm.since}' if alarm.since else ''
+                yield (f'{label}: {who} {to_printable(alarm.name)} {differs} '
+                       f'{format_amount(alarm.size, value.unit, value.name)}{since}{of} '
+                       f'(probability {alarm.p_value:.1g})')
     slow = [each for each in summary.values.values() if each.is_slow]
     if repeating := find_missing_effects(summary):
         first, *others = repeating
@@ -211,30 +227,7 @@ def describe_type(summary: TypeSummary) -> Iterator[str]:
                f'of {count.units} of {len(summary.units)} units: {origin[count.owner]}')
 
 
-def _describe_value(value: ValueSummary) -> Iterator[str]:
-    """Give the origin of a value: unit, drive or power-on; then outliers and changes."""
-    label = readable_name(value.name)
-    meanings = {UNITS: 'is an error of the unit: most of its variance is between units',
-                DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
-                'between drives, and common to the units of a drive',
-                POWER_ONS: 'is not repeatable: most of its variance is between power-ons'}
-    shares = {name: value.components[name] for name in meanings if name in value.components}
-    owner = max(shares, key=lambda name: shares[name].value, default='')
-    if owner and shares[owner].low > 0.0 and not value.is_slow:
-        yield f'{label} {meanings[owner]}'
-    for alarms, who, differs, of in (
-            (value.outlying_units, 'unit', 'differs from its type by', ''),
-            (value.outlying_drives, 'all units of drive', 'deviate by',
-             ', an error of the reference'),
-            (value.changes, 'unit', 'changed by', '')):
-        for each in alarms:
-            since = f' on {each.since}' if each.since else ''
-            yield (f'{label}: {who} {to_printable(each.name)} {differs} '
-                   f'{format_amount(each.size, value.unit, value.name)}{since}{of} (probability '
-                   f'{each.p_value:.1g})')
-
-
-def find_missing_effects(summary: TypeSummary) -> list[ValueSummary]:
+def find_missing_effects(summary: _TypeSummary) -> list[_ValueSummary]:
     """Return the slow effects that repeat in all units, the most significant first."""
     slow = [each for each in summary.values.values()
             if each.is_slow and each.p_value < summary.significance]
@@ -242,7 +235,7 @@ def find_missing_effects(summary: TypeSummary) -> list[ValueSummary]:
 
 
 @dataclass(frozen=True)
-class EffectCount:
+class _EffectCount:
     """An effect that diagnoses of single logs established, and that is no pooled value."""
 
     effect: str
@@ -254,7 +247,7 @@ class EffectCount:
     chance: float  # p-value of the number of logs under false alarms only, times the candidates
 
 
-def count_effects(summary: TypeSummary) -> list[EffectCount]:
+def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
     """
     Assign the established effects of diagnoses by the numbers of logs that show them.
 
@@ -289,41 +282,39 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
         if chance >= summary.significance:
             owner = name = ''
         units = {each['unit'] for each, one in zip(logs, shows) if one}
-        result.append(EffectCount(effect, int(shows.sum()), len(units), len(logs), owner, name,
-                                  min(chance, 1.0)))
+        result.append(_EffectCount(effect, int(shows.sum()), len(units), len(logs), owner, name,
+                                   min(chance, 1.0)))
     return result
 
 
-def data(summary: TypeSummary) -> dict[str, Any]:
+def data(summary: _TypeSummary) -> dict[str, Any]:
+    values = {}
+    for value in summary.values.values():
+        keys = {UNITS: 'between_units', POWER_ONS: 'between_power_ons', DRIVES: 'between_drives',
+                OWN_SHARE: 'own_share_of_errors',
+                **{name: f'between_units_over_{over}' for name, over in zip(SLOPES, value.slopes)}}
+        values[value.name] = {
+            'unit': value.unit, 'slow': value.is_slow, 'logs': len(value.records),
+            **{keys[name]: {'estimate': part.value, 'ci95': [part.low, part.high]}
+               for name, part in value.components.items()},
+            'type_mean': _interval_data(value.mean), 'new_unit': _interval_data(value.new_unit),
+            'chance_of_zero_mean': value.p_value,
+            'units': {name: {**_interval_data(interval),
+                             'from_type': _interval_data(value.type_deviation[name]),
+                             'next_power_on': _interval_data(value.next_power_on[name]),
+                             'slopes': {over: _interval_data(slopes[name])
+                                        for over, slopes in value.unit_slopes.items()}}
+                      for name, interval in value.units.items()},
+            'drives': {name: _interval_data(interval) for name, interval in value.drives.items()},
+            'slopes': {name: _interval_data(slope) for name, slope in value.slopes.items()},
+            'outlying_units': [each.to_dict() for each in value.outlying_units],
+            'outlying_drives': [each.to_dict() for each in value.outlying_drives],
+            'changed_units': [each.to_dict() for each in value.changes]}
     return {'type': summary.name, 'units': list(summary.units), 'drives': list(summary.drives),
-            'logs': len(summary.records), 'level': summary.significance,
-            'values': {name: _value_data(each) for name, each in summary.values.items()},
+            'logs': len(summary.records), 'level': summary.significance, 'values': values,
             'effects': [asdict(each) for each in count_effects(summary)],
             'lacking': [each.name for each in find_missing_effects(summary)],
             'sentences': list(describe_type(summary))}
-
-
-def _value_data(value: ValueSummary) -> dict[str, Any]:
-    keys = {UNITS: 'between_units', POWER_ONS: 'between_power_ons', DRIVES: 'between_drives',
-            OWN_SHARE: 'own_share_of_errors',
-            **{name: f'between_units_over_{over}' for name, over in zip(SLOPES, value.slopes)}}
-    return {
-        'unit': value.unit, 'slow': value.is_slow, 'logs': len(value.records),
-        **{keys[name]: {'estimate': part.value, 'ci95': [part.low, part.high]}
-           for name, part in value.components.items()},
-        'type_mean': _interval_data(value.mean), 'new_unit': _interval_data(value.new_unit),
-        'chance_of_zero_mean': value.p_value,
-        'units': {name: {**_interval_data(interval),
-                         'from_type': _interval_data(value.type_deviation[name]),
-                         'next_power_on': _interval_data(value.next_power_on[name]),
-                         'slopes': {over: _interval_data(slopes[name])
-                                    for over, slopes in value.unit_slopes.items()}}
-                  for name, interval in value.units.items()},
-        'drives': {name: _interval_data(interval) for name, interval in value.drives.items()},
-        'slopes': {name: _interval_data(slope) for name, slope in value.slopes.items()},
-        'outlying_units': [each.to_dict() for each in value.outlying_units],
-        'outlying_drives': [each.to_dict() for each in value.outlying_drives],
-        'changed_units': [each.to_dict() for each in value.changes]}
 
 
 def _interval_data(interval: Interval) -> dict[str, Any]:
@@ -332,7 +323,7 @@ def _interval_data(interval: Interval) -> dict[str, Any]:
             'ci95': ends if all(map(math.isfinite, ends)) else None}
 
 
-def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
+def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     """
     Give for a further unit of a type, with the name '', and for each unit: name and model.
 
@@ -373,71 +364,12 @@ _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 're
             'samples', 'duration_s', 'sha256', 'page')
 
 
-def render_fleet_page(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
+def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
              f'{len(types)} {"type" if len(types) == 1 else "types"}')
     about = f'{len(records) - used} more logs are excluded.' if used < len(records) else None
-    body = join_markup(
-        element('header', element('p', 'Fleet', class_='about'), element('h1', title),
-                element('p', about, class_='gained') if about else None),
-        element('main', *(part for place, found in enumerate(types)
-                          for part in _type_sections(found, f't{place}')), _log_section(records)),
-        Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
-    return render_page(f'Fleet: {title}', body)
-
-
-def _type_sections(summary: TypeSummary, key: str) -> Iterator[Markup]:
-    name = summary.name or 'Type not stated'
-    items = [element('li', as_sentence(text)) for text in describe_type(summary)]
-    yield element('section', element('h2', name), element('ul', *items), _variance_table(summary))
-    values = [each for each in summary.values.values() if not each.is_slow]
-    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
-    drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
-              for each in summary.values.values() if each.drives]
-    dates = [_dates_chart(summary, each, key) for each in values if len(summary.dates) > 1]
-    for heading, charts, text, more in (
-            ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
-             _unit_table(summary, values)),
-            ('drives', drives, 'An error that all units of a drive have in common is assigned to '
-             'its reference or to the vehicle.', None),
-            ('over time', dates, '', None)):
-        if charts or more:
-            yield element('section', element('h2', f'{name}: {heading}'),
-                          element('p', text, class_='quiet') if text else None,
-                          element('div', *map(draw_chart, charts), class_='pairs'), more)
-
-
-def _variance_table(summary: TypeSummary) -> Markup:
-    per = {'age': '/year', 'temperature': '/K'}
-    drifts = any(each.slopes for each in summary.values.values())
-    heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
-             *(['drift'] if drifts else [])]
-    return _table(heads, [
-        [_cell(readable_name(each.name)), _interval_cell(each, each.mean),
-         _interval_cell(each, each.new_unit),
-         *(_cell(each.format_component(name), each.components[name].value
-                 if name in each.components else -1.0) for name in COMPONENT_LABELS),
-         *([_cell('; '.join(each.format_interval(slope, per[name])
-                            for name, slope in each.slopes.items()))] if drifts else [])]
-        for each in summary.values.values()])
-
-
-def _unit_table(summary: TypeSummary, values: Sequence[ValueSummary]) -> Markup:
-    alarms = {'stands out': {alarm.name for each in summary.values.values()
-                             for alarm in each.outlying_units},
-              'changed': {alarm.name for each in summary.values.values()
-                          for alarm in each.changes}}
-    logs = Counter(each['unit'] for each in summary.records)
-    return _table(['unit', 'logs', *(readable_name(each.name) for each in values), 'remark'], [
-        [_cell(name), _cell(str(logs[name]), logs[name]),
-         *(_interval_cell(each, each.units.get(name)) for each in values),
-         _cell(', '.join(text for text, names in alarms.items() if name in names))]
-        for name in summary.units])
-
-
-def _log_section(records: Sequence[Mapping[str, Any]]) -> Markup:
     names = list(dict.fromkeys(name for each in records for name in each.get('values', ())))
     heads = ['log', 'type', 'unit', 'drive', 'date', *map(readable_name, names), 'diagnosis',
              'remark']
@@ -455,7 +387,66 @@ def _log_section(records: Sequence[Mapping[str, Any]]) -> Markup:
                      *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *cells,
                      _cell((each.get('diagnosis') or {}).get('verdict', '')),
                      _cell(each['reason'])])
-    return element('section', element('h2', 'Logs'), _table(heads, rows))
+    body = join_markup(
+        element('header', element('p', 'Fleet', class_='about'), element('h1', title),
+                element('p', about, class_='gained') if about else None),
+        element('main', *(part for place, found in enumerate(types)
+                          for part in _type_sections(found, f't{place}')),
+                element('section', element('h2', 'Logs'), _table(heads, rows))),
+        Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
+    return render_page(f'Fleet: {title}', body)
+
+
+def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
+    name, of_type = summary.name or 'Type not stated', summary.values.values()
+    per, drifts = {'age': '/year', 'temperature': '/K'}, any(each.slopes for each in of_type)
+    heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
+             *(['drift'] if drifts else [])]
+    variances = _table(heads, [
+        [_cell(readable_name(each.name)), _interval_cell(each, each.mean),
+         _interval_cell(each, each.new_unit),
+         *(_cell(each.format_component(part), each.components[part].value
+                 if part in each.components else -1.0) for part in COMPONENT_LABELS),
+         *([_cell('; '.join(each.format_interval(slope, per[over])
+                            for over, slope in each.slopes.items()))] if drifts else [])]
+        for each in of_type])
+    items = [element('li', as_sentence(text)) for text in describe_type(summary)]
+    yield element('section', element('h2', name), element('ul', *items), variances)
+
+    values = [each for each in of_type if not each.is_slow]
+    alarms = {'stands out': {alarm.name for each in of_type for alarm in each.outlying_units},
+              'changed': {alarm.name for each in of_type for alarm in each.changes}}
+    logs = Counter(each['unit'] for each in summary.records)
+    of_units = _table(['unit', 'logs', *(readable_name(each.name) for each in values), 'remark'], [
+        [_cell(unit), _cell(str(logs[unit]), logs[unit]),
+         *(_interval_cell(each, each.units.get(unit)) for each in values),
+         _cell(', '.join(text for text, names in alarms.items() if unit in names))]
+        for unit in summary.units])
+    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
+    drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
+              for each in of_type if each.drives]
+    dates = []  # values of logs, less those of their units, over their dates
+    for each in values if len(summary.dates) > 1 else ():
+        measure, factor = display_unit(each.unit, each.name)
+        label, dated = readable_name(each.name), [one for one in each.records if one['date']]
+        place = np.array([summary.dates.index(one['date']) + 1.0 for one in dated])
+        difference: Array = np.array([
+            one['values'][each.name]['value'] - each.units[one['unit']].value for one in dated])
+        dates.append(Chart(
+            f'{key}-{each.name}-dates', f'{label} less that of the unit',
+            f'dates: {", ".join(summary.dates)}', 'date', '', place, label, measure,
+            [Line('log', 'measured', factor * difference, draw_dots=True)],
+            x_names=summary.dates))
+    for heading, charts, text, more in (
+            ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
+             of_units),
+            ('drives', drives, 'An error that all units of a drive have in common is assigned to '
+             'its reference or to the vehicle.', None),
+            ('over time', dates, '', None)):
+        if charts or more:
+            yield element('section', element('h2', f'{name}: {heading}'),
+                          element('p', text, class_='quiet') if text else None,
+                          element('div', *map(draw_chart, charts), class_='pairs'), more)
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
@@ -470,12 +461,12 @@ def _cell(text: str, key: float | None = None) -> Markup:
     return element('td', text, data_key=text if key is None else f'{key:.9g}')
 
 
-def _interval_cell(value: ValueSummary, interval: Interval | None) -> Markup:
+def _interval_cell(value: _ValueSummary, interval: Interval | None) -> Markup:
     return (_cell('') if interval is None
             else _cell(value.format_interval(interval), interval.value))
 
 
-def _interval_chart(value: ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
+def _interval_chart(value: _ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
                     style: str) -> Chart:
     unit, factor = display_unit(value.unit, value.name)
     low, high = (np.array([getattr(each, end) for each in intervals.values()])
@@ -489,51 +480,33 @@ def _interval_chart(value: ValueSummary, key: str, kind: str, intervals: Mapping
                  lines, x_names=list(intervals))
 
 
-def _dates_chart(summary: TypeSummary, value: ValueSummary, key: str) -> Chart:
-    """Return the values of logs, less those of their units, over their dates."""
-    unit, factor = display_unit(value.unit, value.name)
-    dated = [each for each in value.records if each['date']]
-    place = np.array([summary.dates.index(each['date']) + 1.0 for each in dated])
-    difference: Array = np.array([
-        each['values'][value.name]['value'] - value.units[each['unit']].value for each in dated])
-    return Chart(f'{key}-{value.name}-dates', f'{readable_name(value.name)} less that of the unit',
-                 f'dates: {", ".join(summary.dates)}', 'date', '', place,
-                 readable_name(value.name), unit,
-                 [Line('log', 'measured', factor * difference, draw_dots=True)],
-                 x_names=summary.dates)
-
-
-def table_files(types: Sequence[TypeSummary],
+def table_files(types: Sequence[_TypeSummary],
                 records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """Return the content of files by name: values of logs, and of units, one row each, in SI."""
-    found, log_rows = {}, []
+    found, log_rows, unit_rows = {}, [], []
     for record in records:
         log_rows.append({key: record.get(key) for key in _COLUMNS})
         for name, value in (record.get('values', {}) | record.get('slow', {})).items():
             log_rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
-    for name, rows in (('logs', log_rows), ('units', list(_unit_rows(types)))):
+    for summary in types:
+        for unit, (name, each) in itertools.product(summary.units, summary.values.items()):
+            if unit not in each.units:
+                continue
+            estimate, following = each.units[unit], each.next_power_on[unit]
+            row = {'type': summary.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
+                   'estimate': estimate.value, 'standard_deviation': estimate.deviation,
+                   'low': estimate.low, 'high': estimate.high,
+                   'from_type': each.type_deviation[unit].value,
+                   'next_low': following.low, 'next_high': following.high,
+                   'stands_out': unit in {alarm.name for alarm in each.outlying_units}}
+            for over, slopes in each.unit_slopes.items():
+                row |= {f'{over}_slope': slopes[unit].value,
+                        f'{over}_slope_low': slopes[unit].low,
+                        f'{over}_slope_high': slopes[unit].high}
+            unit_rows.append(row)
+    for name, rows in (('logs', log_rows), ('units', unit_rows)):
         columns = dict.fromkeys(key for row in rows for key in row)
         if columns:
             found[f'{name}.csv'] = format_rows(
-                [columns, *([row.get(each) for each in columns] for row in rows)]).encode()
+                [columns, *([row.get(key) for key in columns] for row in rows)]).encode()
     return found
-
-
-def _unit_rows(types: Sequence[TypeSummary]) -> Iterator[dict[str, Any]]:
-    for found in types:
-        for unit in found.units:
-            for name, each in found.values.items():
-                if unit not in each.units:
-                    continue
-                estimate, following = each.units[unit], each.next_power_on[unit]
-                row = {'type': found.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
-                       'estimate': estimate.value, 'standard_deviation': estimate.deviation,
-                       'low': estimate.low, 'high': estimate.high,
-                       'from_type': each.type_deviation[unit].value,
-                       'next_low': following.low, 'next_high': following.high,
-                       'stands_out': unit in {alarm.name for alarm in each.outlying_units}}
-                for over, slopes in each.unit_slopes.items():
-                    row |= {f'{over}_slope': slopes[unit].value,
-                            f'{over}_slope_low': slopes[unit].low,
-                            f'{over}_slope_high': slopes[unit].high}
-                yield row

@@ -112,7 +112,7 @@ class MessageError(ValueError):
 
 
 @dataclass(frozen=True)
-class MessageLayout:
+class _MessageLayout:
     """The layout in bytes of a message type, with the quantities of a gyro or reference."""
 
     #: Runs of contiguous numbers: size in bytes of an element of the text or sequence before the
@@ -122,7 +122,7 @@ class MessageLayout:
 
 
 @cache
-def parse_layout(definition: str, axis: str = 'z') -> MessageLayout:
+def parse_layout(definition: str, axis: str = 'z') -> _MessageLayout:
     """Return the layout of a message type by its definition, with the rate about an axis."""
     if len(definition) > _MAX_DEFINITION_LENGTH:
         raise MessageError(f'it has more than {_MAX_DEFINITION_LENGTH} characters')
@@ -155,8 +155,8 @@ def parse_layout(definition: str, axis: str = 'z') -> MessageLayout:
     quantities = {quantity: places[found] for quantity, fields in _QUANTITY_FIELDS.items()
                   for found in [field.format(axis) for field in fields
                                 if field.format(axis) in places][:1]}
-    return MessageLayout(tuple((struct.calcsize(before), codes) for before, codes in runs),
-                         quantities)
+    return _MessageLayout(tuple((struct.calcsize(before), codes) for before, codes in runs),
+                          quantities)
 
 
 def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
@@ -181,8 +181,7 @@ def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, pat
 
 
 #: Message type -> layout, with the rate about z.
-LAYOUTS: Mapping[str, MessageLayout] = {kind: parse_layout(text)
-                                        for kind, text in DEFINITIONS.items()}
+LAYOUTS = {kind: parse_layout(text) for kind, text in DEFINITIONS.items()}
 
 
 @cache
@@ -199,7 +198,7 @@ def _padded_struct(order: str, codes: str, offset: int) -> struct.Struct:
 _UNPACK_LENGTH = {order: struct.Struct(f'{order}I').unpack_from for order in '<>'}
 
 
-def parse(data: bytes, layout: MessageLayout) -> tuple[int, tuple[float, ...]]:
+def parse(data: bytes, layout: _MessageLayout) -> tuple[int, tuple[float, ...]]:
     """Return the stamp of a message, in ns since 1970, and its numbers, or raise MessageError."""
     if data[:2] not in (b'\0\0', b'\0\1'):
         raise MessageError(f'a message begins with {data[:4].hex()}, which is not plain CDR')

@@ -17,6 +17,7 @@ A name of the log format states quantity and unit. The user assigns other names,
 
 from collections.abc import Iterable, Mapping, Sequence
 import difflib
+import itertools
 import math
 import re
 import shlex
@@ -93,8 +94,8 @@ class Column(NamedTuple):
     offset: float = 0.0
 
 
-def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
-                 axis: str = 'z') -> dict[str, Column]:
+def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
+                 axis: str) -> dict[str, Column]:
     """
     Return the column of each quantity of a log, and of each part of an `ATTITUDE`.
 
@@ -117,8 +118,18 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
         if len(columns) != len(parts):
             raise InputError(f'{name}={text}: wanted the four columns of a quaternion, such as '
                              'attitude=qw/qx/qy/qz')
-        found |= {part: _find_column(header, name, column, units)
-                  for part, column in zip(parts, columns)}
+        for part, column in zip(parts, columns):
+            given, unit = column, next(iter(units))
+            if column not in header and ':' in column:
+                column, _, unit = column.rpartition(':')
+            if unit not in units:
+                raise InputError(f'{name}={given}: {unit} is no unit of it; wanted one of '
+                                 f'{", ".join(units)}{suggest_nearest(unit, units)}')
+            if column not in header:
+                raise InputError(f'{name}={given}: there is no column {column} among '
+                                 f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
+            offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
+            found[part] = Column(header.index(column), units[unit], offset)
     asked = {column.position for column in found.values()}
     for index, name in enumerate(header):
         quantity, factor = COLUMNS.get(_strip_axis(name, axis), ('', 0.0))
@@ -132,21 +143,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
         raise InputError(f'no gyro column among {_shorten(",".join(header))}; '
                          f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggest_columns(header)}')
     return found
-
-
-def _find_column(header: Sequence[str], name: str, text: str,
-                 units: Mapping[str, float]) -> Column:
-    column, unit = text, next(iter(units))
-    if text not in header and ':' in text:
-        column, _, unit = text.rpartition(':')
-    if unit not in units:
-        raise InputError(f'{name}={text}: {unit} is no unit of it; wanted one of '
-                         f'{", ".join(units)}{suggest_nearest(unit, units)}')
-    if column not in header:
-        raise InputError(f'{name}={text}: there is no column {column} among '
-                         f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
-    offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
-    return Column(header.index(column), units[unit], offset)
 
 
 def _strip_axis(name: str, axis: str) -> str:
@@ -171,11 +167,15 @@ def suggest_columns(header: Sequence[str]) -> str:
     """Suggest the option --columns for a header, or another name; '' without a suggestion."""
     names = [name for name in header if name not in COLUMNS and name == _shorten(name)
              and not set(name) & set(',=:')]
-    wanted = {}
-    for quantity in _COLUMN_ALIASES:
-        for name in names:
-            if quantity not in wanted and (unit := _guess_unit(name, quantity)):
-                wanted[quantity] = f'{quantity}={name}:{unit}'
+    wanted = dict[str, str]()
+    for quantity, alias in _COLUMN_ALIASES.items():
+        endings = {re.sub('[^a-z]', '', unit.lower()): unit
+                   for unit in _OPTION_QUANTITIES[quantity][1]}
+        endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
+        for name, (end, unit) in itertools.product(names, {**endings, '': 'UNIT'}.items()):
+            letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
+            if letters.endswith(end) and re.fullmatch(alias, letters.removesuffix(end)):
+                wanted.setdefault(quantity, f'{quantity}={name}:{unit}')
     if 'gyro' in wanted:
         attitude = '' if 'heading' in wanted else suggest_attitude(names)
         text = ','.join(filter(None, [*wanted.values(), attitude]))
@@ -193,19 +193,6 @@ def suggest_attitude(names: Iterable[str]) -> str:
     found = {name[-2:].lower(): name for name in names}
     parts = [found.get(f'q{axis}', '') for axis in ('w', *AXES)]
     return f'attitude={"/".join(parts)}' if all(parts) else ''
-
-
-def _guess_unit(name: str, quantity: str) -> str:
-    """Return the unit in a name of a quantity, UNIT without one; '' for another quantity."""
-    letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
-    units = _OPTION_QUANTITIES[quantity][1]
-    endings = {re.sub('[^a-z]', '', unit.lower()): unit for unit in units}
-    endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
-    for end, unit in {**endings, '': 'UNIT'}.items():
-        if letters.endswith(end) and re.fullmatch(_COLUMN_ALIASES[quantity],
-                                                  letters.removesuffix(end)):
-            return unit
-    return ''
 
 
 def _shorten(text: str) -> str:

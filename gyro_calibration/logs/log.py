@@ -175,7 +175,14 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
         budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
-        while block := _read_block(lines, rows):
+        while True:
+            block, length = list[str](), 0  # fewer lines where they are long
+            while (length < _MAX_BLOCK_LENGTH and (
+                    more := list(itertools.islice(lines, min(rows - len(block), 256))))):
+                block += more
+                length += sum(map(len, more))
+            if not block:
+                break
             if budget:
                 budget.spend(sum(map(len, block)))
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
@@ -241,17 +248,6 @@ def _iter_lines(text: io.TextIOWrapper) -> Iterator[str]:
         yield line
 
 
-def _read_block(lines: Iterator[str], rows: int) -> list[str]:
-    """Return the next lines: `rows` of them, or fewer where they are long."""
-    block: list[str] = []
-    length = 0
-    while (length < _MAX_BLOCK_LENGTH
-            and (more := list(itertools.islice(lines, min(rows - len(block), 256))))):
-        block += more
-        length += sum(map(len, more))
-    return block
-
-
 def _limit_length(lines: Iterator[str]) -> Iterator[str]:
     left = _MAX_BLOCK_LENGTH
     for line in lines:
@@ -288,7 +284,10 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
         delimiter, line = ' ', ' '.join(line.split())
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
-    has_names = not all(_is_number(name) for name in header)
+    try:
+        has_names = not np.isfinite([_to_number(name.replace(',', '.')) for name in header]).all()
+    except ValueError:
+        has_names = True
     if not has_names:
         header = [str(1 + place) for place in range(len(header))]
     if not is_header(header, columns, axis):
@@ -303,32 +302,20 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
         raise LogError(f'line {len(notes) + 1} is no header with a known column: '
                        f'{excerpt(line.strip())}{meant}')
     found = find_columns(header, columns, axis)
-    taken = {column.position for column in found.values()}
-    others = {name: index for index, name in enumerate(_make_unique(header))
-              if index not in taken and header[index] not in COLUMNS}
+    positions = {column.position for column in found.values()}
+    # the other names, made unique: a second x becomes x.1
+    others, taken, numbers = dict[str, int](), set(header), dict[str, int]()
+    for index, name in enumerate(header):
+        unique = name
+        while name in numbers and unique in taken:
+            numbers[name] += 1
+            unique = f'{name}.{numbers[name]}'
+        numbers.setdefault(name, 0)
+        taken.add(unique)
+        if index not in positions and name not in COLUMNS:
+            others[unique] = index
     return (_FileHeader(tuple(notes), header, found, others, delimiter),
             len(notes) + has_names * rows.line_num + 1, [] if has_names else [line])
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(_to_number(text.replace(',', '.')))
-    except ValueError:
-        return False
-
-
-def _make_unique(header: list[str]) -> list[str]:
-    """Return the names of columns, made unique: a second x becomes x.1."""
-    taken, numbers, names = set(header), dict[str, int](), list[str]()
-    for name in header:
-        tried = name
-        while name in numbers and tried in taken:
-            numbers[name] += 1
-            tried = f'{name}.{numbers[name]}'
-        numbers.setdefault(name, 0)
-        taken.add(tried)
-        names.append(tried)
-    return names
 
 
 def _parse_numeric_rows(lines: list[str], first_line: int,
@@ -367,38 +354,33 @@ def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_lin
         places.append(first_line + reader.line_num)
         if reader.line_num >= len(lines) and len(rows) > 1:
             break
-    texts = list(zip(*rows))
-    if table.delimiter != ',':
-        for index, _, _ in table.columns.values():
-            texts[index] = tuple(text.replace(',', '.') for text in texts[index])
-    arrays = {quantity: _parse_numbers(places, header[index], texts[index], quantity)
-              * factor + offset for quantity, (index, factor, offset) in table.columns.items()}
-    return places, arrays, {name: texts[index] for name, index in table.other_columns.items()}
-
-
-def _parse_numbers(line_numbers: Sequence[int], column: str, texts: tuple[str, ...],
-                   quantity: str) -> Array:
-    if quantity in _NULLABLE_QUANTITIES:
-        texts = tuple(text.strip() or 'nan' for text in texts)
-    found: list[float] = []
-    try:
-        found.extend(map(_to_number, texts))
-    except ValueError:
-        row = len(found)  # the first that is no number
-        remedy = ('give seconds, or the sample rate with --rate'
-                  if quantity == 'time' else 'leave the cell empty if the value is lost'
-                  if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
-        raise LogError(f'line {line_numbers[row]}, column {column}: {reprlib.repr(texts[row])} '
-                       f'is not a number; {remedy}') from None
-    values = np.array(found)
-    wrong = mask_invalid(values, quantity)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
-                 if np.isfinite(values[row]) else 'not a finite number')
-        raise LogError(f'line {line_numbers[row]}, column {column}: {excerpt(texts[row])} is '
-                       f'{fault}; remove the row')
-    return values
+    cells = list(zip(*rows))
+    arrays: dict[str, Array] = {}
+    for quantity, (index, factor, offset) in table.columns.items():
+        texts, found = cells[index], list[float]()
+        if table.delimiter != ',':
+            texts = tuple(text.replace(',', '.') for text in texts)
+        if quantity in _NULLABLE_QUANTITIES:
+            texts = tuple(text.strip() or 'nan' for text in texts)
+        try:
+            found.extend(map(_to_number, texts))
+        except ValueError:
+            number = len(found)  # the first that is no number
+            remedy = ('give seconds, or the sample rate with --rate'
+                      if quantity == 'time' else 'leave the cell empty if the value is lost'
+                      if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
+            raise LogError(f'line {places[number]}, column {header[index]}: '
+                           f'{reprlib.repr(texts[number])} is not a number; {remedy}') from None
+        values = np.array(found)
+        wrong = mask_invalid(values, quantity)
+        if wrong.any():
+            number = int(np.argmax(wrong))
+            fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
+                     if np.isfinite(values[number]) else 'not a finite number')
+            raise LogError(f'line {places[number]}, column {header[index]}: '
+                           f'{excerpt(texts[number])} is {fault}; remove the row')
+        arrays[quantity] = values * factor + offset
+    return places, arrays, {name: cells[index] for name, index in table.other_columns.items()}
 
 
 def _to_number(text: str) -> float:
@@ -518,8 +500,20 @@ class _AxisRotation:
             return
         attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
         known = np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < 0.4  # as in recordings
-        time, by_gyro = self._integrate_output(arrays, len(attitude))
-        angles = np.full((len(attitude), 3), np.nan)
+        count, angles = len(attitude), np.full((len(attitude), 3), np.nan)
+        # time, s or rows, and the integral of the output, rad, nan without an output
+        first, begin = (self._output[-1, 0] + 1.0, self._output[-1, 2]) if len(
+            self._output) else (0.0, 0.0)
+        time = arrays.get('time', first + np.arange(count))
+        output = arrays.get('output', np.full(count, np.nan))
+        measured = np.isfinite(output)
+        if measured.any():
+            output = np.interp(time, time[measured], output[measured])
+        at, rate = (np.append(self._output[-1:, column], values)
+                    for column, values in enumerate((time, output)))
+        steps = 0.5 * np.diff(at) * (rate[1:] + rate[:-1])
+        by_gyro = begin + np.cumsum(np.append(np.zeros(count - len(steps)), steps))
+        self._output = np.array([[time[-1], output[-1], by_gyro[-1]]])
         if known.any():
             rows = np.column_stack([time, by_gyro, attitude])[known]
             path = np.concatenate([self._last, rows])
@@ -528,22 +522,6 @@ class _AxisRotation:
             angles[known] = self._angles + np.cumsum(turned, axis=0)
             self._angles, self._last = angles[known][-1], rows
         arrays |= zip(ROTATIONS, angles.T)
-
-    def _integrate_output(self, arrays: Mapping[str, Array], count: int) -> tuple[Array, Array]:
-        """Return time, s or rows, and the integral of the output, rad, nan without an output."""
-        first, begin = (self._output[-1, 0] + 1.0, self._output[-1, 2]) if len(
-            self._output) else (0.0, 0.0)
-        time = arrays.get('time', first + np.arange(count))
-        output = arrays.get('output', np.full(count, np.nan))
-        known = np.isfinite(output)
-        if known.any():
-            output = np.interp(time, time[known], output[known])
-        at, rate = (np.append(self._output[-1:, column], values)
-                    for column, values in enumerate((time, output)))
-        steps = 0.5 * np.diff(at) * (rate[1:] + rate[:-1])
-        angle = begin + np.cumsum(np.append(np.zeros(count - len(steps)), steps))
-        self._output = np.array([[time[-1], output[-1], angle[-1]]])
-        return time, angle
 
     def _turned(self, path: Array) -> Array:
         """Return the angles from row to row of time, integral and quaternion, rad, (n - 1, 3)."""
@@ -637,10 +615,25 @@ def refuse_wrapped(log: Log) -> None:
         return
     known = np.flatnonzero(np.isfinite(log.reference_heading))
     time, change = log.time[known], np.diff(log.reference_heading[known])
-    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL_TURN_MARGIN
     # vehicles do not turn faster than 35 rad/s
-    jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time))
-                           | _turns_without_gyro(log, known))
+    is_jump = ((np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL_TURN_MARGIN)
+               & (np.abs(change) > 35.0 * np.diff(time)))
+    measured = np.isfinite(np.nan if log.output is None else log.output)
+    if log.output is not None and len(known) > 2 and measured.sum() > 2:
+        # gaps with full turns that the gyro lacks
+        output, stamps = log.output[measured], log.time[measured]
+        expected, factor = _heading_by_gyro(time, log.reference_heading[known], stamps, output)
+        turns = (change - np.diff(expected)) / (2.0 * math.pi)
+        # the integral of the gyro errs by less than its longest interval times its largest rate
+        pauses = np.diff(stamps)
+        begin = np.clip(np.searchsorted(stamps, time, 'right') - 1, 0, len(pauses) - 1)
+        longest = np.maximum.reduceat(pauses, begin)[:-1]
+        is_jump |= ((longest * np.abs(output).max() < _FULL_TURN_MARGIN * 2.0 * math.pi)
+                    & (np.rint(turns) != 0.0)
+                    & (np.abs(turns - np.rint(turns)) < _FULL_TURN_MARGIN)
+                    & (known[1:] > known[:-1] + 1)
+                    & (1.0 / MAX_PLAUSIBLE_FACTOR < abs(factor) < MAX_PLAUSIBLE_FACTOR))
+    jumps = np.flatnonzero(is_jump)
     if len(jumps) and not (log.output is not None and _is_in_degrees(
             time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
@@ -648,27 +641,6 @@ def refuse_wrapped(log: Log) -> None:
                  ' that the gyro does not show, first in the gap that ends at')
         raise DataRefused(f'the reference heading jumps by a full turn{where} '
                           f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
-
-
-def _turns_without_gyro(log: Log, known: NDArray[np.intp]) -> Mask:
-    """Tell which gaps between known reference headings hold full turns that the gyro lacks."""
-    assert log.time is not None and log.reference_heading is not None
-    measured = np.zeros(0, dtype=np.intp) if log.output is None else np.flatnonzero(
-        np.isfinite(log.output))
-    if len(known) < 3 or len(measured) < 3:
-        return np.zeros(max(len(known) - 1, 0), dtype=bool)
-    assert log.output is not None
-    at, output, stamps = log.time[known], log.output[measured], log.time[measured]
-    expected, factor = _heading_by_gyro(at, log.reference_heading[known], stamps, output)
-    turns = (np.diff(log.reference_heading[known]) - np.diff(expected)) / (2.0 * math.pi)
-    # the integral of the gyro errs by less than its longest interval times its largest rate
-    pauses = np.diff(stamps)
-    begin = np.clip(np.searchsorted(stamps, at, 'right') - 1, 0, len(pauses) - 1)
-    longest = np.maximum.reduceat(pauses, begin)[:-1]
-    certain = longest * np.abs(output).max() < _FULL_TURN_MARGIN * 2.0 * math.pi
-    is_whole = (np.rint(turns) != 0.0) & (np.abs(turns - np.rint(turns)) < _FULL_TURN_MARGIN)
-    return np.asarray(certain & is_whole & (known[1:] > known[:-1] + 1)
-                      & (1.0 / MAX_PLAUSIBLE_FACTOR < abs(factor) < MAX_PLAUSIBLE_FACTOR))
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:

@@ -117,7 +117,13 @@ def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, f
     reach, deviation = float(span[first]) / step + 0.5, 0.0
     while True:
         within = np.abs(place) < reach * step
-        aligned, offset = _alignment(place[within], codes.counts[within], step)
+        # the mean phasor of the positions on the lattice, without the most frequent one: a value
+        # at every rest would outweigh all others
+        counts = codes.counts[within]
+        if len(counts) > 1:
+            counts = np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
+        mean = np.sum(counts * np.exp(2j * np.pi * place[within] / step)) / counts.sum()
+        aligned, offset = float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
         if aligned < _MIN_ALIGNMENT:
             return step, aligned, deviation
         number = np.rint((place[within] - offset) / step)
@@ -129,15 +135,6 @@ def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, f
         if within.all():
             return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
         reach *= 4.0
-
-
-def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
-    """Return the length of the mean phasor of positions on a lattice, and its shift."""
-    # The most frequent position is left out: a value at every rest would outweigh all others.
-    counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
-              if len(counts) > 1 else counts)
-    mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
-    return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
 
 
 def quantization_step(values: Array) -> float:
@@ -283,25 +280,19 @@ def refuse_dead(output: Array) -> None:
 
 def refuse_saturated(output: Array) -> None:
     """Refuse an output that is clipped at its largest or smallest value."""
-    # A clipped output has at least 10 samples and 0.5 % of all at a limit, and three times as many
-    # as at the next value. An output whose codes are too coarse to show its noise is not refused.
-    values, counts = np.unique(output, return_counts=True)
-    if len(values) < 2 or not _is_noise_resolved(output):
+    # Not if its codes are too coarse to show its noise: less than a fifth of neighbouring samples
+    # differ in the flattest quarter of blocks of ten samples away from the extreme values.
+    blocks = output[:len(output) // 10 * 10].reshape(-1, 10)
+    blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
+    slopes = np.abs(blocks[:, 5:].mean(axis=1) - blocks[:, :5].mean(axis=1))
+    flattest = blocks[np.argsort(slopes)[:len(blocks) // 4]]
+    if not len(flattest) or not np.mean(np.diff(flattest, axis=1) != 0.0) > 0.2:
         return
+    # A clipped output has at least 10 samples and 0.5 % of all at a limit, and three times as many
+    # as at the next value.
+    values, counts = np.unique(output, return_counts=True)
     for end, neighbour in ((-1, -2), (0, 1)):
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
             raise DataRefused(f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of '
                               f'the samples are at its limit of {values[end] / DEGREE:.4g} deg/s; '
                               'turn slower, or set a wider range')
-
-
-def _is_noise_resolved(output: Array) -> bool:
-    """Tell whether a fifth of neighbouring samples differ where the rate is steady."""
-    # That is in the flattest quarter of blocks of ten samples away from the extreme values.
-    blocks = output[:len(output) // 10 * 10].reshape(-1, 10)
-    blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
-    if len(blocks) < 4:
-        return False
-    slopes = np.abs(blocks[:, 5:].mean(axis=1) - blocks[:, :5].mean(axis=1))
-    flattest = blocks[np.argsort(slopes)[:len(blocks) // 4]]
-    return bool(np.mean(np.diff(flattest, axis=1) != 0.0) > 0.2)

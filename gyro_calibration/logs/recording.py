@@ -84,7 +84,6 @@ class _TopicBuffer:
         return len(self._stamps)
 
     def add(self, message: Message) -> None:
-        """Store the quantities of a message; count a damaged one."""
         try:
             stamp, numbers = cdr.parse(message.data, self._layout)
             self._received.append(message.received)
@@ -97,7 +96,6 @@ class _TopicBuffer:
         self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
     def sort_by_arrival(self) -> _TopicSeries:
-        """Return the messages in the order of receipt."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
         series = _TopicSeries(self.topic, self.kind, np.frombuffer(self._stamps, np.int64),
@@ -187,13 +185,37 @@ class _LogBuilder:
         self._notes = [f'ROS 2 recording {name}']
 
     def build(self, rate: float | None) -> Log:
-        wanted = self._topics.gyro
-        gyro = self._topic_series(
-            self._find_topic(wanted, 'gyro') if wanted else self._find_only_imu())
+        found = [topic for topic in self._topics_of_type({cdr.IMU})
+                 if not _is_same_topic(topic, self._topics.reference)]
+        if self._topics.gyro:
+            found = [self._find_topic(self._topics.gyro, 'gyro')]
+        elif len(found) > 1:
+            raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
+        elif not found:
+            reasons = ''.join(f' ({note})' for note in self._contents.notes)
+            others = self._topics_of_type({
+                kind for kind, definition in self._contents.definitions.items()
+                if kind not in _REFERENCE_TYPES
+                and 'rate' in cdr.parse_layout(definition).quantities})
+            remedy = (f'select {_join_names(others, "or")} with --topic' if others
+                      else 'record the topic of the gyro')
+            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; '
+                           f'{remedy}')
+        gyro = self._topic_series(found[0])
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.topic} declares that it reports no angular velocity; name '
                            'another by --topic')
-        reference, temperature = None, self._find_temperature(gyro.topic)
+        thermometer = None
+        if self._topics.temperature is not None:
+            thermometer = self._find_topic(self._topics.temperature, 'temperature')
+        elif found := self._topics_of_type({cdr.TEMPERATURE}):
+            if len(found) > 1:
+                self._notes.append(f'of the temperatures {_join_names(found)}, the one whose name '
+                                   'is nearest to the topic of the gyro is used')
+            thermometer = max(found, key=lambda topic: len(os.path.commonprefix(
+                [topic.strip('/'), gyro.topic.strip('/')])))
+        temperature = self._topic_series(thermometer) if thermometer else None
+        reference = None
         if self._topics.reference is not None:
             reference = self._topic_series(self._find_topic(self._topics.reference, 'reference'))
         elif possible := self._topics_of_type(set(_REFERENCE_TYPES) - {cdr.IMU}):
@@ -213,7 +235,13 @@ class _LogBuilder:
             self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
                                'as lost')
             output[lost] = np.nan
-        arrays: dict[str, Any] = {'output': output, 'specific_force': self._specific_force(gyro)}
+        arrays: dict[str, Any] = {'output': output}
+        force = gyro.values('force')
+        if force.any() and not (gyro.values('force variance') == cdr.NOT_REPORTED).any():
+            if mask_invalid(force, 'specific_force').any():
+                self._notes.append('the specific force is not finite everywhere and was left out')
+            else:
+                arrays['specific_force'] = force.copy()
         if temperature is not None:
             times = temperature.with_times(use_stamps and temperature.has_stamps)
             arrays['temperature'] = self._interpolate_temperature(times, gyro.stamps[0], time)
@@ -222,32 +250,6 @@ class _LogBuilder:
                                                   output)
         return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
                    notes=(*self._notes, *self._contents.notes))
-
-    def _find_only_imu(self) -> str:
-        found = [topic for topic in self._topics_of_type({cdr.IMU})
-                 if not _is_same_topic(topic, self._topics.reference)]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
-        reasons = ''.join(f' ({note})' for note in self._contents.notes)
-        others = self._topics_of_type({
-            kind for kind, definition in self._contents.definitions.items()
-            if kind not in _REFERENCE_TYPES and 'rate' in cdr.parse_layout(definition).quantities})
-        remedy = (f'select {_join_names(others, "or")} with --topic' if others
-                  else 'record the topic of the gyro')
-        raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; {remedy}')
-
-    def _find_temperature(self, gyro: str) -> _TopicSeries | None:
-        if self._topics.temperature is not None:
-            return self._topic_series(self._find_topic(self._topics.temperature, 'temperature'))
-        found = self._topics_of_type({cdr.TEMPERATURE})
-        if len(found) > 1:
-            self._notes.append(f'of the temperatures {_join_names(found)}, the one whose name is '
-                               'nearest to the topic of the gyro is used')
-        near = max(found, default=None, key=lambda topic: len(
-            os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
-        return self._topic_series(near) if near else None
 
     def _find_topic(self, wanted: str, role: str) -> str:
         topic = next((topic for topic in self._contents.topics if _is_same_topic(topic, wanted)),
@@ -303,36 +305,21 @@ class _LogBuilder:
             self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were '
                                'sorted')
             gyro = gyro.select(np.argsort(gyro.stamps, kind='stable'))
-        if rate is None:
-            gyro = self._drop_duplicates(gyro)
+        doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
+        if rate is None and doubled.any():
+            differs = np.diff(gyro.values('rate'), prepend=np.nan) != 0.0
+            other = int(np.count_nonzero(doubled & differs))
+            if other > 1 + 0.01 * len(gyro):
+                raise LogError(f'{other} of {len(gyro)} samples of {gyro.topic} have the stamp of '
+                               'another sample, so their times are unknown; give the sample rate '
+                               'with --rate')
+            self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another '
+                               'one were left out')
+            gyro = gyro.select(~doubled)
         if len(gyro) < 2:
             raise LogError(f'{gyro.topic} has {len(gyro)} samples with a time; a log has at '
                            'least two: record more')
         return gyro
-
-    def _drop_duplicates(self, gyro: _TopicSeries) -> _TopicSeries:
-        doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
-        if not doubled.any():
-            return gyro
-        differs = np.diff(gyro.values('rate'), prepend=np.nan) != 0.0
-        other = int(np.count_nonzero(doubled & differs))
-        if other > 1 + 0.01 * len(gyro):
-            raise LogError(f'{other} of {len(gyro)} samples of {gyro.topic} have the stamp of '
-                           'another sample, so their times are unknown; give the sample rate '
-                           'with --rate')
-        self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
-                           'were left out')
-        return gyro.select(~doubled)
-
-    def _specific_force(self, gyro: _TopicSeries) -> Array | None:
-        """Return the specific force along z, or None if it is not reported or never filled in."""
-        force = gyro.values('force')
-        if (gyro.values('force variance') == cdr.NOT_REPORTED).any() or not force.any():
-            return None
-        if mask_invalid(force, 'specific_force').any():
-            self._notes.append('the specific force is not finite everywhere and was left out')
-            return None
-        return force.copy()
 
     def _interpolate_temperature(self, series: _TopicSeries, begin: np.int64,
                                  time: Array) -> Array | None:
@@ -360,13 +347,21 @@ class _LogBuilder:
             raise LogError(f'{gyro.topic} cannot be its own reference; name another by '
                            '--reference-topic')
         series = series.with_unique_stamps()
-        at, wrapped = (series.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _wrapped_headings(series)
+        at = (series.stamps - gyro.stamps[0]) / NSEC_PER_SEC
         rate = series.values('rate') if series.is_reported('rate') else None
         if rate is not None:
             rate = np.where(np.isfinite(rate), rate, np.nan)
         heading = None
-        if wrapped is not None:  # without its jumps by whole turns
-            heading, by_gyro = unwrap_heading(at, wrapped, time, output)
+        x, y, z, w = (series.values(f'orientation.{each}') for each in 'xyzw')
+        variance = series.values('orientation variance')
+        # declared unknown by an Imu, or left at its default
+        if series.is_reported('orientation.w') and not (
+                'orientation variance' in series.quantities and (
+                    (variance == cdr.NOT_REPORTED).all()
+                    or not (x.any() or y.any() or z.any() or variance.any())
+                    and (w == 1.0).all())):
+            heading, by_gyro = unwrap_heading(
+                at, np.asarray(cdr.quaternion_heading(x, y, z, w)), time, output)
             if by_gyro:
                 self._notes.append('the reference turned by more than half a turn between two '
                                    'values; the number of turns was taken from the gyro')
@@ -374,10 +369,18 @@ class _LogBuilder:
                 and np.nanmax(heading) - np.nanmin(heading) > 0.1):
             self._notes.append('the rates of the reference are all zero, and were left out')
             rate = None
-        found: dict[str, Any] = {
-            name: _interpolate_with_gaps(time, at, values)
-            for name, values in (('reference_heading', heading), ('reference_rate', rate))
-            if values is not None and np.isfinite(values).sum() > 1}
+        found: dict[str, Any] = {}
+        for name, values in (('reference_heading', heading), ('reference_rate', rate)):
+            if values is None or np.isfinite(values).sum() < 2:
+                continue
+            # nan in gaps longer than 5 median intervals and 0.1 s
+            known, values = at[np.isfinite(values)], values[np.isfinite(values)]
+            longest = max(5.0 * float(np.median(np.diff(known))), 0.1)
+            place = np.clip(np.searchsorted(known, time, 'right') - 1, 0, len(known) - 2)
+            inside = (time >= known[0]) & (time <= known[-1])
+            close = ((known[place + 1] - known[place] <= longest) | (time == known[place])
+                     | (time == known[place + 1]))
+            found[name] = np.where(inside & close, np.interp(time, known, values), np.nan)
         if not any(np.isfinite(values).any() for values in found.values()):
             raise LogError(f'{series.topic} has no heading and no rate at the times of the gyro; '
                            'name another reference, or check that both clocks agree')
@@ -385,34 +388,6 @@ class _LogBuilder:
         self._notes.append(f'reference: {series.topic} ({series.kind}), {len(at)} values, '
                            f'lost for {100 * lost:.1f} % of the samples')
         return found
-
-
-def _wrapped_headings(series: _TopicSeries) -> Array | None:
-    """Return the rotation about z, wrapped, nan where invalid; None if not reported."""
-    if not series.is_reported('orientation.w'):
-        return None
-    x, y, z, w = (series.values(f'orientation.{each}') for each in 'xyzw')
-    variance = series.values('orientation variance')
-    # declared unknown by an Imu, or left at its default
-    if 'orientation variance' in series.quantities and (
-            (variance == cdr.NOT_REPORTED).all()
-            or not (x.any() or y.any() or z.any() or variance.any()) and (w == 1.0).all()):
-        return None
-    heading: Array = cdr.quaternion_heading(x, y, z, w)
-    return heading
-
-
-def _interpolate_with_gaps(time: Array, known_time: Array, values: Array) -> Array:
-    """Return values at other times; nan in gaps longer than 5 median intervals and 0.1 s."""
-    known_time, values = known_time[np.isfinite(values)], values[np.isfinite(values)]
-    if len(known_time) < 2:
-        return np.full(len(time), np.nan)
-    longest = max(5.0 * float(np.median(np.diff(known_time))), 0.1)
-    place = np.clip(np.searchsorted(known_time, time, 'right') - 1, 0, len(known_time) - 2)
-    inside = (time >= known_time[0]) & (time <= known_time[-1])
-    close = ((known_time[place + 1] - known_time[place] <= longest) | (time == known_time[place])
-             | (time == known_time[place + 1]))
-    return np.where(inside & close, np.interp(time, known_time, values), np.nan)
 
 
 def _format_seconds(nanoseconds: np.int64) -> str:

@@ -20,12 +20,13 @@ size. Existing libraries have no such limits and refuse truncated files: rosbags
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, ExitStack, suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
 import importlib
 import io
+from itertools import repeat
 import os
 from pathlib import Path
 import re
@@ -135,7 +136,13 @@ def read_messages(path: str | Path, contents: Contents,
     for file in list_recording_files(path):
         read = _read_mcap if _recording_suffix(file) == '.mcap' else _read_database
         try:
-            with _open_uncompressed(file) as source:
+            with ExitStack() as stack:
+                source, packed = file, stack.enter_context(open_regular_file(file))
+                if file.suffix == '.zstd':  # a temporary decompressed copy is read
+                    source = Path(stack.enter_context(tempfile.TemporaryDirectory(
+                        prefix='gyro_calibration_'))) / file.stem
+                    with open(source, 'wb') as copy:
+                        copy.writelines(_decompress('zstd', packed, ExpansionBudget(file)))
                 yield from read(source, file, contents, on_place)
             done += file.stat().st_size
         except LogError as error:
@@ -152,20 +159,6 @@ def read_messages(path: str | Path, contents: Contents,
 def _recording_suffix(path: Path) -> str | None:
     name = path.name.removesuffix('.zstd')
     return next((kind for kind in ('.mcap', '.db3') if name.endswith(kind)), None)
-
-
-@contextmanager
-def _open_uncompressed(path: Path) -> Iterator[Path]:
-    """Give the path of a file, or of a temporary decompressed copy."""
-    with open_regular_file(path) as packed:
-        if path.suffix != '.zstd':
-            yield path
-            return
-        with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
-            source = Path(folder) / path.stem
-            with open(source, 'wb') as file:
-                file.writelines(_decompress('zstd', packed, ExpansionBudget(path)))
-            yield source
 
 
 def _decompress(compression: str, packed: BinaryIO, budget: ExpansionBudget) -> Iterator[bytes]:
@@ -269,7 +262,15 @@ class _McapReader:
         """Give the messages in a record; a truncated chunk is read up to its end."""
         try:
             if code == _RecordCode.CHUNK:
-                data = _read_chunk(body, torn, self._budget)
+                _, _, size, check = struct.unpack_from('<QQQI', body)
+                compression, place = _read_text(body, 28)
+                if size > MAX_RECORD_BYTES or compression not in ('', 'zstd', 'lz4'):
+                    raise _DamagedPart
+                data = body[place + 8:]
+                data = (_decompress_up_to(size, compression, data, self._budget) if compression
+                        else data[:size])
+                if not torn and (len(data) != size or check and zlib.crc32(data) != check):
+                    raise _DamagedPart
                 for inner, content in _iter_records(io.BytesIO(data), len(data), self._contents):
                     yield from self.read(inner, content) if inner != _RecordCode.CHUNK else ()
             elif code == _RecordCode.MESSAGE:
@@ -327,19 +328,6 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     return found
 
 
-def _read_chunk(body: bytes, torn: bool, budget: ExpansionBudget) -> bytes:
-    """Return the records of a chunk as bytes; of a truncated one those before its end."""
-    _, _, size, check = struct.unpack_from('<QQQI', body)
-    compression, place = _read_text(body, 28)
-    if size > MAX_RECORD_BYTES or compression not in ('', 'zstd', 'lz4'):
-        raise _DamagedPart
-    data = body[place + 8:]
-    data = _decompress_up_to(size, compression, data, budget) if compression else data[:size]
-    if not torn and (len(data) != size or check and zlib.crc32(data) != check):
-        raise _DamagedPart
-    return data
-
-
 def _pack_record(code: _RecordCode, *content: bytes) -> bytes:
     data = b''.join(content)
     return struct.pack('<BQ', code, len(data)) + data
@@ -366,7 +354,6 @@ class McapWriter:
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes of the messages that are not yet in a chunk."""
         return len(self._records)
 
     def pack_header(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
@@ -459,8 +446,18 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
     with _open_database(source) as (database, tables):
-        channels, budget = _read_topics(database, tables, contents), ExpansionBudget(path)
-        size, last, count = path.stat().st_size, sys.maxsize, 0
+        try:
+            definitions = dict(database.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions')
+                if 'message_definitions' in tables else ())
+            channels = {number: contents.add_topic(str(topic), str(kind), encoding,
+                                                   str(definitions.get(kind, '')))
+                        for number, topic, kind, encoding in database.execute(
+                            'SELECT id, name, type, serialization_format FROM topics')}
+        except _DATABASE_ERRORS as error:
+            raise LogError('its list of topics cannot be read '
+                           f'({_describe_database_error(error)}); record again') from error
+        budget, size, last, count = ExpansionBudget(path), path.stat().st_size, sys.maxsize, 0
         with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
         try:
@@ -487,13 +484,40 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
         for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
+            file = source
+            if mode == 'copy':
+                file, mode = Path(shutil.copy(source, folder)), 'mode=ro'
+                with open(file, 'r+b') as copy:
+                    head = copy.read(100)
+                    if len(head) == 100:
+                        size = int.from_bytes(head[16:18], 'big')
+                        size = 1 << 16 if size == 1 else max(size, 1)
+                        copy.seek(28)
+                        copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
             try:
-                file = source if mode != 'copy' else _correct_page_count(source, Path(folder))
-                database, tables = _connect(file, mode.replace('copy', 'mode=ro'))
+                database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
             with closing(database):
+                try:
+                    database.text_factory = partial(str, encoding='utf-8', errors='replace')
+                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
+                    # SQLite. A query is ended after a million steps plus ten per byte.
+                    thousands = repeat(0, file.stat().st_size // 100 + 1000)
+                    database.set_progress_handler(partial(next, thousands, 1), 1000)
+                    if sys.version_info >= (3, 11):
+                        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
+                    database.execute('PRAGMA trusted_schema = OFF')
+                    tables = {name for name, text in database.execute(
+                        "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+                        if name in ('topics', 'messages', 'message_definitions')
+                        and str(text).upper().startswith('CREATE TABLE')
+                        and not any(hidden for *_, hidden in database.execute(
+                            f'PRAGMA table_xinfo({name})'))}
+                except _DATABASE_ERRORS as error:
+                    reason = error
+                    continue
                 if not {'topics', 'messages'} <= tables:
                     raise LogError('is a database, but not a ROS 2 recording with tables of '
                                    'stored columns; name a recording')
@@ -505,53 +529,3 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
 
 def _describe_database_error(error: Exception | None) -> str:
     return _to_short_line(str(error) or 'it needs more memory than the limit')
-
-
-def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
-    database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
-    try:
-        database.text_factory = partial(str, encoding='utf-8', errors='replace')
-        # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite. A query
-        # is ended after a million steps plus ten per byte.
-        thousands = iter(range(file.stat().st_size // 100 + 1000))
-        database.set_progress_handler(lambda: next(thousands, None) is None, 1000)
-        if sys.version_info >= (3, 11):
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
-        database.execute('PRAGMA trusted_schema = OFF')
-        tables = {name for name, text in database.execute(
-            "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-            if name in ('topics', 'messages', 'message_definitions')
-            and str(text).upper().startswith('CREATE TABLE')
-            and not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
-        return database, tables
-    except BaseException:
-        database.close()
-        raise
-
-
-def _correct_page_count(source: Path, folder: Path) -> Path:
-    """Return a copy of a truncated database with its page count corrected, as SQLite wants it."""
-    copy = Path(shutil.copy(source, folder))
-    with open(copy, 'r+b') as file:
-        head = file.read(100)
-        if len(head) == 100:
-            size = int.from_bytes(head[16:18], 'big')
-            size = 1 << 16 if size == 1 else max(size, 1)
-            file.seek(28)
-            file.write((copy.stat().st_size // size).to_bytes(4, 'big'))
-    return copy
-
-
-def _read_topics(database: sqlite3.Connection, tables: set[str],
-                 contents: Contents) -> dict[int, tuple[str, str] | None]:
-    try:
-        definitions = dict(database.execute(
-            'SELECT topic_type, encoded_message_definition FROM message_definitions')
-            if 'message_definitions' in tables else ())
-        return {number: contents.add_topic(str(topic), str(kind), encoding,
-                                           str(definitions.get(kind, '')))
-                for number, topic, kind, encoding in database.execute(
-                    'SELECT id, name, type, serialization_format FROM topics')}
-    except _DATABASE_ERRORS as error:
-        raise LogError('its list of topics cannot be read '
-                       f'({_describe_database_error(error)}); record again') from error

@@ -69,10 +69,39 @@ class StampGrid:
 
 def fit_stamp_grid(time: Array) -> StampGrid:
     """Fit an even grid to stamps, or raise `DataRefused` where there is none."""
-    steps = np.diff(time)
-    usual = _typical_interval(time, steps)
+    # the interval, s: by the median over 100 samples; by the steps themselves where nine of ten
+    # are whole multiples of the median one, since samples are lost
+    steps, lag = np.diff(time), min(100, len(time) // 4)
+    interval, usual = float(np.median(time[lag:] - time[:-lag])) / lag, float(np.median(steps))
+    alike = 0.8 < interval / usual < 1.25
+    if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > 0.9:
+        raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
+                          f'{100 * interval:.4g} s: either most samples are lost, or they come in '
+                          'long bursts; give the sample rate with --rate, or record again')
+    whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
+    usual = (float(steps[whole & (steps < 1.5 * usual)].mean())
+             if alike and float(whole.mean()) > 0.9 else interval)
     bursts = float((steps < SHORT_RATIO * usual).mean()) > _MIN_BURST_SHARE
-    lost = _count_lost_per_step(time, steps, usual, bursts)
+
+    # The number of lost samples is that of the intervals by which the stamps remain late. Samples
+    # that were delayed at a host arrive in one burst of any size; the time to catch up begins
+    # after it.
+    lost: Integers = np.zeros(len(steps), dtype=np.int64)
+    shift, done = 0, 0
+    # samples within which delayed stamps catch up, and the least loss beyond their jitter
+    span, least = (300, 10) if bursts else (10, 1)
+    late = (time - time[0]) / usual - np.arange(len(time))
+    due = np.append(np.flatnonzero(steps >= SHORT_RATIO * usual), len(steps))
+    for step in np.nonzero(steps > (least + 0.5) * usual)[0].tolist():
+        late[done:step + 1] -= shift
+        done = step + 1
+        waited = int(due[np.searchsorted(due, done)])
+        missing = round(late[done:waited + span].min() - shift
+                        - late[max(done - span, 0):done].min())
+        if missing >= least:
+            lost[step] = missing
+            shift += missing
+
     number = _number_samples(lost)
     interval = float(np.polyfit(number, time - time[0], 1)[0])
     off = time - time[0] - interval * number
@@ -107,43 +136,6 @@ def count_lost_samples(time: Array) -> Integers | None:
         return fit_stamp_grid(time).lost_after
     except DataRefused:
         return None
-
-
-def _typical_interval(time: Array, steps: Array) -> float:
-    """Return the interval, s: the median over 100 samples, or the divisor of most steps."""
-    lag = min(100, len(time) // 4)
-    interval = float(np.median(time[lag:] - time[:-lag])) / lag
-    usual = float(np.median(steps))
-    alike = 0.8 < interval / usual < 1.25
-    if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > 0.9:
-        raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
-                          f'{100 * interval:.4g} s: either most samples are lost, or they come in '
-                          'long bursts; give the sample rate with --rate, or record again')
-    whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
-    # nine of ten steps are whole multiples of the median one: samples are lost
-    return (float(steps[whole & (steps < 1.5 * usual)].mean())
-            if alike and float(whole.mean()) > 0.9 else interval)
-
-
-def _count_lost_per_step(time: Array, steps: Array, interval: float, has_bursts: bool) -> Integers:
-    # It is the number of intervals by which the stamps remain late. Samples that were delayed at a
-    # host arrive in one burst of any size; the time to catch up begins after it.
-    lost: Integers = np.zeros(len(steps), dtype=np.int64)
-    shift, done = 0, 0
-    # samples within which delayed stamps catch up, and the least loss beyond their jitter
-    span, least = (300, 10) if has_bursts else (10, 1)
-    late = (time - time[0]) / interval - np.arange(len(time))
-    due = np.append(np.flatnonzero(steps >= SHORT_RATIO * interval), len(steps))
-    for step in np.nonzero(steps > (least + 0.5) * interval)[0].tolist():
-        late[done:step + 1] -= shift
-        done = step + 1
-        waited = int(due[np.searchsorted(due, done)])
-        missing = round(late[done:waited + span].min() - shift
-                        - late[max(done - span, 0):done].min())
-        if missing >= least:
-            lost[step] = missing
-            shift += missing
-    return lost
 
 
 def _number_samples(lost: Integers) -> Integers:

@@ -122,7 +122,6 @@ class CalibrationRun:
 
     @property
     def progress(self) -> float:
-        """Return the completed fraction, 0 to 1."""
         return min(self.elapsed / self.max_duration, 1.0)
 
     @property
@@ -406,15 +405,33 @@ class CalibrationSession:
 
     def conclude(self) -> tuple[bool, str]:
         """Fit a finished run and use its calibration, or return why nothing was changed."""
-        run, drive = self.run, self._drive
+        run, drive, estimator = self.run, self._drive, self._estimator
         assert run is not None and run.end_reason is not None
         try:
             if run.end_reason:
                 raise DataRefused(run.end_reason)
-            return True, self._apply_calibration(run)
+            now = datetime.fromtimestamp(self._clock.date(), timezone.utc)
+            noise = estimator.model.noise
+            calibration, remark = fit_run(run, noise, now.isoformat(timespec='seconds'),
+                                          estimator.model.prior_deviations)
+            if run.kind == REST:  # the scale factor error in use is kept
+                used = estimator.current_model.self_calibration
+                unknown = SelfCalibration(covariance=((0.0, 0.0), (0.0, 0.0)))
+                last = estimator.model.self_calibration or used or unknown
+                known = last.covariance or used and used.covariance or unknown.covariance
+                assert known is not None and calibration.covariance is not None
+                calibration = replace(
+                    calibration, scale_factor_error=last.scale_factor_error,
+                    covariance=((known[0][0], 0.0), (0.0, calibration.covariance[1][1])))
+            difference = describe_change(estimator.current_calibration, calibration, noise,
+                                         estimator.bias_age(now.timestamp()))
+            trouble = self._store.store_calibration(calibration)
+            estimator.use_calibration(self._store.model, now.timestamp())
+            self._monitor.reset_biases()
+            return True, '; '.join(filter(None, [
+                f'{calibration}, from {len(run.times)} samples', remark, difference, trouble]))
         except DataRefused as error:
-            late = (drive.describe_lateness(run.limits)
-                    if drive and not run.end_reason else '')
+            late = drive.describe_lateness(run.limits) if drive and not run.end_reason else ''
             return False, f'{late} (the run shows: {error})' if late else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
@@ -422,31 +439,6 @@ class CalibrationSession:
             if drive:
                 self.max_lateness = drive.command_lateness, drive.sample_lateness
             self.run = self._drive = None
-
-    def _apply_calibration(self, run: CalibrationRun) -> str:
-        estimator, now = self._estimator, datetime.fromtimestamp(self._clock.date(), timezone.utc)
-        noise = estimator.model.noise
-        calibration, remark = fit_run(run, noise, now.isoformat(timespec='seconds'),
-                                      estimator.model.prior_deviations)
-        if run.kind == REST:
-            calibration = self._with_current_scale(calibration)
-        difference = describe_change(estimator.current_calibration, calibration, noise,
-                                     estimator.bias_age(now.timestamp()))
-        trouble = self._store.store_calibration(calibration)
-        estimator.use_calibration(self._store.model, now.timestamp())
-        self._monitor.reset_biases()
-        return '; '.join(filter(None, [f'{calibration}, from {len(run.times)} samples', remark,
-                                       difference, trouble]))
-
-    def _with_current_scale(self, bias: SelfCalibration) -> SelfCalibration:
-        """Return a calibration of the bias with the scale factor error in use."""
-        used = self._estimator.current_model.self_calibration
-        unknown = SelfCalibration(covariance=((0.0, 0.0), (0.0, 0.0)))
-        last = self._estimator.model.self_calibration or used or unknown
-        known = last.covariance or used and used.covariance or unknown.covariance
-        assert known is not None and bias.covariance is not None
-        covariance = ((known[0][0], 0.0), (0.0, bias.covariance[1][1]))
-        return replace(bias, scale_factor_error=last.scale_factor_error, covariance=covariance)
 
 
 def fit_run(run: CalibrationRun, noise: Noise, date: str,
@@ -474,8 +466,21 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
                                 output=output)
         return (to_model_record(found.fit, 'turns', date, temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
-    begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
-    by_odometry, time = run.kind == ODOMETRY, time - begin
+    by_odometry = run.motion is None
+    if run.motion is not None:
+        begin, motion = time[0], run.motion
+    else:
+        rows = np.array([each for each in run.odometry if each[0] <= time[0] + run.duration])
+        increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
+        if len(rows) < 10 or not increases or np.ptp(rows[:, 0]) < 0.8 * run.duration:
+            raise DataRefused(
+                f'{len(rows)} messages came on odom in {run.duration:.0f} s, but at least 10 with '
+                'increasing stamps over most of the run are needed: check the odometry')
+        at, headings, rates = rows.T
+        begin, headings = at[0], np.unwrap(headings)
+        motion = (motion_from_headings(at, headings) if np.ptp(headings) > MIN_TURN_ANGLE
+                  else motion_from_rates(at - begin, rates))
+    time = time - begin
     inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
                          reference=run.reference_errors if by_odometry else None,
@@ -495,20 +500,3 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
                        f'{rest.limit / DEGREE:.4f} deg/s')
     method = 'odometry' if by_odometry else 'likelihood'
     return to_model_record(fit, method, date, temperature), '; '.join(remarks)
-
-
-def _odometry_motion(run: CalibrationRun) -> tuple[float, Motion]:
-    """Return the time of the first odometry, s, and the motion of the odometry."""
-    end = run.times[0] + run.duration
-    rows = np.array([each for each in run.odometry if each[0] <= end])
-    increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
-    if len(rows) < 10 or not increases or np.ptp(rows[:, 0]) < 0.8 * run.duration:
-        raise DataRefused(
-            f'{len(rows)} messages came on odom in {run.duration:.0f} s, but at least 10 with '
-            'increasing stamps over most of the run are needed: check the odometry')
-    time, heading, rate = rows.T
-    heading = np.unwrap(heading)
-    turned = np.ptp(heading) > MIN_TURN_ANGLE
-    motion = (motion_from_headings(time, heading) if turned
-              else motion_from_rates(time - time[0], rate))
-    return float(time[0]), motion

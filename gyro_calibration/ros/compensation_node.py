@@ -17,7 +17,7 @@ It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import math
 import os
 from pathlib import Path
@@ -51,7 +51,7 @@ from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
 
-class NodeClock:
+class _NodeClock:
     """The clocks of a node; see `inputs.Clock`."""
 
     steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
@@ -60,7 +60,6 @@ class NodeClock:
         self._clock = node.get_clock()
 
     def simulated(self) -> float | None:
-        """Return the time of a simulation, s; None where there is none."""
         clock = self._clock
         if isinstance(clock, ROSClock) and clock.ros_time_is_active:
             return clock.now().nanoseconds / NSEC_PER_SEC
@@ -75,17 +74,40 @@ class CompensationNode(Node):
         super().__init__('compensation_node')
         values = declare_parameters(self, PARAMETERS,
                                     lambda changed: self._pipeline.use_parameters(changed))
-        clock = NodeClock(self)
+        clock = _NodeClock(self)
         self._velocity: Publisher | None = None
         self._velocity_type = TwistStamped if values.cmd_vel_stamped else Twist
-        self._pipeline = Pipeline(values, self._calibration_file(values.calibration_file), clock,
+        name = self.get_fully_qualified_name().strip('/').replace('/', '_')
+        file = values.calibration_file or os.path.join(
+            os.environ.get('ROS_HOME', '~/.ros'), 'gyro_calibration', f'{name}.yaml')
+        self._pipeline = Pipeline(values, Path(os.path.expanduser(file)), clock,
                                   self._publish_command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
         self._receivers = 0
         self._pending_answer: tuple[Trigger.Response, Future] | None = None
         self._timer: Timer | None = None
-        self._create_topics()
+
+        self._imu = publish_on(self, Imu, 'imu/data')
+        self._heading = publish_on(self, PoseWithCovarianceStamped, 'heading')
+        self._yaw_rate = publish_on(self, TwistWithCovarianceStamped, 'yaw_rate')
+        self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
+        self._has_subscribers = {self._heading: False, self._yaw_rate: False}
+        self._pose_message = PoseWithCovarianceStamped()
+        self._pose_message.header.frame_id = values.heading_frame
+        self._rate_message = TwistWithCovarianceStamped()
+        for place in range(5):
+            self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
+            self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
+        subscribe_to(self, Temperature, 'imu/temperature',
+                     lambda message: self._pipeline.add_temperature(
+                         _stamp_ns(message.header), message.temperature))
+        self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
+        subscribe_to(self, Odometry, 'odom', self._on_odometry)
+        subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
+        if values.calibration_drive:
+            self._offer_velocity()  # calibrate reports a failure
+
         self._report = CompensationReport(self._pipeline, clock)
         self._diagnostics = Diagnostics(self, 'heading', lambda: self._report.make())
         session = self._pipeline.session
@@ -101,34 +123,6 @@ class CompensationNode(Node):
         self._poll_count = 0
         call_every(self, 0.2, self._poll_graph)
         self._publish_status()
-
-    def _calibration_file(self, path: str) -> Path:
-        if path:
-            return Path(os.path.expanduser(path))
-        home = Path(os.path.expanduser(os.environ.get('ROS_HOME', '~/.ros')))
-        name = self.get_fully_qualified_name().strip('/').replace('/', '_')
-        return home / 'gyro_calibration' / f'{name}.yaml'
-
-    def _create_topics(self) -> None:
-        self._imu = publish_on(self, Imu, 'imu/data')
-        self._heading = publish_on(self, PoseWithCovarianceStamped, 'heading')
-        self._yaw_rate = publish_on(self, TwistWithCovarianceStamped, 'yaw_rate')
-        self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
-        self._has_subscribers = {self._heading: False, self._yaw_rate: False}
-        self._pose_message = PoseWithCovarianceStamped()
-        self._pose_message.header.frame_id = self._pipeline.values.heading_frame
-        self._rate_message = TwistWithCovarianceStamped()
-        for place in range(5):
-            self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
-            self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
-        subscribe_to(self, Temperature, 'imu/temperature',
-                     lambda message: self._pipeline.add_temperature(
-                         _stamp_ns(message.header), message.temperature))
-        self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
-        subscribe_to(self, Odometry, 'odom', self._on_odometry)
-        subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
-        if self._pipeline.values.calibration_drive:
-            self._offer_velocity()  # calibrate reports a failure
 
     def _offer_service(self, name: str,
                        fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
@@ -164,14 +158,12 @@ class CompensationNode(Node):
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
             output = math.nan  # REP-145: the message has no rate
-        found = self._pipeline.add_sample(_stamp_ns(message.header), output, force,
-                                          self._receivers, message.header.frame_id)
-        if found is not None:
-            self._publish(message, found)
+        corrected = self._pipeline.add_sample(_stamp_ns(message.header), output, force,
+                                              self._receivers, message.header.frame_id)
+        if corrected is not None:
+            self._publish(message, corrected)
         if self._pending_answer:
             self._answer_finished_run()
-
-    # Publishers
 
     def _publish(self, imu: Imu, corrected: CorrectedSample) -> None:
         """Publish the received message with its z corrected, and the heading."""
@@ -214,10 +206,24 @@ class CompensationNode(Node):
             self._yaw_rate.publish(rate)
 
     def _publish_status(self) -> None:
-        self._status.publish(status_array(self, 'calibration', calibration_status(self._pipeline)))
+        store, run = self._pipeline.store, self._pipeline.session.run
+        calibration = store.model.self_calibration
+        values: dict[str, object] = {
+            'calibrated': calibration is not None, 'running': run is not None,
+            **({'progress': f'{run.progress:.2f}'} if run else {}),
+            **(calibration.to_dict() if calibration else {})}
+        level, message = OK, str(calibration)
+        if run:
+            message = f'calibrating: {run.status}; the previous calibration is in use'
+        elif store.problem:
+            level, message = ERROR, store.problem
+        elif store.calibration_hint:
+            level, message = WARN, store.calibration_hint
+        elif not calibration:
+            level, message = WARN, 'no self-calibration is stored; call calibrate'
+        self._status.publish(status_array(self, 'calibration', (level, message, values)))
 
     def _poll_graph(self) -> None:
-        """Poll publishers, receivers, clocks and the level of the report."""
         self._pipeline.update_publishers(self._publishers_on(self._samples.topic_name))
         outputs = (each.topic_name for each in (self._imu, self._heading, self._yaw_rate))
         self._pipeline.output_conflict = next((
@@ -352,13 +358,65 @@ class CompensationReport:
     def make(self) -> Report:
         """Return level, message and values; only counts that increase give warnings."""
         level, message = self._evaluate()
-        counts, now = self._pipeline.journal.counts, self._clock.steady()
-        seconds = now - self._last_report_time
+        pipeline, journal, now = self._pipeline, self._pipeline.journal, self._clock.steady()
+        estimator, monitor, store = pipeline.estimator, pipeline.monitor, pipeline.store
+        tracker, temperature, model = estimator.tracker, estimator.temperature, estimator.model
+        counts, seconds = journal.counts, now - self._last_report_time
         rate = ((counts['samples'] - self._previous_counts['samples'])
                 / seconds if seconds > 0.0 else 0.0)
         self._previous_counts, self._last_report_time = dict(counts), now
-        return level, message, {**self._sample_values(rate), **self._rest_values(),
-                                **self._calibration_values()}
+        has_noise = model.noise.angle_random_walk > 0.0
+        deviation = math.sqrt(tracker.variance) / DEGREE if has_noise else math.nan
+        low, high = model.temperature_range
+        commands, samples = pipeline.session.max_lateness
+        values: dict[str, object] = {
+            **counts, 'rate_hz': f'{rate:.1f}',
+            'longest_gap_s': f'{tracker.intervals.longest_gap:.3f}',
+            'clock_steps': journal.clock_steps,
+            'heading_deg': f'{tracker.heading / DEGREE:.3f}',
+            'heading_standard_deviation_deg': f'{deviation:.3f}',
+            'deleted_heading_deg': f'{tracker.deleted_heading / DEGREE:.3f}',
+            'temperature_degc': '' if temperature is None else f'{temperature:.2f}',
+            'temperature_range_degc': (f'{low:g} to {high:g}'
+                                       if model.uses_channel('temperature') else ''),
+            'command_lateness_s': f'{commands:.3f}', 'sample_lateness_s': f'{samples:.3f}',
+            'last_event': journal.event}
+
+        bias, deviation = tracker.bias
+        slowest, age = tracker.slowest_detectable_rate / DEGREE, pipeline.wheels.age(now)
+        moving, method = pipeline.wheels.is_moving(now), pipeline.values.stationary_method
+        if method == 'rest' and not has_noise:
+            method = ('threshold, since the model has no angle random walk: measure it with '
+                      'allan for the method rest')
+        values |= {
+            'stationary_method': method, 'resting': tracker.is_resting,
+            'bias_deg_s': f'{bias / DEGREE:.5f}',
+            'bias_standard_deviation_deg_s': f'{deviation / DEGREE:.5f}',
+            'slowest_noticed_turn_deg_s': f'{slowest:.4f}',
+            'slow_turns': ('without wheels or commands, slower turns cannot be distinguished '
+                           'from drift' if moving is None and not math.isnan(slowest) else ''),
+            'wheels': {True: 'moving', False: 'standing', None: 'unknown'}[moving],
+            'wheels_age_s': f'{age:.2f}' if math.isfinite(age) else '',
+            'rests_checked': monitor.examined_count}
+        if rest := monitor.last_rest:
+            values |= {
+                'rest_noise_ratio': f'{rest.noise_ratio:.3f}',
+                'rest_rate_deg_s': f'{rest.bias / DEGREE:.5f}',
+                'rest_rate_sigmas': f'{rest.sigmas:.2f}',
+                'noise_alarm': monitor.noise_alarm, 'bias_alarm': monitor.bias_alarm}
+
+        date, calibration = self._clock.date(), model.self_calibration
+        written = store.table_written_time
+        return level, message, {
+            **values, **(calibration.to_dict() if calibration else {}),
+            'calibration_age_h': f'{estimator.age(date) / 3600.0:.2f}' if calibration else '',
+            'calibration_now': estimator.calibration_message,
+            'refused_calibrations': journal.refused_calibrations,
+            'refusals': ' | '.join(journal.refusal_reasons),
+            'bias_table_entries': len(estimator.table.entries),
+            'bias_table_held_back': estimator.table.held_back_count,
+            'bias_table_written_min': '' if written is None else f'{(date - written) / 60.0:.1f}',
+            'bias_table': store.table_hint}
 
     def _evaluate(self) -> tuple[bytes, str]:
         """Return level and message: the first error, else the first warning."""
@@ -377,131 +435,42 @@ class CompensationReport:
         if silent > 1.0:
             why = journal.event if 'refused_samples' in growing else 'is the driver running?'
             return ERROR, f'no samples on imu/data_raw for {silent:.0f} s: {why}'
-        for warning in filter(None, self._warnings(growing)):
-            return WARN, warning
-        tracked = pipeline.estimator.tracker.slowest_detectable_rate > 0.0
-        return OK, 'the heading is published' + (
-            '' if tracked else '; the bias is not estimated at rest')
 
-    def _warnings(self, growing: set[str]) -> Iterator[str]:
-        """Give the warnings, the most important first; some are ''."""
-        pipeline, event = self._pipeline, self._pipeline.journal.event
+        # the warnings, the most important first
         estimator, store, monitor = pipeline.estimator, pipeline.store, pipeline.monitor
         low, high = estimator.model.valid_temperatures
-        for name, text in {
-                'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
-                'refused_temperatures': event,
-                'lost_samples': 'samples are lost: check the cable, the baud rate and the load of '
-                'the computer; the heading is integrated over the gaps, and its variance includes '
-                'them',
-                'beyond_range': 'the rate is beyond the calibrated range; the correction is '
-                'extrapolated',
-                'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
-                f'{high:g} degC; the correction is extrapolated, and its variance increases',
-        }.items():
-            if name in growing:
-                yield text
+        warnings = [text for name, text in {
+            'restarts': journal.event, 'repeated_stamps': journal.event,
+            'refused_samples': journal.event, 'refused_temperatures': journal.event,
+            'lost_samples': 'samples are lost: check the cable, the baud rate and the load of the '
+            'computer; the heading is integrated over the gaps, and its variance includes them',
+            'beyond_range': 'the rate is beyond the calibrated range; the correction is '
+            'extrapolated',
+            'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
+            f'{high:g} degC; the correction is extrapolated, and its variance increases',
+        }.items() if name in growing]
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
-            yield ('no temperature comes; the model is used at its reference temperature of '
-                   f'{estimator.model.reference_temperature:g} degC')
+            warnings.append('no temperature comes; the model is used at its reference temperature '
+                            f'of {estimator.model.reference_temperature:g} degC')
         elif estimator.temperature is not None and estimator.is_temperature_lost:
-            yield (f'the temperature is missing; {estimator.temperature:.1f} degC, the last one, '
-                   'is held, and the standard deviation of the bias increases')
-        for channel in ('supply', 'specific_force'):
-            if (estimator.current_model.uses_channel(channel)
-                    and channel not in pipeline.journal.channels):
-                yield (f'the model needs the {channel.replace("_", " ")}, which no message '
-                       'contains; that effect is left out')
-        yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-                    pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
-                    pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
-                    store.calibration_hint, store.shared_hint, monitor.bias_alarm,
-                    monitor.noise_alarm, estimator.calibration_message, estimator.bias_message,
-                    store.table_hint)
-
-    def _sample_values(self, rate: float) -> dict[str, object]:
-        """Return counts, heading and temperature; `rate` is the sample rate, Hz."""
-        estimator, journal = self._pipeline.estimator, self._pipeline.journal
-        tracker, temperature = estimator.tracker, estimator.temperature
-        deviation = (math.sqrt(tracker.variance) / DEGREE
-                     if estimator.model.noise.angle_random_walk > 0.0 else math.nan)
-        low, high = estimator.model.temperature_range
-        commands, samples = self._pipeline.session.max_lateness
-        return {
-            **journal.counts, 'rate_hz': f'{rate:.1f}',
-            'longest_gap_s': f'{tracker.intervals.longest_gap:.3f}',
-            'clock_steps': journal.clock_steps,
-            'heading_deg': f'{tracker.heading / DEGREE:.3f}',
-            'heading_standard_deviation_deg': f'{deviation:.3f}',
-            'deleted_heading_deg': f'{tracker.deleted_heading / DEGREE:.3f}',
-            'temperature_degc': '' if temperature is None else f'{temperature:.2f}',
-            'temperature_range_degc': (f'{low:g} to {high:g}'
-                                       if estimator.model.uses_channel('temperature') else ''),
-            'command_lateness_s': f'{commands:.3f}', 'sample_lateness_s': f'{samples:.3f}',
-            'last_event': journal.event}
-
-    def _rest_values(self) -> dict[str, object]:
-        """Return the bias at rest, the motion of the wheels, and the results of the monitor."""
-        pipeline, now = self._pipeline, self._clock.steady()
-        tracker, monitor, rest = (pipeline.estimator.tracker, pipeline.monitor,
-                                  pipeline.monitor.last_rest)
-        bias, deviation = tracker.bias
-        slowest, age = tracker.slowest_detectable_rate / DEGREE, pipeline.wheels.age(now)
-        moving, method = pipeline.wheels.is_moving(now), pipeline.values.stationary_method
-        if method == 'rest' and not pipeline.estimator.model.noise.angle_random_walk:
-            method = ('threshold, since the model has no angle random walk: measure it with '
-                      'allan for the method rest')
-        unseen = moving is None and not math.isnan(slowest)
-        values = {
-            'stationary_method': method, 'resting': tracker.is_resting,
-            'bias_deg_s': f'{bias / DEGREE:.5f}',
-            'bias_standard_deviation_deg_s': f'{deviation / DEGREE:.5f}',
-            'slowest_noticed_turn_deg_s': f'{slowest:.4f}',
-            'slow_turns': ('without wheels or commands, slower turns cannot be distinguished '
-                           'from drift' if unseen else ''),
-            'wheels': {True: 'moving', False: 'standing', None: 'unknown'}[moving],
-            'wheels_age_s': f'{age:.2f}' if math.isfinite(age) else '',
-            'rests_checked': monitor.examined_count}
-        return values if rest is None else {
-            **values, 'rest_noise_ratio': f'{rest.noise_ratio:.3f}',
-            'rest_rate_deg_s': f'{rest.bias / DEGREE:.5f}',
-            'rest_rate_sigmas': f'{rest.sigmas:.2f}',
-            'noise_alarm': monitor.noise_alarm, 'bias_alarm': monitor.bias_alarm}
-
-    def _calibration_values(self) -> dict[str, object]:
-        """Return the calibration in use, refused ones, and the state of the bias table."""
-        estimator, store, journal = (self._pipeline.estimator, self._pipeline.store,
-                                     self._pipeline.journal)
-        date, calibration = self._clock.date(), estimator.model.self_calibration
-        written = store.table_written_time
-        return {
-            **(calibration.to_dict() if calibration else {}),
-            'calibration_age_h': f'{estimator.age(date) / 3600.0:.2f}' if calibration else '',
-            'calibration_now': estimator.calibration_message,
-            'refused_calibrations': journal.refused_calibrations,
-            'refusals': ' | '.join(journal.refusal_reasons),
-            'bias_table_entries': len(estimator.table.entries),
-            'bias_table_held_back': estimator.table.held_back_count,
-            'bias_table_written_min': '' if written is None else f'{(date - written) / 60.0:.1f}',
-            'bias_table': store.table_hint}
-
-
-def calibration_status(pipeline: Pipeline) -> Report:
-    """Return level, message and values of the latched state of the calibration."""
-    store, run = pipeline.store, pipeline.session.run
-    calibration = store.model.self_calibration
-    values: dict[str, object] = {'calibrated': calibration is not None, 'running': run is not None,
-                                 **({'progress': f'{run.progress:.2f}'} if run else {}),
-                                 **(calibration.to_dict() if calibration else {})}
-    if run:
-        return OK, f'calibrating: {run.status}; the previous calibration is in use', values
-    if store.problem:
-        return ERROR, store.problem, values
-    if store.calibration_hint:
-        return WARN, store.calibration_hint, values
-    if not calibration:
-        return WARN, 'no self-calibration is stored; call calibrate', values
-    return OK, str(calibration), values
+            warnings.append(f'the temperature is missing; {estimator.temperature:.1f} degC, the '
+                            'last one, is held, and the standard deviation of the bias increases')
+        warnings += [f'the model needs the {channel.replace("_", " ")}, which no message '
+                     'contains; that effect is left out'
+                     for channel in ('supply', 'specific_force')
+                     if estimator.current_model.uses_channel(channel)
+                     and channel not in journal.channels]
+        warnings += filter(None, (
+            pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
+            pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
+            pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
+            store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
+            estimator.calibration_message, estimator.bias_message, store.table_hint))
+        if warnings:
+            return WARN, warnings[0]
+        tracked = estimator.tracker.slowest_detectable_rate > 0.0
+        return OK, 'the heading is published' + (
+            '' if tracked else '; the bias is not estimated at rest')
 
 
 def _stamp_ns(header: Any) -> int:

@@ -116,7 +116,14 @@ class DriverNode(Node):
 
     def _read_port(self) -> None:
         for chunk in self._connection.chunks(self._stop):
-            self._poll_clock(chunk.arrival)
+            if chunk.arrival - self._last_clock_poll >= 0.01:  # as costly as a message
+                read = read_clock_pair(read_steady_clock, self._read_node_clock)
+                if read or not self._last_clock_poll:
+                    self._last_clock_poll = chunk.arrival
+                    step = self._node_time.update(
+                        *(read or (chunk.arrival, self._read_node_clock())))
+                    if step and not self.get_parameter('use_sim_time').value:
+                        self._report.add_clock_step(step)
             self._report.add(chunk.samples)
             protocol, clock = self._connection.protocol, self._connection.clock
             assert protocol is not None and clock is not None  # they made the samples
@@ -131,17 +138,6 @@ class DriverNode(Node):
             if mean.sample.temperature is not None:
                 self._temperature.publish(self._messages.temperature)
             self._imu.publish(self._messages.imu)
-
-    def _poll_clock(self, arrival: float) -> None:
-        if arrival - self._last_clock_poll < 0.01:  # a reading is as costly as a message
-            return
-        read = read_clock_pair(read_steady_clock, self._read_node_clock)
-        if read is None and self._last_clock_poll:
-            return
-        self._last_clock_poll = arrival
-        step = self._node_time.update(*(read or (arrival, self._read_node_clock())))
-        if step and not self.get_parameter('use_sim_time').value:
-            self._report.add_clock_step(step)
 
     def _read_node_clock(self) -> float:
         """Return the time of the node, s; the system time before a simulation starts."""
@@ -208,11 +204,32 @@ class DriverReport:
             self._last_counts, self._last_time = counts, now
         # The other thread may clear these meanwhile.
         last, clock, protocol = self._temperature, connection.clock, connection.protocol
-        return *self._evaluate(), {
-            'port': self._port, 'device': connection.path, 'state': connection.state.name,
+        state = connection.state
+        grown = [f'{name.replace("_", " ")} {count}'
+                 for name, count in self._new_counts.items() if count > 0]
+        warnings = [f'in the last second there were: {", ".join(grown)}'] if grown else []
+        if protocol is not None and clock is not None:
+            for name, (low, high) in protocol.normal_ranges.items():
+                value = self._health.get(name)
+                if value is not None and not low <= value <= high:
+                    warnings.append(f'{name} is {value:.4g}, but should be from {low:g} to '
+                                    f'{high:g}: check the supply, then have the gyro checked')
+            if (clock.is_settled
+                    and (wrong := protocol.sample_rate_warning(self._settings, clock.period))):
+                warnings.append(wrong)
+        level, message = OK, 'samples come'
+        if state.name == 'failed':
+            level, message = ERROR, state.problem
+        elif state.name != 'reading':
+            level, message = WARN, {'opening': 'opening the port',
+                                    'listening': 'listening for a protocol'}[state.name]
+        elif warnings:
+            level, message = WARN, f'samples come, but {"; ".join(warnings)}'
+        return level, message, {
+            'port': self._port, 'device': connection.path, 'state': state.name,
             'protocol': protocol.name if protocol else '', 'baud': connection.baud,
             'detected': connection.detected, 'reopened': max(0, connection.open_count - 1),
-            'waiting_s': f'{connection.state.retry_delay:.1f}',
+            'waiting_s': f'{state.retry_delay:.1f}',
             'waited_s': f'{connection.waited_duration:.1f}',
             'last_error': connection.last_error, **vars(counts), 'rate_hz': f'{self._rate:.1f}',
             'longest_gap_s': f'{connection.longest_gap:.3f}', 'clock_steps': self._clock_steps,
@@ -225,29 +242,6 @@ class DriverReport:
             **{name: f'{value:.4g}' for name, value in self._health.items()},
             'last_event': self.event,
         }
-
-    def _evaluate(self) -> tuple[bytes, str]:
-        state = self._connection.state
-        if state.name == 'failed':
-            return ERROR, state.problem
-        if state.name != 'reading':
-            return WARN, {'opening': 'opening the port',
-                          'listening': 'listening for a protocol'}[state.name]
-        grown = [f'{name.replace("_", " ")} {count}'
-                 for name, count in self._new_counts.items() if count > 0]
-        warnings = [f'in the last second there were: {", ".join(grown)}'] if grown else []
-        protocol, clock = self._connection.protocol, self._connection.clock
-        if protocol is not None and clock is not None:
-            for name, (low, high) in protocol.normal_ranges.items():
-                value = self._health.get(name)
-                if value is not None and not low <= value <= high:
-                    warnings.append(f'{name} is {value:.4g}, but should be from {low:g} to '
-                                    f'{high:g}: check the supply, then have the gyro checked')
-            if (clock.is_settled
-                    and (wrong := protocol.sample_rate_warning(self._settings, clock.period))):
-                warnings.append(wrong)
-        return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
-            OK, 'samples come')
 
 
 class SampleMessages:

@@ -50,7 +50,7 @@ _DECIDING_STRETCHES = 3
 
 
 @dataclass(frozen=True)
-class RestResult:
+class _RestResult:
     """The result of one stretch at rest."""
 
     noise_ratio: float  # standard deviation of the noise over that of the model
@@ -90,13 +90,35 @@ class RepeatedOutputDetector:
         step = abs(output - self._value)
         if step:
             self._step = min(step, self._step)
-        toggles, self.unseen_turn = self._toggles(time, output, has_noise_at_rest), 0.0
+
+        # two neighbouring codes for longer than noise allows
+        low, high, since, count = self._band
+        low, high, count = min(low, output), max(high, output), count + 1
+        if not high - low < 1.5 * self._step:
+            low, high, since, count = output, output, time, 0
+        self._band = low, high, since, count
+        lasts = time - since
+        sample = (self._noise.angle_random_walk / math.sqrt(lasts / count)
+                  if lasts > FAULT_DURATION else 0.0)
+        toggles = (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
+                   and self._changes > 100 and sample > 0.0
+                   and self._excludes_chance(2.0 * self._step, count, sample))
+
+        self.unseen_turn = 0.0
         if output != self._value:
             changed_after = abs(time - self._since)
-            if self._holds.add(changed_after) and (
+            if self._holds.add(changed_after) and self._changes > 100 and (
                     self._value or has_noise_at_rest
                     or self._acceleration > MAX_ANGULAR_ACCELERATION):
-                self.unseen_turn = self._find_unseen_turn(math.hypot(step, self._last_step))
+                usual, held = self._holds.usual_interval, self._until - self._since
+                sample = self._noise.angle_random_walk / math.sqrt(usual)
+                # a chance of e^-20 is once in 50 days at 100 Hz
+                if sample and self._excludes_chance(self._step, held / usual, sample, 20.0):
+                    # the mean square of a rate that goes on linearly, or changes at once, and a
+                    # turn meanwhile
+                    self.unseen_turn = math.hypot(
+                        math.hypot(step, self._last_step) * (held + usual) / math.sqrt(3.0),
+                        0.25 * MAX_ANGULAR_ACCELERATION * (held + usual) ** 2)
             self._last_step = step
             self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
                                   / max(changed_after, MIN_SAMPLE_INTERVAL))
@@ -120,34 +142,6 @@ class RepeatedOutputDetector:
             return False
         return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
                 or self._excludes_chance(self._step, self._count, sample))
-
-    def _find_unseen_turn(self, step: float) -> float:
-        """Return the possible turn, rad, while the value was held between steps, rad/s."""
-        usual = self._holds.usual_interval
-        sample = self._noise.angle_random_walk / math.sqrt(usual)
-        repeats = (self._until - self._since) / usual
-        # a chance of e^-20 is once in 50 days at 100 Hz
-        if (self._changes <= 100 or not sample
-                or not self._excludes_chance(self._step, repeats, sample, 20.0)):
-            return 0.0
-        held = self._until - self._since + usual
-        # the mean square of a rate that goes on linearly, or changes at once, and a turn meanwhile
-        return math.hypot(step * held / math.sqrt(3.0),
-                          0.25 * MAX_ANGULAR_ACCELERATION * held ** 2)
-
-    def _toggles(self, time: float, output: float, has_noise_at_rest: bool) -> bool:
-        """Tell whether the output has two neighbouring codes for longer than noise allows."""
-        low, high, since, count = self._band
-        low, high, count = min(low, output), max(high, output), count + 1
-        if not high - low < 1.5 * self._step:
-            low, high, since, count = output, output, time, 0
-        self._band = low, high, since, count
-        lasts = time - since
-        sample = (self._noise.angle_random_walk / math.sqrt(lasts / count)
-                  if lasts > FAULT_DURATION else 0.0)
-        return (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
-                and self._changes > 100 and sample > 0.0
-                and self._excludes_chance(2.0 * self._step, count, sample))
 
     def _excludes_chance(self, width: float, count: float, sample: float,
                          level: float = 100.0) -> bool:
@@ -223,10 +217,10 @@ class HealthMonitor:
         # Four tests: noise and bias, upwards and downwards.
         self._level = 0.25 * false_alarm_rate * REST_DURATION / 3600.0
         self._samples: list[tuple[float, float, float]] = []
-        self._rests: list[RestResult] = []
+        self._rests: list[_RestResult] = []
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
-        self.last_rest: RestResult | None = None
+        self.last_rest: _RestResult | None = None
         self.examined_count, self.has_noise_at_rest = 0, False
 
     @property
@@ -251,7 +245,7 @@ class HealthMonitor:
         return time - self._samples[0][0] >= REST_DURATION
 
     def examine_stretch(self, bias_variance: float, age: float,
-                        is_announced: bool = False) -> RestResult | None:
+                        is_announced: bool) -> _RestResult | None:
         """Test the complete stretch as `examine_stretch` does, and start the next one."""
         time, output, rate = np.array(self._samples).T
         self.restart()
@@ -259,15 +253,12 @@ class HealthMonitor:
             self._step = min(self._step, quantization_step(output))
         rest = examine_stretch(time, output, rate, self._noise, self._level, self._step,
                                bias_variance, age)
-        if rest is not None:
-            self.last_rest, self.examined_count = rest, self.examined_count + 1
-            self.has_noise_at_rest = (self.has_noise_at_rest
-                                      or rest.is_noise_normal and rest.is_bias_normal)
-            self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
-            self._set_alarms(rest, is_announced)
-        return rest
-
-    def _set_alarms(self, rest: RestResult, is_announced: bool) -> None:
+        if rest is None:
+            return None
+        self.last_rest, self.examined_count = rest, self.examined_count + 1
+        self.has_noise_at_rest = (self.has_noise_at_rest
+                                  or rest.is_noise_normal and rest.is_bias_normal)
+        self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
         last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
         # the mean was the same in the last stretches, unlike in turns
         biases = [each.bias for each in last]
@@ -277,8 +268,7 @@ class HealthMonitor:
         elif is_announced or several and not any(each.is_noise_normal for each in last):
             remedy = ('record a log at rest, and run allan or diagnose on it'
                       if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = ('' if is_announced or rest.noise_ratio < 1.0
-                      else ', or the robot vibrates')
+            shaken = '' if is_announced or rest.noise_ratio < 1.0 else ', or the robot vibrates'
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
                                 f'model{shaken}: {remedy}')
         if rest.is_bias_normal:
@@ -288,11 +278,12 @@ class HealthMonitor:
             self.bias_alarm = (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
                                f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
                                'occurs again, diagnose a log')
+        return rest
 
 
 def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level: float,
                     step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0
-                    ) -> RestResult | None:
+                    ) -> _RestResult | None:
     """
     Test a stretch of samples against noise and bias of a model.
 
@@ -339,7 +330,7 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     variance = of_noise + noise.mean_change_variance(age, duration) + bias_variance
     sigmas = (max(abs(mean) - rounding_error, 0.0)
               / math.sqrt(variance) if variance > 0.0 else math.nan)
-    return RestResult(
+    return _RestResult(
         math.sqrt(measured / claimed), not (too_much or too_little), mean, sigmas,
         not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level,
         math.sqrt(of_noise + noise.mean_change_variance(duration, duration)))

@@ -80,9 +80,8 @@ class NodeParameter:
 
 
 def parameter_values(table: Sequence[NodeParameter],
-                     given: Mapping[str, object] | None = None) -> SimpleNamespace:
+                     given: Mapping[str, object]) -> SimpleNamespace:
     """Return the values of a table by attribute: checked given values, else defaults."""
-    given = given or {}
     return SimpleNamespace(**{each.attribute: each.check(given[each.name]) if each.name in given
                               else each.default for each in table})
 
@@ -144,15 +143,6 @@ class StampDelay:
         self._min_delays.append((now, now - time, heading))
         return now - time - self.min_delay
 
-    def _drop_past(self) -> None:
-        """Drop samples that were too old at the last call: after a pause, more may wait."""
-        now, before = node_time(self._clock), self._last_check
-        while (len(self._min_delays) > 1
-                and before - self._min_delays[0][0] > self._tolerances[-1][0]):
-            self._min_delays.popleft()
-            self._use_least()
-        self._last_check = now
-
     def _use_least(self) -> None:
         """Compare the least delay with that before."""
         (then, delay, heading), self._least = self._least, self._min_delays[0]
@@ -177,8 +167,12 @@ class StampDelay:
 
     def find_fault(self) -> str:
         """Return a sentence if stamps and clock advance differently; else ''."""
-        self._drop_past()
-        now = node_time(self._clock)
+        # Only samples that were too old at the last call: after a pause, more may wait.
+        while (len(self._min_delays) > 1
+                and self._last_check - self._min_delays[0][0] > self._tolerances[-1][0]):
+            self._min_delays.popleft()
+            self._use_least()
+        self._last_check = now = node_time(self._clock)
         # In a fast simulation the same delay is more simulated time.
         factor = 1.0 if self._clock.simulated() is None else 4.0
         while self._earlier and not 0.0 <= now - self._earlier[0][0] <= self._window:

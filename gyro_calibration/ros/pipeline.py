@@ -114,7 +114,7 @@ COUNT_NAMES = ('samples', 'refused_samples', 'refused_temperatures', 'lost_sampl
 
 
 @dataclass
-class Journal:
+class _Journal:
     """Events and counts so far."""
 
     last_received: float  # time of the last sample, s of the steady clock
@@ -155,7 +155,7 @@ class Pipeline:
             self._tracking_settings, clock.date())
         # false alarms: 0.001 per hour of rest
         self.monitor = HealthMonitor(noise, 0.001, self._tracking_settings.threshold.rate)
-        self.wheels, self.journal = Wheels(), Journal(clock.steady())
+        self.wheels, self.journal = Wheels(), _Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
         self.conflict = ''  # why samples cannot be used
@@ -246,8 +246,7 @@ class Pipeline:
         now, rate, time = self._clock.steady(), velocity.angular[2], self._message_time(stamp)
         if velocity.is_moving:
             self._heading_at_rest = math.nan
-        elif abs(math.remainder(heading - self._heading_at_rest,
-                                math.tau)) > MIN_TURN_ANGLE:
+        elif abs(math.remainder(heading - self._heading_at_rest, math.tau)) > MIN_TURN_ANGLE:
             self._contradiction_time, self._heading_at_rest = now, heading
             self.estimator.tracker.add_unknown_turn(MIN_TURN_ANGLE)
         elif math.isnan(self._heading_at_rest):
@@ -286,7 +285,6 @@ class Pipeline:
 
     @property
     def stamp_fault(self) -> str:
-        """Return that the heading may be off by uneven stamps; ''."""
         turned = self._stamp_delay.unknown_turn
         return (f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
                 'imu/data_raw advanced faster or slower for a time than before: check that the '
@@ -295,7 +293,6 @@ class Pipeline:
 
     @property
     def odometry_fault(self) -> str:
-        """Return why odometry does not show standstill; ''."""
         if self._clock.steady() - self._contradiction_time > 600.0:  # s
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
@@ -303,7 +300,6 @@ class Pipeline:
 
     @property
     def turn_fault(self) -> str:
-        """Return that the turns by the gyro and by odometry or commands do not agree; ''."""
         turns = self._turns
         return (f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check the '
                 f'unit and the sense of rotation of the gyro, and those of {turns.source}'
@@ -311,14 +307,12 @@ class Pipeline:
 
     @property
     def alternation_fault(self) -> str:
-        """Return that every other sample shows another turn; ''."""
         return ('every other sample on imu/data_raw shows another turn, as with two gyros on one '
                 'topic: give each gyro a topic of its own'
                 if self._alternate_turns.is_contradictory else '')
 
     @property
     def standstill_fault(self) -> str:
-        """Return that the gyro shows a turn while odometry shows standstill; ''."""
         return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
                 'the robot stands: unless others turn it, call calibrate_bias, or check odom'
                 if self._false_turn[1] else '')
@@ -347,8 +341,9 @@ class Pipeline:
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')
             return None
-        self._detect_several_gyros(stamp, frame, now)
-        silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
+        silence = now - self._last_arrival
+        self._detect_several_gyros(stamp, frame, now, silence)
+        self._last_stamp, self._last_arrival = stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
             return None
@@ -357,8 +352,22 @@ class Pipeline:
             self._update_host_clock()
             time = self._host_time.convert_sample(time, self._last_time, self._usual_interval,
                                                   silence)
-        if self._repeats_stamp(time, output, now):
+        if time == self._last_time:
+            counts['repeated_stamps'] += 1
+            first, fastest = self._frozen_stamp or (now, 0.0)
+            self._frozen_stamp = first, max(fastest, abs(output))
+            journal.event = (
+                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                if now - first > FAULT_DURATION else
+                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
+                'on its arrival; only the first of them is used: stamp when the gyro measures')
             return None
+        if self._frozen_stamp is not None:
+            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
+            if now - first > FAULT_DURATION:
+                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
+                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
+                                 'came; turns in this time are not in the heading')
         interval = time - self._last_time
         if 0.0 < interval <= self.values.maximum_gap:
             self._usual_interval = min(interval, self.estimator.tracker.intervals.usual_interval)
@@ -370,7 +379,7 @@ class Pipeline:
         if specific_force is not None and not abs(specific_force) <= MAX_SPECIFIC_FORCE:
             specific_force = None
         journal.channels = set() if specific_force is None else {'specific_force'}
-        if not self._integrate(time, (interval, silence), output, specific_force, now):
+        if not self._integrate(time, interval, silence, output, specific_force, now):
             return None
         self._stamp_delay.add(time, self._heading)
         self._check_repeats(time, output, now)
@@ -386,7 +395,6 @@ class Pipeline:
 
     @property
     def frame_fault(self) -> str:
-        """Return that the samples are not in the frame of the first one; ''."""
         if self._frame == self._first_frame:
             return ''
         return to_printable(
@@ -394,7 +402,7 @@ class Pipeline:
             f"'{self._first_frame:.99}': the calibration may be that of another gyro; restart "
             'this node, and calibrate another gyro')
 
-    def _detect_several_gyros(self, stamp: int, frame: str, now: float) -> None:
+    def _detect_several_gyros(self, stamp: int, frame: str, now: float, silence: float) -> None:
         """Detect stamps that jump back, frames that alternate, and samples that interleave."""
         if stamp < self._last_stamp:
             self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
@@ -406,29 +414,18 @@ class Pipeline:
                 self._note_jump(now, to_printable(
                     f"samples of the frames '{before:.99}' and '{frame:.99}' alternate on "
                     'imu/data_raw'))
-        if self.publisher_conflict:
-            self._detect_interleaving(stamp)
-
-    def _repeats_stamp(self, time: float, output: float, now: float) -> bool:
-        """Tell whether a stamp is that of the last sample, and add the turn while it was so."""
-        journal = self.journal
-        if time == self._last_time:
-            journal.counts['repeated_stamps'] += 1
-            first, fastest = self._frozen_stamp or (now, 0.0)
-            self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = (
-                f'the stamp stands still at {time:.3f} s; the sample is not used'
-                if now - first > FAULT_DURATION else
-                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
-                'on its arrival; only the first of them is used: stamp when the gyro measures')
-            return True
-        if self._frozen_stamp is not None:
-            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
-            if now - first > FAULT_DURATION:
-                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
-                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                 'came; turns in this time are not in the heading')
-        return False
+        if not self.publisher_conflict:
+            return
+        # Samples that follow too soon are not of the same publisher. A restarted driver that sends
+        # twice as fast as before is refused while the middleware lists the killed one. Delayed
+        # samples also follow too soon, until they have caught up.
+        usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
+        interval, behind = stamp - self._last_stamp, self._backlog
+        self._backlog = 0.0 if silence > FAULT_DURATION else min(
+            max(behind + interval - usual, 0.0), NSEC_PER_SEC * FAULT_DURATION)
+        self._interleaved_count += not (2.0 * interval > usual or behind)
+        if self._interleaved_count > 1:
+            self._refuse_all(self.publisher_conflict)
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
@@ -437,15 +434,18 @@ class Pipeline:
             self._refuse_all(f'{what}, as with several gyros on one topic: give each gyro a topic '
                              'of its own')
 
-    def _integrate(self, time: float, since: tuple[float, float], output: float,
+    def _integrate(self, time: float, interval: float, silence: float, output: float,
                    force: float | None, now: float) -> bool:
-        """Compensate and integrate a sample, and tell whether it was used."""
-        # `since` is the interval from the sample before, by stamps and by arrivals, s.
+        """
+        Compensate and integrate a sample, and tell whether it was used.
+
+        Interval and silence are from the sample before, by stamps and by arrivals, s.
+        """
         estimator, journal, refused = self.estimator, self.journal, self.estimator.refused_count
-        counts, intervals = journal.counts, estimator.tracker.intervals
-        sources = _WHEEL_SOURCES[self.values.wheels]
-        moving = self.wheels.is_moving(now, sources) if sources else None
-        (interval, silence), lost = since, intervals.lost_samples
+        counts, lost = journal.counts, estimator.tracker.intervals.lost_samples
+        wheels = self.values.wheels
+        sources = (ODOMETRY, COMMAND) if wheels == 'both' else (wheels,)
+        moving = self.wheels.is_moving(now, sources)
         unseen = not 0.0 < interval <= FAULT_DURATION
         if unseen and not moving and not self.wheels.has_stood(journal.last_received, now,
                                                                sources):
@@ -475,7 +475,7 @@ class Pipeline:
             turned = 0.25 * MAX_ANGULAR_ACCELERATION * interval ** 2
             if silence < 0.5 * interval:  # the stamps may have jumped without a loss
                 turned += abs(estimator.rate) * interval
-            self.estimator.tracker.add_unknown_turn(turned)
+            tracker.add_unknown_turn(turned)
         return True
 
     def _corrected_sample(self, stamp: int, time: float) -> CorrectedSample | None:
@@ -547,19 +547,6 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._trusted_heading = tracker.heading, tracker.variance
 
-    def _detect_interleaving(self, stamp: int) -> None:
-        """Count samples that follow too soon to be of the same publisher."""
-        # A restarted driver that sends twice as fast as before is refused while the middleware
-        # lists the killed one. Delayed samples also follow too soon, until they have caught up.
-        usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
-        interval, behind = stamp - self._last_stamp, self._backlog
-        begins = self._clock.steady() - self._last_arrival > FAULT_DURATION
-        self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
-                                               NSEC_PER_SEC * FAULT_DURATION)
-        self._interleaved_count += not (2.0 * interval > usual or behind)
-        if self._interleaved_count > 1:
-            self._refuse_all(self.publisher_conflict)
-
     def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
@@ -611,9 +598,8 @@ class Pipeline:
         if added > 0.01 * tracker.variance:  # else the deviation changes by less than 0.5 %
             tracker.add_unknown_turn(math.sqrt(added))
             self._stamp_turn = unknown
-        if (self.clock_fault or self.frame_fault or self.turn_fault
-                or self.alternation_fault):
-            self.estimator.tracker.add_unknown_turn(math.tau)
+        if self.clock_fault or self.frame_fault or self.turn_fault or self.alternation_fault:
+            tracker.add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):
             self.journal.event = event
@@ -627,7 +613,3 @@ class Pipeline:
         if self.conflict or self.repeat_fault:  # turns are not measured now
             self.estimator.set_heading(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
-
-
-_WHEEL_SOURCES = {'none': (), 'odom': (ODOMETRY,), 'cmd_vel': (COMMAND,),
-                  'both': (ODOMETRY, COMMAND)}

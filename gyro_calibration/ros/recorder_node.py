@@ -17,7 +17,7 @@ lose nothing. Publishers may start late, stop, and start again with another QoS.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import importlib
 import os
 import threading
@@ -72,12 +72,25 @@ class RecorderNode(Node):
                 continue
             if fault := topic_type_fault(self._roles[topic], topic, kinds[0]):
                 raise LogError(fault)
-            quality = _compatible_quality([each.qos_profile for each in publishers])
+            # compatible with all publishers; transient local only if all offer it
+            offered = [each.qos_profile for each in publishers]
+            is_reliable = not any(each.reliability == ReliabilityPolicy.BEST_EFFORT
+                                  for each in offered)
+            is_latched = all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                             for each in offered)
             before = self._taken.get(topic)
-            if before is None or _wants_more(before.qos_profile, quality):
-                if before is not None:
-                    self.destroy_subscription(before)
-                self._taken[topic] = self._subscribe(topic, kinds[0], quality)
+            if before is not None:
+                has = before.qos_profile
+                if (is_reliable or has.reliability != ReliabilityPolicy.RELIABLE) and (
+                        is_latched or has.durability != DurabilityPolicy.TRANSIENT_LOCAL):
+                    continue  # it receives every publisher
+                self.destroy_subscription(before)
+            self._taken[topic] = self._subscribe(topic, kinds[0], QoSProfile(
+                depth=SENSOR_QOS.depth,
+                reliability=(ReliabilityPolicy.RELIABLE if is_reliable
+                             else ReliabilityPolicy.BEST_EFFORT),
+                durability=(DurabilityPolicy.TRANSIENT_LOCAL if is_latched
+                            else DurabilityPolicy.VOLATILE)))
 
     def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> Subscription:
         # By the steady clock, so that times of receipt do not jump when the clock is set.
@@ -89,22 +102,6 @@ class RecorderNode(Node):
         package, _, name = kind.split('/')
         message_class = getattr(importlib.import_module(f'{package}.msg'), name)
         return self.create_subscription(message_class, topic, take, quality, raw=True)
-
-
-def _compatible_quality(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """Return a QoS compatible with all publishers; transient local only if all offer it."""
-    best_effort = any(each.reliability == ReliabilityPolicy.BEST_EFFORT for each in offered)
-    latched = all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in offered)
-    return QoSProfile(
-        depth=SENSOR_QOS.depth,
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
-
-
-def _wants_more(requested: QoSProfile, offered: QoSProfile) -> bool:
-    """Tell whether a subscription does not receive a publisher with this offer."""
-    return (requested.reliability == ReliabilityPolicy.RELIABLE != offered.reliability
-            or requested.durability == DurabilityPolicy.TRANSIENT_LOCAL != offered.durability)
 
 
 def _describe_error(error: Exception) -> str:

@@ -118,40 +118,22 @@ def declare_parameters(
         given = node.declare_parameter(each.name, default,
                                        ParameterDescriptor(dynamic_typing=True)).value
         node.undeclare_parameter(each.name)
-        node.declare_parameter(each.name, each.check(given), _descriptor(each),
-                               ignore_override=True)
+        descriptor = ParameterDescriptor(
+            description=each.description + (f' Unit: {each.unit}.' if each.unit else ''),
+            read_only=not each.dynamic, additional_constraints=each.choices_text,
+            dynamic_typing=isinstance(each.default, float))  # a whole number is allowed
+        if each.range and isinstance(each.default, float):
+            low, high = map(float, each.range)
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        elif each.range:
+            least, most = map(int, each.range)
+            descriptor.integer_range = [IntegerRange(from_value=least, to_value=most)]
+        node.declare_parameter(each.name, each.check(given), descriptor, ignore_override=True)
     after = hasattr(node, 'add_post_set_parameters_callback')  # not in Humble
     node.add_on_set_parameters_callback(check)
     if after:
         node.add_post_set_parameters_callback(use)
     return read_values()
-
-
-def warn_of_unused_parameters(node: Node) -> None:
-    """Warn of values that were given for parameters which the node does not have."""
-    # not refused, since a file may give a parameter to all nodes
-    for name in node._parameter_overrides:
-        if not node.has_parameter(name):
-            alike = get_close_matches(name, node._parameters, 1)
-            node.get_logger().warning(
-                f'there is no parameter {name}, and its value is not used'
-                f'{"".join(f": is {each} meant?" for each in alike)}')
-
-
-def _descriptor(parameter: NodeParameter) -> ParameterDescriptor:
-    unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
-    descriptor = ParameterDescriptor(
-        description=parameter.description + unit, read_only=not parameter.dynamic,
-        additional_constraints=parameter.choices_text,
-        # a whole number may be set for a float
-        dynamic_typing=isinstance(parameter.default, float))
-    if parameter.range and isinstance(parameter.default, float):
-        low, high = map(float, parameter.range)
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    elif parameter.range:
-        low, high = map(int, parameter.range)
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
-    return descriptor
 
 
 def call_every(node: Node, period: float, callback: Callable[[], None]) -> Timer:
@@ -212,7 +194,13 @@ def run_node(node_class: Callable[[], Node]) -> int:
         except (ValueError, OSError, RuntimeError, ParameterException) as error:
             print(f'{node_class.__name__}: {error}', file=sys.stderr)
             return 2
-        warn_of_unused_parameters(node)
+        # not refused, since a file may give a parameter to all nodes
+        for name in node._parameter_overrides:
+            if not node.has_parameter(name):
+                alike = get_close_matches(name, node._parameters, 1)
+                node.get_logger().warning(
+                    f'there is no parameter {name}, and its value is not used'
+                    f'{"".join(f": is {each} meant?" for each in alike)}')
         spin(node, stop)
         return 0
     finally:

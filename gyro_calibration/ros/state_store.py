@@ -78,7 +78,17 @@ class StateStore:
         except ModelError as error:
             self.calibration_hint = f'the last self-calibration is not used: {error}'
             return model
-        if fault := _describe_mismatch(stored, model):
+        theirs, ours = (each.gyro.get('serial_number', '') for each in (stored, model))
+        fault = ''
+        if stored.self_calibration is None:
+            fault = 'the file has none; it may be truncated'
+        elif not have_same_effects(stored, model):
+            fault = 'it belongs to another model'
+        elif theirs != ours:
+            of = (f'the gyro with the serial number {theirs}' if theirs
+                  else 'a gyro without a serial number')
+            fault = f'it belongs to {of}, and the model to {ours or "one without"}'
+        if fault:
             self.calibration_hint = to_printable(
                 f'the self-calibration in {self._calibration_file} is not used: {fault}; '
                 'calibrate again')
@@ -116,20 +126,6 @@ class StateStore:
             self.table_hint = to_printable('the bias table cannot be written '
                                            f'({describe_error(error)}): '
                                            f'{remedy(error, self._bias_file)}')
-
-
-def _describe_mismatch(stored: GyroModel, model: GyroModel) -> str:
-    """Return why a stored self-calibration does not fit a model; '' if it does."""
-    if stored.self_calibration is None:
-        return 'the file has none; it may be truncated'
-    if not have_same_effects(stored, model):
-        return 'it belongs to another model'
-    theirs, ours = (each.gyro.get('serial_number', '') for each in (stored, model))
-    if theirs == ours:
-        return ''
-    of = (f'the gyro with the serial number {theirs}' if theirs
-          else 'a gyro without a serial number')
-    return f'it belongs to {of}, and the model to {ours or "one without"}'
 
 
 def _existing_version(file: Path) -> tuple[int, int] | None:

@@ -74,7 +74,17 @@ def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recogni
     their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
     """
     settings, data = settings or Settings(), data[-_MAX_BYTES:]
-    scores = [(*_explain(protocol, settings, data), protocol) for protocol in PROTOCOLS.values()]
+    scores = []
+    for protocol in PROTOCOLS.values():  # the share of the bytes in frames, and these frames
+        splitter, parse = protocol.splitter(), protocol.parser(settings)
+        found = splitter.feed(data)
+        good = [frame.data for frame in found if parse(frame.data) is not None]
+        explained = 0.0
+        if good:
+            received = splitter.discarded_bytes + sum(len(frame.data) for frame in found)
+            begun = min(found[0].skipped_bytes, max(map(len, good)))
+            explained = sum(map(len, good)) / (received - begun)
+        scores.append((explained, good, protocol))
     (share, frames, best), (next_share, _, second) = sorted(scores, key=lambda each: -each[0])[:2]
     if next_share and next_share >= _AMBIGUITY_RATIO * share:
         return Recognition(None, share, f'the bytes may be {best.name} or {second.name}: set '
@@ -93,15 +103,3 @@ def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recogni
         words = (f'{len(data)} bytes came, but in no known format: try another baud, set '
                  'protocol, or for csv name as many columns as a line has numbers')
     return Recognition(None, share, words)
-
-
-def _explain(protocol: Protocol, settings: Settings, data: bytes) -> tuple[float, list[bytes]]:
-    """Return the share of the bytes in frames of a protocol, and these frames."""
-    splitter, parse = protocol.splitter(), protocol.parser(settings)
-    frames = splitter.feed(data)
-    good = [frame.data for frame in frames if parse(frame.data) is not None]
-    if not good:
-        return 0.0, good
-    received = splitter.discarded_bytes + sum(len(frame.data) for frame in frames)
-    begun = min(frames[0].skipped_bytes, max(map(len, good)))
-    return sum(map(len, good)) / (received - begun), good

@@ -35,7 +35,6 @@ from gyro_calibration.driver.protocols.protocol import (
 
 _NUMBER = re.compile(NUMBER)
 _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
-_MISSING_VALUES = (b'', b'nan')
 
 
 def _check(settings: Settings) -> None:
@@ -60,7 +59,7 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
     known: list[float | None] = []
     for column in OPTIONAL_COLUMNS:
         text = fields.get(column, b'')
-        if text.lower() in _MISSING_VALUES:
+        if text.lower() in (b'', b'nan'):
             known.append(None)
         elif _NUMBER.fullmatch(text) and math.isfinite(value := float(text)):
             known.append(value)

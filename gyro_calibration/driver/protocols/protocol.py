@@ -27,7 +27,7 @@ from typing import NamedTuple, TypeVar
 
 from gyro_calibration.logs.columns import COLUMNS, PLAUSIBLE_TEMPERATURES
 
-OutputT = TypeVar('OutputT')
+_OutputT = TypeVar('_OutputT')
 
 ROOM_TEMPERATURE = 25.0  # degC; default of an emulated device
 #: Columns of the log format that hold the output, with their unit in rad/s, or in counts.
@@ -104,13 +104,13 @@ def to_signed_count(value: float, bits: int = 16) -> int:
 
 
 #: Parses a frame to a reading, or None if it is not valid; may use earlier frames.
-ParseFrame = Callable[[bytes], 'Reading | None']
+_ParseFrame = Callable[[bytes], 'Reading | None']
 #: Makes the bytes that an emulated device sends of a value, in its unit, and the further values
 #: of a sample; may use earlier samples. The sequence counts from 0 and never wraps.
-WriteFrame = Callable[[float, Sample], bytes]
+_WriteFrame = Callable[[float, Sample], bytes]
 
 
-def stateless(convert: Callable[..., OutputT]) -> Callable[[Settings], Callable[..., OutputT]]:
+def stateless(convert: Callable[..., _OutputT]) -> Callable[[Settings], Callable[..., _OutputT]]:
     """Return the `Protocol.parser` or `writer` of a format with independent frames."""
     return lambda settings: lambda *given: convert(*given, settings)
 
@@ -158,8 +158,8 @@ class Protocol:
     #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    parser: Callable[[Settings], ParseFrame]  # makes that of one connection
-    writer: Callable[[Settings], WriteFrame]  # makes that of one device
+    parser: Callable[[Settings], _ParseFrame]  # makes that of one connection
+    writer: Callable[[Settings], _WriteFrame]  # makes that of one device
     invert: bool = False  # whether the device counts clockwise turns positive
     full_scale: float = math.radians(2000.0)  # rad/s
     largest_count: int | None = None  # times the sensitivity it is the full scale
@@ -204,11 +204,9 @@ class Protocol:
         return encode
 
     def nominal_rate(self, settings: Settings) -> float:
-        """Return the samples per second, as set or of the format."""
         return settings.sample_rate or self.rate
 
     def sends_angles(self, settings: Settings) -> bool:
-        """Return whether the device sends angles since its last sample, as set or by default."""
         return self.increments if settings.increments is None else settings.increments
 
     def sample_rate_warning(self, settings: Settings, period: float) -> str:
@@ -264,46 +262,44 @@ class Decoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Return the number of bytes outside of frames."""
         return self._splitter.discarded_bytes + self._refused_bytes
 
     def feed(self, data: bytes) -> list[Sample]:
         """Return the samples that these bytes complete, the oldest first."""
-        samples = (self._to_sample(frame) for frame in self._splitter.feed(data))
-        return [sample for sample in samples if sample is not None]
+        samples, (coldest, hottest) = [], PLAUSIBLE_TEMPERATURES
+        for frame in self._splitter.feed(data):
+            if frame.skipped_bytes:
+                self._parse = self._parser()  # the previous frame is not adjacent
+                self._skipped_bytes += frame.skipped_bytes
+            reading = self._parse(frame.data)
+            if reading is None:
+                self._refused_bytes += len(frame.data)
+                self._skipped_bytes += len(frame.data)
+                continue
+            if reading.value is None:
+                continue
+            output = reading.value * self._factor
+            if not (reading.valid and abs(output) <= self._limit):
+                self.device_faults += not reading.valid
+                self.refused_samples += reading.valid
+                self._refused_frames += 1
+                continue
+            missing = (self._refused_frames + round(self._skipped_bytes / len(frame.data))
+                       if self._has_sample else 0)
+            self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True
+            temperature = reading.temperature
+            if temperature is not None and not coldest <= temperature <= hottest:
+                self.refused_temperatures += 1
+                temperature = None
+            samples.append(Sample(output, temperature, reading.time, reading.sequence, missing,
+                                  reading.specific_force, reading.health))
+        return samples
 
     def reset(self) -> None:
         """Discard an incomplete frame, as after a loss of the port; the counts are kept."""
         self._splitter.reset()
         self._parse = self._parser()
         self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, False
-
-    def _to_sample(self, frame: Frame) -> Sample | None:
-        if frame.skipped_bytes:
-            self._parse = self._parser()  # the previous frame is not adjacent
-            self._skipped_bytes += frame.skipped_bytes
-        reading = self._parse(frame.data)
-        if reading is None:
-            self._refused_bytes += len(frame.data)
-            self._skipped_bytes += len(frame.data)
-            return None
-        if reading.value is None:
-            return None
-        output = reading.value * self._factor
-        if not (reading.valid and abs(output) <= self._limit):
-            self.device_faults += not reading.valid
-            self.refused_samples += reading.valid
-            self._refused_frames += 1
-            return None
-        missing = (self._refused_frames + round(self._skipped_bytes / len(frame.data))
-                   if self._has_sample else 0)
-        self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True
-        temperature, (coldest, hottest) = reading.temperature, PLAUSIBLE_TEMPERATURES
-        if temperature is not None and not coldest <= temperature <= hottest:
-            self.refused_temperatures += 1
-            temperature = None
-        return Sample(output, temperature, reading.time, reading.sequence, missing,
-                      reading.specific_force, reading.health)
 
 
 #: A finite number in text: `float` also takes nan, inf and 1_0.

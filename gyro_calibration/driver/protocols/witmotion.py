@@ -57,18 +57,14 @@ class _Parser:
 
 
 def _write(value: float, sample: Sample, settings: Settings) -> bytes:
-    degrees = ROOM_TEMPERATURE if sample.temperature is None else sample.temperature
-    rate = _frame(_RATE, value, 100.0 * degrees, settings.axis)
-    if sample.specific_force is None:
-        return rate
-    force = sample.specific_force / _FORCE_PER_COUNT
-    return _frame(_ACCELERATION, force, 100.0 * degrees, settings.axis) + rate
-
-
-def _frame(kind: int, value: float, temperature: float, axis: str) -> bytes:
-    numbers = [value if each == axis else 0.0 for each in 'xyz'] + [temperature]
-    frame = bytes([0x55, kind]) + struct.pack('<4h', *map(to_signed_count, numbers))
-    return frame + bytes([sum(frame) & 0xFF])
+    degrees, data = ROOM_TEMPERATURE if sample.temperature is None else sample.temperature, b''
+    force = sample.specific_force
+    for kind, number in ((_ACCELERATION, force and force / _FORCE_PER_COUNT), (_RATE, value)):
+        if number is not None:
+            numbers = *(number * (each == settings.axis) for each in 'xyz'), 100.0 * degrees
+            frame = bytes([0x55, kind]) + struct.pack('<4h', *map(to_signed_count, numbers))
+            data += frame + bytes([sum(frame) & 0xFF])
+    return data
 
 
 WITMOTION = Protocol(name='witmotion', text=__doc__, baud=9600,
