@@ -62,7 +62,17 @@ class Intervals:
         self._history.append(interval)
         self._until_update -= 1
         if not self._until_update:
-            self._update_usual_interval()
+            # the usual interval is the median, unless the stamps come in bursts
+            self._until_update = max(len(self._history) // 4, _MIN_INTERVALS)
+            steps = sorted(self._history)
+            mean = sum(steps) / len(steps)
+            usual = self._even_interval = steps[len(steps) // 2]
+            if steps[int(_MIN_BURST_SHARE * len(steps))] < SHORT_RATIO * mean:
+                # the longest may be gaps
+                self._even_interval = steps[-1 - len(steps) // 100]
+                usual = sum(min(step, self._even_interval) for step in steps) / len(steps)
+            self.usual_interval = max(usual, MIN_SAMPLE_INTERVAL)
+            self._gap_limit = self._even_interval + SHORT_RATIO * self.usual_interval
         return self.count_lost(interval)
 
     def add_many(self, intervals: Array) -> tuple[Array, Array]:
@@ -103,19 +113,6 @@ class Intervals:
         else:
             self._late_samples = 0
         return 0
-
-    def _update_usual_interval(self) -> None:
-        """Find the usual interval: the median, unless the stamps come in bursts."""
-        self._until_update = max(len(self._history) // 4, _MIN_INTERVALS)
-        steps = sorted(self._history)
-        mean = sum(steps) / len(steps)
-        usual = self._even_interval = steps[len(steps) // 2]
-        if steps[int(_MIN_BURST_SHARE * len(steps))] < SHORT_RATIO * mean:
-            # the longest may be gaps
-            self._even_interval = steps[-1 - len(steps) // 100]
-            usual = sum(min(step, self._even_interval) for step in steps) / len(steps)
-        self.usual_interval = max(usual, MIN_SAMPLE_INTERVAL)
-        self._gap_limit = self._even_interval + SHORT_RATIO * self.usual_interval
 
 
 def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[int]:

@@ -75,7 +75,7 @@ class RateIntegral:
 
 @dataclass(frozen=True)
 class _Transition:
-    """_Transition of the state over some time, without the rotation itself."""
+    """Transition of the state over some time, without the rotation itself."""
 
     observation: Array  # of each component in the integral of the compensated rate, shape (n,)
     retention: Array  # decay factor of each component, shape (n,)

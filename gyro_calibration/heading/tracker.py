@@ -444,7 +444,7 @@ class HeadingTracker:
 
     def _pass_blocks(self, piece: EvenSamples, number: int) -> int:
         """Take the whole blocks before the next in which a decision falls; return their number."""
-        if (piece.wheels is not None or not self._energy.has_results
+        if (piece.wheels is not None or not self._energy.results_ahead
                 or piece.last_at_rest != self.is_resting):
             return 0
         passed = (self._count_quiet_blocks(piece, number) if self.is_resting
