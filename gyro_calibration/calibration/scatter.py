@@ -331,9 +331,22 @@ class Uncertainty:
         """
         lengths, deviation = np.linalg.norm(columns, axis=0), scatter.deviation(dwells)
         dof, likeliest = len(dwells) - len(lengths), (scatter.sweep_bias, scatter.sweep_scale)
-        axes, priors = zip(*(_scatter_grid(size, variances) for size, variances in zip(
-            likeliest, _sweep_variances(dwells, deviation)))
-            if _count_scatter_terms(dwells) == 4 else ((np.zeros(1), np.ones(1)),) * 2)
+        axes, priors = [np.zeros(1)] * 2, [np.ones(1)] * 2
+        if _count_scatter_terms(dwells) == 4:
+            # variance of bias and scale of each sweep by its dwells, shape (2, sweeps)
+            weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
+            variances = 1.0 / sum_by_part(
+                weights / deviation[:, None] ** 2, _sweep_numbers(dwells)).T
+            for place, variance in enumerate(variances):
+                # possible sizes of this scatter about the likely one, and their prior
+                typical, size = 1.0 / math.sqrt(float(np.mean(1.0 / variance))), likeliest[place]
+                grid = np.geomspace(
+                    max(0.3 * typical, size / 30.0), 100.0 * max(typical, size), 25)
+                prior = grid ** 2 * np.sqrt(
+                    np.mean((grid[:, None] ** 2 + variance) ** -2.0, axis=1))
+                axes[place] = np.append(0.0, grid)
+                priors[place] = np.append(
+                    0.5 + 0.5 * prior[0], prior * math.log(grid[1] / grid[0]))
         sizes = [np.column_stack([np.full(len(axes[1]), bias), axes[1]])
                  for bias in axes[0]]  # in turn, for the memory
         log_determinant, misfit, offsets, inverses = (np.concatenate(each) for each in zip(*(
@@ -385,21 +398,6 @@ class Uncertainty:
         covariance = np.tensordot(self.weights, self.covariances, axes=1)
         widening = self.half_width(0.95) / NORMAL_QUANTILE_975 / np.sqrt(np.diag(covariance))
         return covariance * np.outer(widening, widening)
-
-
-def _sweep_variances(dwells: Dwells, deviation: Array) -> Array:
-    """Return the variance of bias and scale of each sweep by its dwells, shape (2, sweeps)."""
-    weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
-    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, _sweep_numbers(dwells)).T
-
-
-def _scatter_grid(size: float, variances: Array) -> tuple[Array, Array]:
-    """Return possible sizes of a scatter about the likely one, and their prior."""
-    typical = 1.0 / math.sqrt(float(np.mean(1.0 / variances)))
-    sizes = np.geomspace(max(0.3 * typical, size / 30.0), 100.0 * max(typical, size), 25)
-    prior = sizes ** 2 * np.sqrt(np.mean((sizes[:, None] ** 2 + variances) ** -2.0, axis=1))
-    return np.append(0.0, sizes), np.append(
-        0.5 + 0.5 * prior[0], prior * math.log(sizes[1] / sizes[0]))
 
 
 # errors in another run
