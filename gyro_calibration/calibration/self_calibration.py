@@ -182,15 +182,29 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
          noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2])
     of_steps, rounding = rounding_covariance(time, rate if output is None else output, fit)
+    goodness = None
+    if noise.angle_random_walk and fit.dof:
+        # the residual against the known noise of means over neighbouring blocks
+        block = float(np.median(np.diff(fit.influence[:, 2])))
+        known = noise.allan_variance(block) * block + (scale * reference.random_walk) ** 2
+        chi_square = fit.residual_squares / known
+        goodness = GoodnessOfFit(chi_square, fit.dof, float(chdtrc(fit.dof, chi_square)),
+                                 fit.angle_random_walk / math.sqrt(known))
     fit = replace(fit, covariance=fit.covariance + unobservable + of_steps,
-                  rounding_variance=rounding, goodness=_goodness_of_fit(fit, reference, noise))
+                  rounding_variance=rounding, goodness=goodness)
     if prior is not None and np.isfinite(fit.covariance).all():
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
     _refuse_fit(fit, run, motion, limits, white_noise)
-    _refuse_shared_noise(fit, white_noise, noise)
+    # a reference that follows the noise of the gyro: that of the model, or less by the samples
+    own = min(noise.angle_random_walk, white_noise) ** 2
+    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-_MIN_SLIP_SIGMAS):
+        raise DataRefused(
+            'the reference is computed from this gyro, since they differ by '
+            f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
+            'gyro: give a reference without it, such as odometry of the wheels')
     return fit
 
 
@@ -240,17 +254,6 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     return sums @ sums.T, float(error[slowest] ** 2)
 
 
-def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) -> None:
-    """Refuse a reference that follows the noise of the gyro: it is computed from this gyro."""
-    # that of the model, if it is known, or less by the samples, `white_noise`, rad/√s
-    own = min(noise.angle_random_walk, white_noise) ** 2
-    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-_MIN_SLIP_SIGMAS):
-        raise DataRefused(
-            'the reference is computed from this gyro, since they differ by '
-            f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
-            'gyro: give a reference without it, such as odometry of the wheels')
-
-
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
                     slip_deviation: float,
                     excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
@@ -261,35 +264,17 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
                               slip_deviation=slip_deviation, excess_turn=excess_turn)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
-    return fit if motion.rate is not None else _add_asymmetry_variance(fit, rate)
-
-
-def _add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
-    """
-    Return the fit with the variance of a scale difference between both senses of turning added.
-
-    For measured headings; against a profile the fit includes it. Such an error is proportional to
-    the absolute value of the rate. The part of it that is proportional to the rate, or constant,
-    is indistinguishable from scale factor error and bias. In a swing without rests, the mean
-    absolute rate is indistinguishable from a bias.
-    """
+    if motion.rate is not None:
+        return fit
+    # Against a profile the fit includes a scale difference between both senses of turning; for
+    # measured headings its variance is added. Such an error is proportional to the absolute value
+    # of the rate. The part of it that is proportional to the rate, or constant, is
+    # indistinguishable from scale factor error and bias. In a swing without rests, the mean
+    # absolute rate is indistinguishable from a bias.
     columns = np.column_stack([rate, np.ones(len(rate))])
     absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
     return replace(
         fit, covariance=fit.covariance + ASYMMETRY_DEVIATION ** 2 * np.outer(absorbed, absorbed))
-
-
-def _goodness_of_fit(fit: ScaleBiasFit, reference: ReferenceErrors,
-                     noise: Noise) -> GoodnessOfFit | None:
-    """Compare the residual with the known noise of means over neighbouring blocks."""
-    if not noise.angle_random_walk or not fit.dof:
-        return None
-    block = float(np.median(np.diff(fit.influence[:, 2])))
-    known = (noise.allan_variance(block) * block
-             + ((1.0 + fit.scale_factor_error) * reference.random_walk) ** 2)
-    chi_square = fit.residual_squares / known
-    return GoodnessOfFit(chi_square, fit.dof, float(chdtrc(fit.dof, chi_square)),
-                         fit.angle_random_walk / math.sqrt(known))
 
 
 def refuse_samples(time: Array, rate: Array, limits: RunLimits, output: Array | None) -> None:
@@ -403,7 +388,17 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           f'{limits.max_noise_ratio:g} are allowed: check that the robot follows '
                           f'the {motion.name}, fasten the gyro, stop vibration, or measure the '
                           'noise again (allan)')
-    _refuse_no_improvement(fit, limits.max_heading_error)
+    # the heading after a drive with a whole turn, by its own covariance and without a calibration
+    error_with = math.sqrt(
+        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * math.tau)
+        * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
+    error_without = math.hypot(fit.bias * DRIVE_DURATION, s * math.tau)
+    if error_with > max(limits.max_heading_error, error_without):
+        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
+                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
+                          'deg in five minutes; without the calibration it is '
+                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
+                          'for longer')
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
@@ -430,32 +425,6 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
 #: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
 #: is stated, s.
 DRIVE_DURATION = 300.0
-
-
-def _refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
-    """
-    Refuse a calibration that by its own covariance makes a heading less accurate.
-
-    Parameters
-    ----------
-    limit : accepted standard deviation of the heading after a drive of five minutes and a whole
-        turn, rad, whatever it was before
-
-    Raises
-    ------
-    DataRefused : the standard deviation exceeds the limit, and the error without the calibration
-
-    """
-    error_with = math.sqrt(
-        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * math.tau)
-        * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
-    error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * math.tau)
-    if error_with > max(limit, error_without):
-        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
-                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
-                          'deg in five minutes; without the calibration it is '
-                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
-                          'for longer')
 
 
 @dataclass(frozen=True)

@@ -159,9 +159,30 @@ class HeadingEstimator:
 
     def _restart(self, now: float, is_fresh: bool = False) -> None:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
-        self._calibration_message = ''
-        self.current_model, age = ((_with_assumed_covariance(self.model, self._assumptions), 0.0)
-                                   if is_fresh else self._propagated_model(now))
+        model, self._calibration_message = (
+            _with_assumed_covariance(self.model, self._assumptions), '')
+        calibration, here = model.self_calibration, self._known_temperature
+        age: float | None = 0.0
+        if not is_fresh and calibration is None:
+            if here is None or not self.table.entries:
+                age = None
+            else:  # the bias of earlier runs
+                bias, variance = self.table.predict(here, now)
+                model = with_self_calibration(
+                    model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance))))
+        elif (not is_fresh and self.model.self_calibration is None
+              and not self.table.entries):
+            age = None
+        elif calibration is not None and not is_fresh:
+            calibration, self._calibration_message = self.table.propagate_calibration(
+                calibration, self.age(now), now, here, self.is_calibrated_this_run)
+            model = with_self_calibration(model, calibration)
+            if (self._dated_age(now) or 0.0) < -AGE_TOLERANCE:
+                self._calibration_message = (
+                    f'the calibration is dated {calibration.time}, which is later than the clock '
+                    'of this computer: its age is not known and taken for a year; set the clock, '
+                    'or calibrate again')
+        self.current_model = model
         self.covariance: Array = block_diag(self._assumptions.bias_temperature_coefficient ** 2,
                                             uncertainty_covariance(self.current_model))
         temperature = self.model.reference_temperature
@@ -191,29 +212,6 @@ class HeadingEstimator:
         self._follows_temperature = here is not None
         self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
                             if here is not None and coefficient else None)
-
-    def _propagated_model(self, now: float) -> tuple[GyroModel, float | None]:
-        """Return the model to compensate with, and the age of its self-calibration, s, or None."""
-        model = _with_assumed_covariance(self.model, self._assumptions)
-        calibration = model.self_calibration
-        if calibration is None:
-            here = self._known_temperature
-            if here is None or not self.table.entries:
-                return model, None
-            # the bias of earlier runs
-            bias, variance = self.table.predict(here, now)
-            return with_self_calibration(
-                model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
-        if self.model.self_calibration is None and not self.table.entries:
-            return model, None
-        calibration, self._calibration_message = self.table.propagate_calibration(
-            calibration, self.age(now), now, self._known_temperature, self.is_calibrated_this_run)
-        if (self._dated_age(now) or 0.0) < -AGE_TOLERANCE:
-            self._calibration_message = (
-                f'the calibration is dated {calibration.time}, which is later than the clock of '
-                'this computer: its age is not known and taken for a year; set the clock, or '
-                'calibrate again')
-        return with_self_calibration(model, calibration), 0.0
 
     @property
     def calibration_message(self) -> str:
@@ -352,7 +350,7 @@ class HeadingEstimator:
             self._add_to_table(now, True)
         return message
 
-    def is_plausible(self, time: float, output: float, force: float | None = None) -> bool:
+    def is_plausible(self, time: float, output: float, force: float | None) -> bool:
         """Tell whether a sample is plausible for the gyro; `add` refuses others, and any nan."""
         limit = self.current_model.rate_limit
         return (-limit <= output <= limit and -MAX_TIME <= time <= MAX_TIME

@@ -115,7 +115,7 @@ class Intervals:
         return 0
 
 
-def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[int]:
+def block_ends(intervals: Array, length: float, elapsed: float) -> list[int]:
     """
     Return the numbers of samples up to the ends of blocks of `length` s or slightly longer.
 

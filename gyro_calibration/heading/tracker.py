@@ -145,12 +145,10 @@ class HeadingTracker:
         self._steady_rates: SteadyRates | None = SteadyRates(covariance)
         self._heading_begin_time = self._last_time
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
-        self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
+        self._open_integral = self._zero_integral
+        self._block_integral = replace(self._zero_integral)
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
-
-    def _new_integral(self) -> RateIntegral:
-        return RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
 
     def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
         """Go on with other settings."""
@@ -447,8 +445,23 @@ class HeadingTracker:
         if (piece.wheels is not None or not self._energy.results_ahead
                 or piece.last_at_rest != self.is_resting):
             return 0
-        passed = (self._count_quiet_blocks(piece, number) if self.is_resting
-                  else self._count_moving_blocks(piece, number))
+        if self.is_resting:
+            until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
+            begin, end = piece.block_starts[number], piece.block_stops[until - 1]
+            rates = np.abs(piece.rate[begin:end] - self._wander_rate
+                           + piece.rest_sensitivity[begin:end] @ self._calibration_errors)
+            peaks = np.maximum.reduceat(rates, np.array(piece.block_starts[number:until]) - begin)
+            duration, passed = self._open_integral.duration, until - number - 1
+            for place, (peak, more) in enumerate(zip(
+                    peaks.tolist(), piece.block_sums[0, number:until].tolist())):
+                quiet, limit = self._energy.quiet_ahead(place)
+                duration += more
+                if (quiet is False or peak > math.hypot(limit, self._bias_margin)
+                        or duration >= _STEP_DURATION - TIME_TOLERANCE):
+                    passed = place
+                    break
+        else:
+            passed = self._count_moving_blocks(piece, number)
         if not passed:
             return 0
         here = slice(number, number + passed)
@@ -466,10 +479,10 @@ class HeadingTracker:
                 squares[last].tolist()))
         if not self.is_resting:
             turn, ends = self._open_integral, piece.block_ends[here]
-            until = turn.duration + np.cumsum(durations)
+            totals = turn.duration + np.cumsum(durations)
             piece.epochs[-1].open_integrals.append((
-                ends, until, np.full(passed, turn.lost_variance + turn.extra_noise_variance),
-                self._unbiased_sensitivity(until, turn.sensitivity + np.cumsum(rows, axis=0),
+                ends, totals, np.full(passed, turn.lost_variance + turn.extra_noise_variance),
+                self._unbiased_sensitivity(totals, turn.sensitivity + np.cumsum(rows, axis=0),
                                            None if piece.still is None else piece.still[ends])))
             self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
         self._integrate_blocks(piece, here, whole)
@@ -494,24 +507,6 @@ class HeadingTracker:
         self._last_sample = time, rate, rate, used[last]
         self._interval, self._last_time = float(piece.intervals[last]), time
         self._still_sensitivity = None if piece.still is None else piece.still[last]
-
-    def _count_quiet_blocks(self, piece: EvenSamples, number: int) -> int:
-        """Return how many of the next whole blocks are at rest before a decision."""
-        duration, passed = self._open_integral.duration, 0
-        begin = piece.block_starts[number]
-        until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
-        end = piece.block_stops[until - 1]
-        rates = np.abs(piece.rate[begin:end] - self._wander_rate
-                       + piece.rest_sensitivity[begin:end] @ self._calibration_errors)
-        peaks = np.maximum.reduceat(rates, np.array(piece.block_starts[number:until]) - begin)
-        for peak, more in zip(peaks.tolist(), piece.block_sums[0, number:until].tolist()):
-            quiet, limit = self._energy.quiet_ahead(passed)
-            duration += more
-            if (quiet is False or peak > math.hypot(limit, self._bias_margin)
-                    or duration >= _STEP_DURATION - TIME_TOLERANCE):
-                return passed
-            passed += 1
-        return passed - 1
 
     def _count_moving_blocks(self, piece: EvenSamples, number: int) -> int:
         """Return how many of the next whole blocks are in motion before a decision."""
@@ -690,7 +685,7 @@ class HeadingTracker:
 
     def _close_block(self) -> RateIntegral:
         """Add the integral of the block to the open one, and return it."""
-        part, self._block_integral = self._block_integral, self._new_integral()
+        part, self._block_integral = self._block_integral, replace(self._zero_integral)
         if part.duration > 0.0:
             part.block_count, part.block_square_sum = 1, part.angle ** 2 / part.duration
         self._open_integral += part
