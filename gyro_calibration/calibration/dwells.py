@@ -82,16 +82,9 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     """
     Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
-    Parameters
-    ----------
-    log : with output, and a reference rate or a reference heading
-    name : of the file, put before the places and the remarks
-    min_share : of a log in time in dwells, 1
-
-    Raises
-    ------
-    DataRefused : output or reference are missing or in another unit, or nothing is steady
-
+    The log has an output, and a reference rate or heading. The name of a file is put before places
+    and remarks. `DataRefused` is raised where something is missing, in another unit, or where the
+    share of a log in time that is in dwells is smaller than `min_share`.
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log, min_share)
     if log.time is not None and not name:  # several logs may have a rate each
@@ -129,11 +122,7 @@ def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
 
 
 def join_dwells(parts: Sequence[Dwells]) -> Dwells:
-    """
-    Return the dwells of several logs as one, with separate sweeps.
-
-    They are without temperature where one of the logs has none.
-    """
+    """Return the dwells of several logs as one, without temperature if one has none."""
     if not parts:
         raise DataRefused('no dwells were given; give at least one log')
     first_sweep = np.cumsum([0] + [int(part.sweep.max()) + 1 for part in parts])
@@ -171,14 +160,9 @@ def format_list(items: Sequence[str]) -> str:
 
 def dwells_from_table(log: Log) -> Dwells:
     """
-    Return the rows of a rate table.
+    Return the rows of a rate table, or raise `DataRefused` if none has output and reference rate.
 
     The columns `sweep` (any text) and `deviation_dps` (of each mean) are used if present.
-
-    Raises
-    ------
-    DataRefused : output or reference rate are missing, or no row holds both
-
     """
     output = require_output(log)
     if log.reference_rate is None:
@@ -380,11 +364,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     """
     Find the dwells of a log in time by its reference heading, or else by its reference rate.
 
-    Raises
-    ------
-    DataRefused : output or reference are missing
-    NothingSteady : the reference is never steady for long enough
-
+    `NothingSteady` is raised where the reference is never steady for long enough.
     """
     samples, remarks = _select_samples(log)
     time, temperature = samples.time, samples.temperature

@@ -108,17 +108,10 @@ class CalibrationForecast:
     def __init__(self, noise: Noise, duration: float, drive: Motion, drive_duration: float,
                  rest_duration: float = RunLimits.rest_duration):
         """
-        Prepare.
+        Prepare for a gyro, whose angle random walk is above 0; all durations are in s.
 
-        Parameters
-        ----------
-        noise : of the gyro; its angle random walk is above 0
-        duration : of the motions, s
-        drive : motion of the robot after the rest, repeated where it ends
-        drive_duration : of the drive, s
-        rest_duration : duration of the rest, which begins `SETTLING_TIME` s after the motion, s; 0
-            for none
-
+        The rest begins `SETTLING_TIME` s after the motion; a duration of 0 is none. The motion of
+        the robot after the rest, the drive, is repeated where it ends.
         """
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
@@ -327,15 +320,8 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     """
     Return the motion of that length, s, with the least heading error in the forecast's drive.
 
-    Parameters
-    ----------
-    forecast : for motions of this length
-    generations : of the search; each tries 70 motions
-
-    Raises
-    ------
-    DataRefused : the robot cannot make such a motion, or none would calibrate it well enough
-
+    The forecast is for motions of this length. Each generation of the search tries 70 motions.
+    `DataRefused` is raised where the robot cannot make one, or none would calibrate well enough.
     """
     _refuse_impossible(robot, duration)
     family = _MotionFamily(robot, duration)

@@ -14,7 +14,7 @@ From dwells to a gyro's model: values of effects, covariance, and errors of left
 The errors are also those of full turns of 360 degrees (Ojeda et al., section 4): an error of the
 rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion to the duration
 of the turn. Two errors are compared: with the bias of a rest before the mission only, and with a
-model and then the bias that remains at rest.
+model and then the bias that remains at rest. Dwells that allow no answer raise `DataRefused`.
 """
 
 from __future__ import annotations
@@ -169,14 +169,8 @@ class Calibration:
         Test whether columns explain the errors of the fitted dwells, given other columns.
 
         It is an F test, averaged over what the scatter may be, in addition to the uncertainty of
-        the given model.
-
-        Parameters
-        ----------
-        columns : that are tested, shape (n, m)
-        known : of other values that are fitted, shape (n, k)
-        unexplained : error in addition to the residual, rad/s, shape (n,)
-
+        the given model. The columns, (n, m), those of other fitted values, (n, k), and an error in
+        addition to the residual, rad/s, (n,), are given.
         """
         known_basis, white, new = self._whiten_beside(known, unexplained, columns)
         # a sine may have its zeros at the rates of all dwells
@@ -219,9 +213,9 @@ class Calibration:
     @cached_property
     def given_errors(self) -> Array:
         """
-        Return what errors of the given model's values do to the fitted dwells, rad/s.
+        Return what independent errors of the given model's values do to the fitted dwells, rad/s.
 
-        Each of one standard deviation, and independent, shape (n, k); none where they are unknown.
+        Each is one standard deviation; shape (n, k), where k is 0 if they are unknown.
         """
         known, covariance = static_terms(self.given), self.given.covariance
         if covariance is None:
@@ -241,11 +235,7 @@ class Calibration:
 
     @property
     def min_non_monotonic_rate(self) -> float | None:
-        """
-        Return the slowest rate of the range, rad/s, at which the output no longer grows with it.
-
-        None where the output always grows with the rate.
-        """
+        """Return the slowest rate, rad/s, at which the output no longer grows with it, or None."""
         # also between the rates of the dwells, where a fast sine would hide
         rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
         channels = Channels(rate, rate, self.given.reference_temperature)
@@ -318,20 +308,15 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
 
     Effects of the rate are evaluated at the reference rate. The polynomial of Ojeda et al. (eq. 9
     to 12) is evaluated at the output, whose noise is small where it is an average. A shape is
-    found by Gauss-Newton steps from the best of a grid over its bounds.
+    found by Gauss-Newton steps from the best of a grid over its bounds. Dwells in which effects
+    look alike are refused.
 
     Parameters
     ----------
-    dwells : of a rate table or a log
     effects : each once
     scatter : of the dwells, if it is known already
     given : model that is corrected: its effects are known, unless they, or their confounders, are
         among the fitted ones. Temperatures count from its reference temperature, or the mean
-
-    Raises
-    ------
-    DataRefused : some of the effects look alike in these dwells, or there are too few dwells
-
     """
     _refuse_unobservable(dwells, effects)
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
@@ -553,20 +538,10 @@ class TurnErrors:
 def compute_turn_errors(dwells: Dwells, rate: Array,
                         min_rate: float = MIN_TURN_RATE) -> TurnErrors:
     """
-    Return the errors of full turns at the rates and temperatures of some dwells.
+    Return the errors of full turns at the rates and temperatures of dwells that are not outlying.
 
-    Parameters
-    ----------
-    dwells : without those that are outlying
-    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); not finite where there is none,
-        as in `Calibration.left_out_rate`
-    min_rate : of a turn, rad/s
-
-    Raises
-    ------
-    DataRefused : no dwell of that rate has a rate by the model, none determines the static bias,
-        or the gyro is upside down
-
+    The rates by the model, rad/s, shape (n,), as in `Calibration.left_out_rate`, are not finite
+    where there is none. A turn is faster than `min_rate`, rad/s.
     """
     known = np.isfinite(rate)
     wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded

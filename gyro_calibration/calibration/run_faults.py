@@ -70,13 +70,9 @@ UNIT_TOLERANCE = 1.1
 
 def refuse_unit_error(scale: float, reference: str) -> None:
     """
-    Raise `DataRefused` for a scale that a confused unit explains.
+    Raise `DataRefused` for a scale, reported over true rate, that a confused unit explains.
 
-    Parameters
-    ----------
-    scale : reported over true rate
-    reference : its name, if its unit may be the wrong one; else ''
-
+    The name of the reference is given if its unit may be the wrong one; else ''.
     """
     size = max(abs(scale), 1e-300)
     found = [factor for factor in _UNIT_CONFUSIONS
@@ -130,16 +126,9 @@ def split_run(time: Array, rate: Array) -> RunPieces:
 def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
                         slip: str = '') -> None:
     """
-    Refuse a run that another motion explains far better than the profile, with the cause.
+    Raise `DataRefused` for a run that another motion explains far better than its profile.
 
-    Parameters
-    ----------
-    slip : message on a slip, where one is known better than the pieces show it
-
-    Raises
-    ------
-    DataRefused : with the cause that explains it best
-
+    `slip` is a message on a slip, where one is known better than the pieces show it.
     """
     trials = [(unexplained, unexplained, message) for unexplained, message
               in _try_motions(run, motion, largest_offset)]

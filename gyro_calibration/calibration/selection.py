@@ -102,15 +102,7 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> SelectedEff
     """
     Fit the effects that the dwells support, each with its reason.
 
-    Parameters
-    ----------
-    dwells : of a rate table or a log
-    technology : one of `TECHNOLOGY_EFFECTS`, of the instrument; it decides where causes tie
-
-    Raises
-    ------
-    DataRefused : too few dwells for anything
-
+    The technology of the instrument, one of `TECHNOLOGY_EFFECTS`, decides where causes tie.
     """
     base = _add_slopes(_fit_base(dwells, None))
     best = _add_slopes(find_supported_effects(dwells, FALSE_ALARM_RATE, base=base))

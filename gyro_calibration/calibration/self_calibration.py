@@ -14,6 +14,11 @@ Scale factor error and bias from about 20 s of known motion, with the reasons to
 The model is ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three methods:
 the two of the paper, unchanged, and a likelihood fit, which has no error by the rectangle rule and
 estimates the time offset between gyro and motion.
+
+In all functions, `time` is in s since the start of the motion, and `rate` is the output of the
+gyro, after its model if it has one, in rad/s, both of shape (n,). `output` is that before the
+model, where it differs, which shows a gyro that is dead or at its limit. `noise` is that of the
+gyro, if it is known. Data that are not credible raise `DataRefused`, with reason and remedy.
 """
 
 from __future__ import annotations
@@ -98,12 +103,6 @@ def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
 
     The rectangle rule of eq. 4 is kept: against a continuous heading it errs by several percent
     where the sampling is slow.
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, rad/s, shape (n,)
-
     """
     step = np.diff(time)
     g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
@@ -112,15 +111,7 @@ def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
 
 
 def fit_rate(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
-    """
-    Fit by Hong and Park's rate reference (eq. 8 and 9), with columns in the order of q = [s̄, b̄].
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, rad/s, shape (n,)
-
-    """
+    """Fit by Hong and Park's rate reference (eq. 8 and 9), in the order of q = [s̄, b̄]."""
     true = motion.rate_at(time)
     g = np.array([[rate @ rate, rate.sum()], [rate.sum(), len(rate)]])
     return _solve_inverse_model(g, np.array([true @ rate, true.sum()]))
@@ -147,22 +138,13 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
     Parameters
     ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
-    noise : of the gyro, if it is known; the wander of the bias goes into its standard deviation,
-        and the residual is compared with it
+    noise : the wander of the bias goes into its standard deviation, and the residual is compared
+        with it
     reference : the errors of the motion; goes into the standard deviations. By default a motion of
         rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
-    output : of the gyro before its model, where that differs, shape (n,); it shows a gyro that is
-        dead or at its limit
     prior : standard deviations of (s, b) about zero before the run, as
         `GyroModel.prior_deviations` of a fleet, shape (2,); what the run leaves open is drawn to
         it, in a method that gives a covariance
-
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
-
     """
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits, output)
@@ -214,17 +196,8 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
     By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
     error, which is no noise of a fit; between codes the errors are independent, of the sizes of
-    `rounding_errors`. Ramps within a block average them out. Zeros without steps.
-
-    Parameters
-    ----------
-    time : s, shape (n,)
-    output : rad/s, shape (n,)
-
-    Returns
-    -------
-    covariance, shape (2, 2), and variance, (rad/s)²
-
+    `rounding_errors`. Ramps within a block average them out. The covariance has shape (2, 2), the
+    variance is in (rad/s)²; both are zero without steps.
     """
     step = quantization_step(output)
     if not step:
@@ -405,11 +378,8 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
     """
     Return a remark on a scale factor error that gyros of a technology hardly have, or ''.
 
-    Parameters
-    ----------
-    prior_deviation : standard deviation of the scale factor error of such gyros, 1
-    reference : name of the motion
-
+    The standard deviation of the scale factor error of such gyros, 1, and the name of the motion
+    are given.
     """
     size = 100.0 * fit.scale_factor_error
     sigmas = abs(fit.scale_factor_error) / math.hypot(
@@ -442,18 +412,9 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
     """
     Check a calibration by a rest after its run, and refuse it if the gyro still drifts.
 
-    Parameters
-    ----------
-    time : s, shape (n,); at least 75 % of the length in the limits
-    rate : of the gyro as it went into the fit, rad/s, shape (n,)
-    fit : which corrects it
-    noise : of the gyro, if it is known; else its white noise is taken from the samples
-    false_refusal_rate : how often a good calibration is refused, if the noise is as given
-
-    Raises
-    ------
-    DataRefused : too few samples, motion, or drift
-
+    The rest lasts at least 75 % of the length in the limits. Without a known noise its white noise
+    is taken from the samples; `false_refusal_rate` tells how often a good calibration is refused,
+    if the noise is as given.
     """
     duration = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     if duration < 0.75 * limits.rest_duration or len(time) < 10:
@@ -496,20 +457,10 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     bias. The samples after the motion show it, even where the robot still settles: its response
     to the profile is fitted together with the rest. A turn that they do not show, of a prior
     deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
-    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn.
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : of the gyro as it went into the fit, rad/s, shape (n,)
-    fit : without a check by a rest; returned unchanged where fewer than 10 samples follow the
-        motion or the robot drives on, of a measured reference, or without a covariance
-    reference : as in `self_calibrate`
-
-    Raises
-    ------
-    DataRefused : the robot turned throughout the motion, or goes on turning after it
-
+    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn. The fit
+    is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
+    a measured reference, and without a covariance. It is refused where the robot turned throughout
+    the motion, or goes on turning after it.
     """
     limits = RunLimits()
     reference = default_reference_errors(motion) if reference is None else reference
@@ -565,14 +516,9 @@ def rest_variance(noise: Noise, duration: float, white_deviation: float,
     """
     Return the variance of a mean at rest about the bias, (rad/s)².
 
-    A robot that settles in the first half of the rest moves the mean by half of the change.
-
-    Parameters
-    ----------
-    duration : of the rest, s
-    white_deviation : standard deviation of the mean by the white noise of the samples, rad/s
-    half_difference : by how much the means of both halves differ, rad/s
-
+    Given are the duration, s, the deviation of the mean by the white noise of the samples, and by
+    how much the means of both halves differ, rad/s: a robot that settles in the first half of the
+    rest moves the mean by half of the change.
     """
     return (max(white_deviation, noise.angle_random_walk / math.sqrt(duration)) ** 2
             + float(noise.mean_change_variance(duration, duration)) + 0.25 * half_difference ** 2)
@@ -580,22 +526,14 @@ def rest_variance(noise: Noise, duration: float, white_deviation: float,
 
 def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[Array, Array]:
     """
-    Combine a run with the rest after it.
+    Return derivatives of (s, b) by the rate at rest, shape (2,), and their covariance, (2, 2).
 
-    The error of a run may exceed its stated deviation: by a slip, a turn by hand, or another
-    response of the robot. That and a run as stated have even odds before the rest is seen. The
-    ratio of that error to the stated deviation has a half-Cauchy prior with a median of 1.
-
-    Parameters
-    ----------
-    covariance : of (s, b) by the run, shape (2, 2)
-    rate, variance : mean of the output at rest less the bias of the run, rad/s, and the variance
-        of that mean, (rad/s)²
-
-    Returns
-    -------
-    derivatives of s and b by that rate, shape (2,), and their covariance, shape (2, 2)
-
+    The rest after a run is combined with the covariance of (s, b) by the run, shape (2, 2). The
+    rate is the mean of the output at rest less the bias of the run, rad/s; its variance is that of
+    the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a turn by
+    hand, or another response of the robot. That and a run as stated have even odds before the rest
+    is seen. The ratio of that error to the stated deviation has a half-Cauchy prior with a median
+    of 1.
     """
     stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
@@ -622,12 +560,6 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     It begins later, by up to its length in the limits, where the robot still moves then, as after
     an overshoot. It lasts until the robot moves, at most as long as the motion did. None where
     the log ends before, or the robot drives on.
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : of the gyro as it went into the fit, rad/s, shape (n,)
-
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
@@ -677,19 +609,8 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
     Return the bias of a gyro at rest and its standard deviation, rad/s.
 
     See Ojeda et al., eq. 1, or 15 for compensated rates. The mean includes the Earth's rate about
-    the axis. A slow and steady turn looks like a bias; only the limit on the bias excludes it.
-
-    Parameters
-    ----------
-    time : s, shape (n,)
-    rate : compensated by the model, rad/s, shape (n,)
-    noise : of the gyro, if it is known; it gives the smallest standard deviation of the mean
-    output : of the gyro before its model, where that differs, shape (n,); it shows a dead gyro
-
-    Raises
-    ------
-    DataRefused : too few samples, a dead gyro, motion, or a mean that is no bias
-
+    the axis. A slow and steady turn looks like a bias; only the limit on the bias excludes it. The
+    noise gives the smallest standard deviation of the mean.
     """
     refuse_samples(time, rate, limits, output)
     parts = np.array_split(rate, 10)

@@ -67,22 +67,13 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
 
     The rates of the turns do not matter, only the net number of turns. The number is accepted only
     where the gyro agrees to less than `_MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
-    factor error needs few turns.
+    factor error needs few turns. Arguments and `DataRefused` are those of `self_calibrate`.
 
     Parameters
     ----------
-    time : s, shape (n,)
-    rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
     turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
         factor error up to `_MAX_COUNTING_SCALE_ERROR`
-    noise : of the gyro, if it is known; the standard deviations include the wander of the bias
     mark_deviation : standard deviation of the angle between the two rests on the mark, rad
-    output : of the gyro before its model, where that differs, shape (n,)
-
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
-
     """
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
