@@ -472,7 +472,16 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
         return fit
     with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
                                   np.append(motion.rate, 0.0))
-    turn_end = _find_turn_end(time[time > end], rate[time > end]) or end
+    # the robot may turn on until the mean rate of the rest changes beyond white noise
+    turn_end, after, rest = end, time[time > end], rate[time > end]
+    count = np.arange(5, len(rest) - 4)
+    if len(count):
+        before = np.cumsum(rest)[count - 1]
+        changes = np.abs(before / count - (rest.sum() - before) / (len(rest) - count))
+        change_sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rest) - count))
+        best = int(np.argmax(change_sigmas))
+        if change_sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rest, 1):
+            turn_end = float(after[count[best]])
     at_rest = _fit_likelihood(
         time, rate, with_rest, limits.max_time_offset, reference.scale_deviation,
         (turn_end - max(fit.time_offset, 0.0), limits.max_bias))
@@ -496,19 +505,6 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     # a turn that the rest does not show
     covariance[1, 1] += 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
     return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
-
-
-def _find_turn_end(time: Array, rate: Array) -> float | None:
-    """Return the time in a rest at which its mean rate changes beyond white noise, s, if any."""
-    count = np.arange(5, len(rate) - 4)
-    if not len(count):
-        return None
-    before = np.cumsum(rate)[count - 1]
-    changes = np.abs(before / count - (rate.sum() - before) / (len(rate) - count))
-    sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rate) - count))
-    best = int(np.argmax(sigmas))
-    return (float(time[count[best]])
-            if sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rate, 1) else None)
 
 
 def rest_variance(noise: Noise, duration: float, white_deviation: float,

@@ -97,9 +97,29 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     refuse_bias(bias, limits, 'let the robot rest at both ends')
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
-    count = _count_turns(gyro_angle / math.tau, turns, limits)
+    # the number of turns
+    measured = gyro_angle / math.tau
+    count = round(measured) if turns is None else turns
+    if not count:
+        raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
+                          'turn once at least, all in one direction or nearly so')
+    if turns is None and _MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
+        raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
+                          f'off by {100 * _MAX_COUNTING_SCALE_ERROR:g} %: give the number of '
+                          'turns')
+    scale = measured / count
+    if turns is not None:
+        # another unit or sign explains the scale; a factor of two may be a wrong count
+        if abs(scale - 1.0) > limits.max_scale_factor_error and not 0.4 < abs(scale) < 2.5:
+            refuse_unit_error(scale, '')
+        refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
+                     "else set the driver's parameter invert")
+    if abs(measured - count) > (_MAX_COUNT_ERROR if turns else _MAX_COUNTING_SCALE_ERROR
+                                * abs(count)):
+        given = f', and {turns} were given' if turns else ''
+        raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '
+                          'whole number; close the turns on the mark, count them, or make fewer')
     true_angle = count * math.tau
-    scale = gyro_angle / true_angle
     if abs(scale - 1.0) > limits.max_scale_factor_error:
         raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
@@ -131,29 +151,3 @@ def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, 
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and does the gyro respond?')
     return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
-
-
-def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
-    """Return the number of turns, or refuse an angle that is no whole number of turns."""
-    count = round(measured) if turns is None else turns
-    if not count:
-        raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
-                          'turn once at least, all in one direction or nearly so')
-    if turns is None and _MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
-        raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
-                          f'off by {100 * _MAX_COUNTING_SCALE_ERROR:g} %: give the number of '
-                          'turns')
-    if turns is not None:
-        # another unit or sign explains the scale; a factor of two may be a wrong count
-        scale = measured / turns
-        if (abs(scale - 1.0) > limits.max_scale_factor_error
-                and not 0.4 < abs(scale) < 2.5):
-            refuse_unit_error(scale, '')
-        refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
-                     "else set the driver's parameter invert")
-    if abs(measured - count) > (_MAX_COUNT_ERROR if turns else _MAX_COUNTING_SCALE_ERROR
-                                * abs(count)):
-        given = f', and {turns} were given' if turns else ''
-        raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '
-                          'whole number; close the turns on the mark, count them, or make fewer')
-    return count

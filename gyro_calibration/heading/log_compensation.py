@@ -28,8 +28,6 @@ from gyro_calibration.model.gyro_model import GyroModel, STEP_TOLERANCE
 import numpy as np
 from numpy.typing import NDArray
 
-_MAX_PASSES = 50  # largest number of the iteration of a heading
-
 
 class LogCompensation:
     """
@@ -63,7 +61,7 @@ class LogCompensation:
                 reference = np.append(np.full(carried, begin), np.full(len(log), np.nan)
                                       if log.reference_heading is None else log.reference_heading)
                 known, heading = np.isfinite(reference), np.full(len(time), begin)
-                for _ in range(_MAX_PASSES):
+                for _ in range(50):
                     channels = replace(channels, heading=heading[carried:])
                     rate = np.concatenate([last_rate, compensate(
                         self._model, log.output, log.temperature, channels).rate])
