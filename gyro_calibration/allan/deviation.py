@@ -42,6 +42,16 @@ _MAX_LOST_PER_WINDOW = 0.01
 #: Least number of spans in the test whether a reference turns with the output: chance shows such a
 #: correlation of fewer too often for spans of several lengths.
 _MIN_SPANS = 8
+#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
+#: product numpy computes in one thread, which is faster here.
+_BLOCK_SAMPLES = 8192
+#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
+_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
+#: Indices of quantization and ramp among the terms, and of terms whose second differences are
+#: independent over longer times.
+_QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
+_SHORT_MEMORY_INDICES = [
+    place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
 
 
 @dataclass(frozen=True)
@@ -217,18 +227,6 @@ def _mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step
     """Return which second differences over `size` samples have few of the samples lost before."""
     return np.asarray(lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
                       <= _MAX_LOST_PER_WINDOW * 2 * size)
-
-
-#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
-#: product numpy computes in one thread, which is faster here.
-_BLOCK_SAMPLES = 8192
-#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
-_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
-#: Indices of quantization and ramp among the terms, and of terms whose second differences are
-#: independent over longer times.
-_QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
-_SHORT_MEMORY_INDICES = [
-    place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@
 """
 The noise figures of a record: the coefficients of the noise terms, and their bounds.
 
-Every combination of terms is fitted to the Allan variances at octaves (`CombinationFit`). The fits
-are ranked by likelihood (`Ranking`), and the best one gives the figures.
+Every combination of terms is fitted to the Allan variances at octaves. The fits are ranked by
+likelihood, and the best one gives the figures.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class _OctaveVariances:
 @lru_cache(maxsize=64)
 def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
                              process: GaussMarkov | None = None) -> Array:
-    """Return the covariances as forms of the squared coefficients, as `OctaveVariances.forms`."""
+    """Return the covariances as forms of the squared coefficients, as `_OctaveVariances.forms`."""
     forms = np.zeros((len(sizes),) * 2 + (len(NOISE_TERMS) + (process is not None),) * 2)
     for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
         form = covariance_form(samples, sizes[i], sizes[j], process)

@@ -193,8 +193,7 @@ def dwells_from_table(log: Log) -> Dwells:
         step = _largest_divisor(output - output[0])
         if step > 0.5 * _largest_divisor(rate - rate[0]):
             step = _largest_divisor(np.append(output - output[0], DEGREE))
-        rounding = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
-        deviation = _independent_rounding(rate, output, rounding)
+        rounding, deviation = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
     return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
                   np.where(deviation > 0.0, deviation, np.nan), sweep,
                   tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
@@ -623,9 +622,9 @@ def _average(samples: _Samples,
         if (quiet := squares <= 0.25).any():
             squares[quiet] = squares[quiet].mean()
         noise = np.sqrt(noise_before_rounding(squares))
-    rounding = _coarse_rounding(rate, output, step, noise)
+    rounding, of_steps = _coarse_rounding(rate, output, step, noise)
     deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2
-                        + _independent_rounding(rate, output, rounding) ** 2)
+                        + of_steps ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan), rounding
 
 
@@ -656,26 +655,21 @@ def _place_in_steps(rate: Array, output: Array, rounding: Array) -> tuple[Array,
     return turned / step, max(variance, 0.0)
 
 
-def _coarse_rounding(rate: Array, output: Array, step: float, noise: Array) -> Array:
-    """Return `Dwells.rounding`, with noise in steps; none where noise or wander hides it."""
+def _coarse_rounding(rate: Array, output: Array, step: float, noise: Array) -> tuple[Array, Array]:
+    """
+    Return `Dwells.rounding`, with noise in steps, and deviations of its errors, rad/s, shape (n,).
+
+    None where noise or wander of the bias average the steps out. The deviations are those of
+    independent errors: of n dwells with the same error, each has n times its variance.
+    """
     if step:
         rounding = step * np.column_stack([np.ones(len(noise)), noise])
         wander = _place_in_steps(rate, output, rounding)[1]
         # from 0.5 on the series is below 1e-9, and the errors are a small part of the scatter
         if float(noise.min()) ** 2 + 0.5 * wander < 0.5:
-            return rounding
-    return np.empty((0, 2))
-
-
-def _independent_rounding(rate: Array, output: Array, rounding: Array) -> Array:
-    """
-    Return deviations of independent errors as large as those by the steps, rad/s, shape (n,).
-
-    Of n dwells with the same error, each has n times its variance.
-    """
-    if not len(rounding):
-        return np.zeros(len(rate))
-    return np.sqrt(np.maximum(dwell_rounding_covariance(rate, output, rounding), 0.0).sum(axis=1))
+            shared = dwell_rounding_covariance(rate, output, rounding)
+            return rounding, np.sqrt(np.maximum(shared, 0.0).sum(axis=1))
+    return np.empty((0, 2)), np.zeros(len(rate))
 
 
 def _shrink_variances(variance: Array, dof: Array) -> Array:

@@ -42,6 +42,19 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
+#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
+#: equal slip in all turns is indistinguishable from a scale factor error.
+_MAX_WHEEL_SLIP = 0.01
+#: Standard deviations from which on a stretch is a slip. With three times the noise of the
+#: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
+_MIN_SLIP_SIGMAS = 4.5
+#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
+#: is stated, s.
+DRIVE_DURATION = 300.0
+#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
+#: which the robot is driving, rad/s.
+SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
+
 
 @dataclass(frozen=True)
 class RunLimits:
@@ -81,20 +94,10 @@ class ReferenceErrors:
     random_walk: float = 0.0  # of its heading, rad/√s
 
 
-#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
-#: equal slip in all turns is indistinguishable from a scale factor error.
-_MAX_WHEEL_SLIP = 0.01
-
-
 def default_reference_errors(motion: Motion) -> ReferenceErrors:
     """Return the usual errors of a reference whose errors are not given: commanded rates slip."""
     commanded = motion.rate is not None
     return ReferenceErrors(_MAX_WHEEL_SLIP / math.sqrt(3.0)) if commanded else ReferenceErrors()
-
-
-#: Standard deviations from which on a stretch is a slip. With three times the noise of the
-#: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
-_MIN_SLIP_SIGMAS = 4.5
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
@@ -392,11 +395,6 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
             'and track of the wheels, or the sensitivity of the gyro')
 
 
-#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
-#: is stated, s.
-DRIVE_DURATION = 300.0
-
-
 @dataclass(frozen=True)
 class RestCheck:
     """The result of a rest after a run."""
@@ -587,11 +585,6 @@ def _half_difference(rate: Array) -> float:
     """Return the difference between the means of the halves of a rest, rad/s."""
     begun, ended = (float(half.mean()) for half in np.array_split(rate, 2))
     return abs(ended - begun)
-
-
-#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
-#: which the robot is driving, rad/s.
-SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
 
 
 def _deviation_of_mean(rate: Array) -> float:

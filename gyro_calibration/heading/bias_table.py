@@ -39,7 +39,7 @@ import hashlib
 import json
 import math
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from gyro_calibration.files import describe_error, keep_aside, to_printable, write_atomically
 from gyro_calibration.logs.log import Array, DEGREE, Number
@@ -107,9 +107,6 @@ class Jump:
     time: float
 
 
-_Dated = TypeVar('_Dated', Entry, Jump)
-
-
 class BiasTable:
     """Biases at rest over temperature, of one gyro behind one model with a digest."""
 
@@ -133,12 +130,10 @@ class BiasTable:
 
     def shift_clock(self, step: float) -> None:
         """Correct the dates since this table began for a clock that was set by a step, s."""
-        self.entries, self._held_entries = ([self._shift_time(each, step) for each in rows]
-                                            for rows in (self.entries, self._held_entries))
-        self.jumps = [self._shift_time(each, step) for each in self.jumps]
-
-    def _shift_time(self, row: _Dated, step: float) -> _Dated:
-        return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first_run else row
+        for name in ('entries', 'jumps', '_held_entries'):
+            setattr(self, name, [
+                replace(each, time=max(each.time + step, 0.0)) if each.run >= self._first_run
+                else each for each in getattr(self, name)])
 
     def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
         """

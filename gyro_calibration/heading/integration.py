@@ -44,6 +44,11 @@ MAX_RATE = 1e4
 _MAX_INTERVALS, _MIN_INTERVALS = 256, 16
 #: Share of short intervals in the memory above which stamps come in bursts.
 _MIN_BURST_SHARE = 0.1
+#: Longest gap in the stamps that is integrated, s, unless the samples are as far apart.
+MAX_GAP = 1.0
+#: Duration, s, of the rates that show how the robot moves in a gap, and in which a rate after a
+#: jump may be erroneous.
+RECENT_DURATION = 2.0
 
 
 class Intervals:
@@ -143,13 +148,6 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
     surplus = np.minimum(lost * usual, interval)
     return (interval ** 2 * np.maximum(step ** 2 - 2.0 * ends, 0.0) / 12.0,
             ends * surplus * (0.5 * surplus + usual))
-
-
-#: Longest gap in the stamps that is integrated, s, unless the samples are as far apart.
-MAX_GAP = 1.0
-#: Duration, s, of the rates that show how the robot moves in a gap, and in which a rate after a
-#: jump may be erroneous.
-RECENT_DURATION = 2.0
 
 
 def varied_variance(noise: Noise, usual: float, interval: float, time: Array,

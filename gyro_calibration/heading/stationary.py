@@ -61,6 +61,10 @@ PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
 #: Rates at which a straight way ends, 1/s, on average after the longest lag; a rest may last.
 ENDING_RATES = (SCATTER_RATIOS > 0.0) / MEAN_LAGS[-1]
+#: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
+_TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
+#: Time constant with which a pending correction of the heading is applied in motion, s.
+CORRECTION_TIME = 1.0
 
 
 @dataclass(slots=True)
@@ -98,10 +102,6 @@ def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
     """Return the values that chi squared exceeds with a probability, shape (k,)."""
     return np.array([chi_squared_quantile(max(round(each), 1), chance)
                      for each in degrees_of_freedom.tolist()])
-
-
-#: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
-_TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
 
 
 class EnergyDetector:
@@ -329,10 +329,6 @@ class SlowTurn:
     snapshot: Snapshot  # when it began
     rate: float  # rad/s
     rate_integral: RateIntegral  # since then
-
-
-#: Time constant with which a pending correction of the heading is applied in motion, s.
-CORRECTION_TIME = 1.0
 
 
 @dataclass(frozen=True)
