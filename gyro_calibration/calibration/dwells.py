@@ -380,7 +380,16 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         fresh = part[~is_repeated[part]]
         is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
         kept.append(fresh[~is_outlier[fresh]])
-    settled, cut = _trim_settling(samples, kept)
+    # margin or settling time, if longer, are cut off both ends; a time offset shows before a ramp,
+    # in the mirrored log
+    error, rate_change = samples.error, np.diff([np.median(samples.output[rows]) for rows in kept])
+    mirrored = [(len(time) - 1 - rows)[::-1] for rows in kept[:-1]]
+    after, before = (max(_MARGIN, _settling_time(*each))
+                     for each in ((time, error, kept[1:], rate_change),
+                                  (-time[::-1], error[::-1], mirrored, -rate_change)))
+    ends = [(time[rows[0]] + after, time[rows[-1]] - before) for rows in kept]
+    settled = [rows[(time[rows] >= begin) & (time[rows] <= end)]
+               for rows, (begin, end) in zip(kept, ends)]
     divided = list[Numbers]()
     for rows in settled:
         pieces = 1
@@ -394,7 +403,8 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     if short := len(divided) - len(dwells):
         remarks.append(f'steady stretches shorter than {_MIN_DURATION:g} s without the '
                        f'settling, left out: {short}')
-    remarks.append(cut)
+    remarks.append(f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut '
+                   'away')
     if more := len(divided) - len(settled):
         remarks.append('dwells that warmed or cooled by more than '
                        f'{MIN_TEMPERATURE_SPREAD:g} K are divided, which makes {more} more')
@@ -493,19 +503,6 @@ def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
 
 
 # settling and temperature
-
-def _trim_settling(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[list[Numbers], str]:
-    """Cut margin or settling time, if longer, off both ends of dwells; return a remark."""
-    time, error = samples.time, samples.error
-    rate_change = np.diff([np.median(samples.output[rows]) for rows in dwells])
-    # a time offset shows before a ramp, in the mirrored log
-    mirrored = [(len(time) - 1 - rows)[::-1] for rows in dwells[:-1]]
-    after, before = (max(_MARGIN, _settling_time(*each))
-                     for each in ((time, error, dwells[1:], rate_change),
-                                  (-time[::-1], error[::-1], mirrored, -rate_change)))
-    kept = [rows[(time[rows] >= time[rows[0]] + after) & (time[rows] <= time[rows[-1]] - before)]
-            for rows in dwells]
-    return kept, f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away'
 
 
 def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],

@@ -344,7 +344,19 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
         raise DataRefused(f'{len(used)} dwells do not determine {values} values; '
                           'add dwells, or fit fewer effects')
     whitener = Whitener(used, scatter)
-    terms = _iterate_gauss_newton(used, _search_shapes(used, terms), whitener)
+    terms = _search_shapes(used, terms)
+    for _ in range(20):  # Gauss-Newton steps; the first is the solution for coefficients alone
+        orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
+        step = solve_triangular(
+            triangle, orthogonal.T @ whitener.whiten(_unexplained_error(used, terms))) / lengths
+        changes, new_terms = iter(step.tolist()), []
+        for term in terms:
+            for place in term.fitted_indices:
+                term = _replace_value(term, place, term.values[place] + next(changes))
+            new_terms.append(term)
+        terms = tuple(new_terms)
+        if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
+            break
     orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
     whitened = whitener.whiten(_unexplained_error(used, terms))
     left_out, deviation = np.full((2, len(dwells)), np.nan)
@@ -398,24 +410,6 @@ def _replace_value(term: Term, index: int, value: float) -> Term:
     low, high = term.effect.parameters[index].bounds
     return replace(term, values=(*term.values[:index], min(max(value, low), high),
                                  *term.values[index + 1:]))
-
-
-def _iterate_gauss_newton(dwells: Dwells, terms: tuple[Term, ...],
-                          whitener: Whitener) -> tuple[Term, ...]:
-    """Take Gauss-Newton steps; where only coefficients are fitted the first is the solution."""
-    for _ in range(20):
-        orthogonal, triangle, lengths = _factor_columns(dwells, terms, whitener)
-        step = solve_triangular(
-            triangle, orthogonal.T @ whitener.whiten(_unexplained_error(dwells, terms))) / lengths
-        changes, new_terms = iter(step.tolist()), []
-        for term in terms:
-            for place in term.fitted_indices:
-                term = _replace_value(term, place, term.values[place] + next(changes))
-            new_terms.append(term)
-        terms = tuple(new_terms)
-        if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
-            break
-    return terms
 
 
 def _factor_columns(dwells: Dwells, terms: Sequence[Term],
