@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gyro_calibration.calibration.run_faults import (
     fit_scale, MAX_UNEXPLAINED_SHARE, refuse_unit_error)
@@ -114,11 +114,11 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
 
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
     """Return some of the dwells, by a mask of shape (n,)."""
-    temperature = None if dwells.temperature is None else dwells.temperature[mask]
-    return Dwells(dwells.rate[mask], dwells.output[mask], temperature, dwells.deviation[mask],
-                  dwells.sweep[mask], tuple(compress(dwells.location, mask)), dwells.remarks,
-                  tuple(compress(dwells.rows, mask)),
-                  dwells.rounding[mask] if len(dwells.rounding) else dwells.rounding)
+    chosen: dict[str, Any] = {
+        name: tuple(compress(values, mask)) if isinstance(values, tuple) else values[mask]
+        for name, values in vars(dwells).items()
+        if name != 'remarks' and values is not None and len(values)}
+    return replace(dwells, **chosen)
 
 
 def join_dwells(parts: Sequence[Dwells]) -> Dwells:

@@ -62,17 +62,6 @@ class Assumptions:
         return (self.scale_factor_error ** 2, 0.0), (0.0, self.bias ** 2)
 
 
-def _with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroModel:
-    """Return the model with an assumed covariance in its self-calibration if it has none."""
-    calibration = model.self_calibration
-    if calibration is None:
-        return (model if model.covariance is not None else with_self_calibration(
-            model, SelfCalibration(covariance=assumptions.covariance)))
-    if calibration.covariance is not None and np.isfinite(calibration.covariance).all():
-        return model
-    return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
-
-
 @dataclass
 class _RestStretch:
     """Samples at rest, as sums."""
@@ -159,9 +148,15 @@ class HeadingEstimator:
 
     def _restart(self, now: float, is_fresh: bool = False) -> None:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
-        model, self._calibration_message = (
-            _with_assumed_covariance(self.model, self._assumptions), '')
-        calibration, here = model.self_calibration, self._known_temperature
+        model, here, self._calibration_message = self.model, self._known_temperature, ''
+        calibration, assumed = model.self_calibration, self._assumptions.covariance
+        if calibration is None and model.covariance is None:
+            calibration = SelfCalibration(covariance=assumed)
+        elif calibration is not None and (calibration.covariance is None
+                                          or not np.isfinite(calibration.covariance).all()):
+            calibration = replace(calibration, covariance=assumed)
+        if calibration is not model.self_calibration:
+            model = with_self_calibration(model, calibration)
         age: float | None = 0.0
         if not is_fresh and calibration is None:
             if here is None or not self.table.entries:
