@@ -29,7 +29,7 @@ from gyro_calibration.logs.log import Array, DataRefused, Mask
 from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
-    ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, NoiseTerm, QUANTIZATION_NOISE, RATE_RAMP,
+    ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, QUANTIZATION_NOISE, RATE_RAMP,
     RATE_RANDOM_WALK)
 import numpy as np
 from scipy.special import chdtri
@@ -42,6 +42,16 @@ _MAX_LOST_PER_WINDOW = 0.01
 #: Least number of spans in the test whether a reference turns with the output: chance shows such a
 #: correlation of fewer too often for spans of several lengths.
 _MIN_SPANS = 8
+#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
+#: product numpy computes in one thread, which is faster here.
+_BLOCK_SAMPLES = 8192
+#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
+_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
+#: Indices of quantization and ramp among the terms, and of terms whose second differences are
+#: independent over longer times.
+_QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
+_SHORT_MEMORY_INDICES = [
+    place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,15 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     """
     _refuse_few(len(output))
     known = np.isfinite(output) if moving is None else np.isfinite(output) & (moving == 0.0)
-    _refuse_dead(time[known], output[known])
+    at_rest = output[known]
+    _refuse_few(len(at_rest), 'samples at rest with an output')
+    same = max(find_runs(np.diff(at_rest) == 0.0), key=lambda run: run.stop - run.start,
+               default=slice(0, 0))
+    count = same.stop - same.start + 1
+    if count > max(len(at_rest) // 10, 50):
+        raise DataRefused(f'the gyro gives the same value {count} times in a row from '
+                          f'{time[known][same.start]:g} s on: it is dead or its steps are coarser '
+                          'than its noise; check it, and record again')
     stamps = fit_stamp_grid(time)
     rate = np.full(int(stamps.grid_index[-1]) + 1, np.nan)
     rate[stamps.grid_index[known]] = output[known]
@@ -74,9 +92,28 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     left_out = int(np.count_nonzero(~known))
     if left_out:
         remarks.append(f'{left_out} samples without output, or moving, are left out.')
-    remarks += _remove_outliers(rate, stamps)
+    # single samples far beyond the noise; a motion or a jolt lasts longer than two samples
+    outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS))
+    if 0 < outliers.size <= 0.001 * len(rate):
+        rate[outliers] = np.nan
+        remarks.append(f'Far beyond the noise, and left out: {outliers.size} single '
+                       f'sample{"s" * (outliers.size > 1)}, the first at '
+                       f'{stamps.time_at(outliers[0]):.3f} s.')
     if (motion := _find_motion(rate, stamps)) is not None:
-        raise _Moved(motion[0], _find_rest(motion[1], time, output, moving, heading))
+        # the first part that is not refused; next to a motion a smaller one is hidden
+        for begin, end in motion[1]:
+            rows = (time >= begin) & (time <= end)
+            try:
+                build_rest_record(time[rows], output[rows], *(
+                    None if each is None else each[rows] for each in (moving, heading)))
+            except _Moved as smaller:
+                if smaller.rest is None:
+                    continue
+                begin, end = smaller.rest
+            except DataRefused:
+                continue
+            raise _Moved(motion[0], (begin, end))
+        raise _Moved(motion[0], None)
     if heading is not None and moving is None:
         _refuse_turning(time, output, heading)
     # long gaps are cut, since no window crosses them
@@ -114,30 +151,6 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
                 'rest by --from and --to, or record one')
 
 
-def _refuse_dead(time: Array, output: Array) -> None:
-    """Refuse an output that is constant over a tenth of the record."""
-    _refuse_few(len(output), 'samples at rest with an output')
-    same = max(find_runs(np.diff(output) == 0.0), key=lambda run: run.stop - run.start,
-               default=slice(0, 0))
-    count = same.stop - same.start + 1
-    if count > max(len(output) // 10, 50):
-        raise DataRefused(f'the gyro gives the same value {count} times in a row from '
-                          f'{time[same.start]:g} s on: it is dead or its steps are coarser '
-                          'than its noise; check it, and record again')
-
-
-def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
-    """Remove single samples far beyond the noise, and return a remark on them."""
-    # A motion or a jolt lasts longer than two samples and is not removed.
-    outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS))
-    if not outliers.size or outliers.size > 0.001 * len(rate):
-        return []
-    rate[outliers] = np.nan
-    return [f'Far beyond the noise, and left out: {outliers.size} single '
-            f'sample{"s" * (outliers.size > 1)}, the first at {stamps.time_at(outliers[0]):.3f} '
-            's.']
-
-
 class _Moved(DataRefused):
     """A record with motion; begin and end of its longest part that is not refused, s, or None."""
 
@@ -146,23 +159,6 @@ class _Moved(DataRefused):
         super().__init__(motion + (
             'record again at rest' if rest is None else 'use the longest part at rest, '
             f'from {rest[0]:.1f} to {rest[1]:.1f} s, or record again'))
-
-
-def _find_rest(rests: Sequence[tuple[float, float]], time: Array, output: Array,
-               moving: Array | None, heading: Array | None) -> tuple[float, float] | None:
-    """Return the first part, s, that is not refused; next to a motion a smaller one is hidden."""
-    for begin, end in rests:
-        rows = (time >= begin) & (time <= end)
-        try:
-            build_rest_record(time[rows], output[rows], *(
-                None if each is None else each[rows] for each in (moving, heading)))
-            return begin, end
-        except _Moved as smaller:
-            if smaller.rest is not None:
-                return smaller.rest
-        except DataRefused:
-            pass
-    return None
 
 
 def _find_motion(rate: Array,
@@ -233,18 +229,6 @@ def _mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step
                       <= _MAX_LOST_PER_WINDOW * 2 * size)
 
 
-#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
-#: product numpy computes in one thread, which is faster here.
-_BLOCK_SAMPLES = 8192
-#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
-_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
-#: Indices of quantization and ramp among the terms, and of terms whose second differences are
-#: independent over longer times.
-_QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
-_SHORT_MEMORY_INDICES = [
-    place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
-
-
 @dataclass(frozen=True)
 class AllanChart:
     """The overlapping Allan deviation, each array of shape (n,)."""
@@ -292,22 +276,7 @@ def allan_deviation(rate: Array, interval: float,
     samples = len(rate)
     sizes = (averaging_sizes(samples) if times is None else
              np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64)))
-    sums, counts = _sum_squared_differences(rate, sizes)
-    some = counts > 0
-    sizes, counts = sizes[some], counts[some]
-    variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
-    freedom = _degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
-    # A few overlapping windows between gaps may have less than one degree of freedom: their
-    # deviation has no upper bound.
-    bounded = freedom >= 1.0 - 1e-9
-    sizes, counts = sizes[bounded], counts[bounded]
-    variance, freedom = variance[bounded], freedom[bounded]
-    return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom,
-                      *chi_squared_bounds(variance, freedom))
-
-
-def _sum_squared_differences(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
-    """Return the sums of the squared second differences of the angle, and their numbers."""
+    # sums of the squared second differences of the angle, and their numbers
     angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     twice, buffer = 2.0 * angle, np.empty(_BLOCK_SAMPLES)
     sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
@@ -326,7 +295,17 @@ def _sum_squared_differences(rate: Array, sizes: Integers) -> tuple[Array, Integ
                 block *= kept
                 counts[place] += np.count_nonzero(kept)
             sums[place] += float(block @ block)
-    return sums, counts
+    some = counts > 0
+    sizes, counts = sizes[some], counts[some]
+    variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
+    freedom = _degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
+    # A few overlapping windows between gaps may have less than one degree of freedom: their
+    # deviation has no upper bound.
+    bounded = freedom >= 1.0 - 1e-9
+    sizes, counts = sizes[bounded], counts[bounded]
+    variance, freedom = variance[bounded], freedom[bounded]
+    return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom,
+                      *chi_squared_bounds(variance, freedom))
 
 
 # degrees of freedom
@@ -340,8 +319,19 @@ def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, 
 
 def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
     """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
-    freedom = []
-    for size, part in zip(sizes.tolist(), _select_terms_by_slope(sizes, variance)):
+    # They are those of the random term that fits the slope of each Allan variance best. The slope
+    # of the logarithm is that from half to twice each time, -1 for a single one. Quantization is
+    # assumed at the short end only; a steep slope elsewhere is chance.
+    low = np.searchsorted(sizes, sizes / 2.0)
+    high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
+    rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
+    slopes = np.where(
+        high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
+    steep, freedom = int(np.argmin(np.append(slopes < -1.5, False))), []
+    for place, (size, slope) in enumerate(zip(sizes.tolist(), slopes)):
+        part = QUANTIZATION_NOISE if place < steep else min(
+            (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK),
+            key=lambda term: abs(2.0 * term.slope - slope))
         count = samples + 1 - 2 * size
         # the covariance of quantization is nonzero at single lags only
         stride = 1 if part is QUANTIZATION_NOISE else max(1, size // _LAGS_PER_WINDOW)
@@ -351,21 +341,6 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
         freedom.append(
             max(1.0, float(squares[0]) * count / stride / float(2.0 * squares.sum() - squares[0])))
     return np.array(freedom)
-
-
-def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
-    """Return the random term that fits the slope of each Allan variance best."""
-    # The slope of the logarithm is that from half to twice each time, -1 for a single one.
-    # Quantization is assumed at the short end only; a steep slope elsewhere is chance.
-    low = np.searchsorted(sizes, sizes / 2.0)
-    high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
-    rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
-    slopes = np.where(
-        high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
-    parts = [min((ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK),
-                 key=lambda part: abs(2.0 * part.slope - slope)) for slope in slopes]
-    steep = int(np.argmin(np.append(slopes < -1.5, False)))
-    return [QUANTIZATION_NOISE] * steep + parts[steep:]
 
 
 # covariance of second differences of the angle, and of Allan variances

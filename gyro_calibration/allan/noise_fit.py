@@ -11,8 +11,8 @@
 """
 The noise figures of a record: the coefficients of the noise terms, and their bounds.
 
-Every combination of terms is fitted to the Allan variances at octaves (`CombinationFit`). The fits
-are ranked by likelihood (`Ranking`), and the best one gives the figures.
+Every combination of terms is fitted to the Allan variances at octaves. The fits are ranked by
+likelihood, and the best one gives the figures.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class _OctaveVariances:
 @lru_cache(maxsize=64)
 def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
                              process: GaussMarkov | None = None) -> Array:
-    """Return the covariances as forms of the squared coefficients, as `OctaveVariances.forms`."""
+    """Return the covariances as forms of the squared coefficients, as `_OctaveVariances.forms`."""
     forms = np.zeros((len(sizes),) * 2 + (len(NOISE_TERMS) + (process is not None),) * 2)
     for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
         form = covariance_form(samples, sizes[i], sizes[j], process)
@@ -233,16 +233,6 @@ class _Ranking:
         return (found
                 if found and found.penalized_deviance() < self.best.penalized_deviance() else None)
 
-    def is_replaceable(self, index: int) -> bool:
-        """Tell whether a process may replace a term."""
-        # A random walk is a process with an infinite correlation time, so the likelihoods are
-        # compared. In place of flicker, the penalized likelihoods are compared.
-        best = self.best
-        return any(index not in each.active_terms
-                   and (each.deviance - best.deviance if index == _K
-                        else each.penalized_deviance() - best.penalized_deviance())
-                   < NORMAL_QUANTILE_975 ** 2 for each in self.process_fits)
-
     @cached_property
     def alternatives(self) -> list[_CombinationFit]:
         """Return the combinations of other terms, not more of them, that are nearly as likely."""
@@ -260,26 +250,8 @@ class _Ranking:
                         < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
 
-def _rank_combinations(octaves: _OctaveVariances) -> _Ranking:
-    """
-    Rank all combinations of terms.
-
-    The first octave is the earliest one from which the residuals are within chance; if there is
-    none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
-    Raise `DataRefused` where no combination fits.
-    """
-    last = max(len(octaves.variance) // 2 - 1, 0)
-    for misfit, start in itertools.product(_MISFIT_SHARES, range(last + 1)):
-        ranking = _rank_from_octave(octaves, start, misfit)
-        if (ranking.best.is_likely()
-                or (ranking.best_process is not None and ranking.best_process.is_likely())):
-            return _rank_from_octave(octaves, start + 1, misfit) if 0 < start < last else ranking
-    raise DataRefused(f'the Allan deviations are more than {100 * _MISFIT_SHARES[-1]:.0f} % off '
-                      'any sum of the five noise terms: the record contains something else, such '
-                      'as a swing or a vibration; record again at rest')
-
-
 def _rank_from_octave(octaves: _OctaveVariances, start: int, misfit: float) -> _Ranking:
+    """Fit all combinations of terms to the octaves from one on."""
     since = replace(octaves, forms=octaves.forms[start:, start:], **{
         name: getattr(octaves, name)[start:]
         for name in ('size', 'loss_factor', 'variance', 'columns')})
@@ -397,7 +369,21 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
                           f'lowest Allan deviation {chart.deviation.min(initial=math.inf):g} '
                           f'rad/s; wanted {_MIN_OCTAVES} octaves, all above 0: record longer and '
                           'without losses')
-    ranking = _rank_combinations(_OctaveVariances.from_chart(chart))
+    # The first octave is the earliest one from which the residuals are within chance; if there is
+    # none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
+    octaves, last = _OctaveVariances.from_chart(chart), max(len(chart.size) // 2 - 1, 0)
+    for misfit, start in itertools.product(_MISFIT_SHARES, range(last + 1)):
+        ranking = _rank_from_octave(octaves, start, misfit)
+        if (ranking.best.is_likely()
+                or (ranking.best_process is not None and ranking.best_process.is_likely())):
+            break
+    else:
+        raise DataRefused(
+            f'the Allan deviations are more than {100 * _MISFIT_SHARES[-1]:.0f} % off any sum of '
+            'the five noise terms: the record contains something else, such as a swing or a '
+            'vibration; record again at rest')
+    if 0 < start < last:
+        ranking = _rank_from_octave(octaves, start + 1, misfit)
     process = None
     if ranking.best_process is not None and ranking.best_process.octaves.process is not None:
         time = ranking.best_process.octaves.process.correlation_time * interval
@@ -435,7 +421,13 @@ def _build_figure(ranking: _Ranking, index: int, interval: float) -> NoiseFigure
             if (joint is not None and index in joint.active_terms
                     and joint.deviance < best.deviance - 2.0 * _WIDENING_LIMIT):
                 lower = min(lower, joint.coefficient_bounds(index)[0])
-    if not value or index in (_B, _K) and ranking.is_replaceable(index):
+    # Where a process may replace a term, it may be 0. A random walk is a process with an infinite
+    # correlation time, so the likelihoods are compared; in place of flicker, the penalized ones.
+    excess = [each.deviance - ranking.best.deviance if index == _K
+              else each.penalized_deviance() - ranking.best.penalized_deviance()
+              for each in ranking.process_fits if index not in each.active_terms]
+    if not value or index in (_B, _K) and min(excess, default=math.inf) < (
+            NORMAL_QUANTILE_975 ** 2):
         lower = 0.0
     unit = interval ** -part.slope
     return NoiseFigure(part, *(each * unit for each in (value, deviation, lower, upper)))

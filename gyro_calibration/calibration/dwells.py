@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gyro_calibration.calibration.run_faults import (
     fit_scale, MAX_UNEXPLAINED_SHARE, refuse_unit_error)
@@ -82,20 +82,27 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     """
     Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
-    Parameters
-    ----------
-    log : with output, and a reference rate or a reference heading
-    name : of the file, put before the places and the remarks
-    min_share : of a log in time in dwells, 1
-
-    Raises
-    ------
-    DataRefused : output or reference are missing or in another unit, or nothing is steady
-
+    The log has an output, and a reference rate or heading. The name of a file is put before places
+    and remarks. `DataRefused` is raised where something is missing, in another unit, or where the
+    share of a log in time that is in dwells is smaller than `min_share`.
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log, min_share)
     if log.time is not None and not name:  # several logs may have a rate each
-        _refuse_narrow_range(log, found.rate)
+        # dwells over less than half of the rates of the log, such as rests alone
+        if log.reference_rate is not None:
+            rates = log.reference_rate[np.isfinite(log.reference_rate)]
+        else:
+            heading = np.asarray(log.reference_heading)
+            known = np.isfinite(heading)
+            rates = np.diff(np.interp(np.arange(log.time[0], log.time[-1]), log.time[known],
+                                      heading[known]))
+        low, high = np.quantile(rates, [0.01, 0.99])
+        if np.ptp(found.rate) < 0.5 * (high - low):
+            raise NothingSteady(
+                f'the reference is steady at {found.rate.min() / DEGREE:.1f} to '
+                f'{found.rate.max() / DEGREE:.1f} deg/s only, and turns at {low / DEGREE:.1f} to '
+                f'{high / DEGREE:.1f} deg/s; hold faster rates for longer, or use '
+                '--method likelihood')
     unexplained, scale = fit_scale(found.output, found.rate)
     if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
         refuse_unit_error(scale, 'reference')
@@ -105,37 +112,17 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
                    remarks=tuple(f'{name}: {remark}' for remark in found.remarks))
 
 
-def _refuse_narrow_range(log: Log, rate: Array) -> None:
-    """Refuse dwells over less than half of the rates of a log in time, such as rests alone."""
-    if log.reference_rate is not None:
-        rates = log.reference_rate[np.isfinite(log.reference_rate)]
-    else:
-        time, heading = np.asarray(log.time), np.asarray(log.reference_heading)
-        known = np.isfinite(heading)
-        rates = np.diff(np.interp(np.arange(time[0], time[-1]), time[known], heading[known]))
-    low, high = np.quantile(rates, [0.01, 0.99])
-    if np.ptp(rate) < 0.5 * (high - low):
-        raise NothingSteady(
-            f'the reference is steady at {rate.min() / DEGREE:.1f} to {rate.max() / DEGREE:.1f} '
-            f'deg/s only, and turns at {low / DEGREE:.1f} to {high / DEGREE:.1f} deg/s; hold '
-            'faster rates for longer, or use --method likelihood')
-
-
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
     """Return some of the dwells, by a mask of shape (n,)."""
-    temperature = None if dwells.temperature is None else dwells.temperature[mask]
-    return Dwells(dwells.rate[mask], dwells.output[mask], temperature, dwells.deviation[mask],
-                  dwells.sweep[mask], tuple(compress(dwells.location, mask)), dwells.remarks,
-                  tuple(compress(dwells.rows, mask)),
-                  dwells.rounding[mask] if len(dwells.rounding) else dwells.rounding)
+    chosen: dict[str, Any] = {
+        name: tuple(compress(values, mask)) if isinstance(values, tuple) else values[mask]
+        for name, values in vars(dwells).items()
+        if name != 'remarks' and values is not None and len(values)}
+    return replace(dwells, **chosen)
 
 
 def join_dwells(parts: Sequence[Dwells]) -> Dwells:
-    """
-    Return the dwells of several logs as one, with separate sweeps.
-
-    They are without temperature where one of the logs has none.
-    """
+    """Return the dwells of several logs as one, without temperature if one has none."""
     if not parts:
         raise DataRefused('no dwells were given; give at least one log')
     first_sweep = np.cumsum([0] + [int(part.sweep.max()) + 1 for part in parts])
@@ -173,14 +160,9 @@ def format_list(items: Sequence[str]) -> str:
 
 def dwells_from_table(log: Log) -> Dwells:
     """
-    Return the rows of a rate table.
+    Return the rows of a rate table, or raise `DataRefused` if none has output and reference rate.
 
     The columns `sweep` (any text) and `deviation_dps` (of each mean) are used if present.
-
-    Raises
-    ------
-    DataRefused : output or reference rate are missing, or no row holds both
-
     """
     output = require_output(log)
     if log.reference_rate is None:
@@ -211,9 +193,7 @@ def dwells_from_table(log: Log) -> Dwells:
         step = _largest_divisor(output - output[0])
         if step > 0.5 * _largest_divisor(rate - rate[0]):
             step = _largest_divisor(np.append(output - output[0], DEGREE))
-        rounding = _coarse_rounding(rate, output, np.column_stack(
-            [np.full(len(rows), step), np.zeros(len(rows))]))
-        deviation = _independent_rounding(rate, output, rounding)
+        rounding, deviation = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
     return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
                   np.where(deviation > 0.0, deviation, np.nan), sweep,
                   tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
@@ -383,11 +363,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     """
     Find the dwells of a log in time by its reference heading, or else by its reference rate.
 
-    Raises
-    ------
-    DataRefused : output or reference are missing
-    NothingSteady : the reference is never steady for long enough
-
+    `NothingSteady` is raised where the reference is never steady for long enough.
     """
     samples, remarks = _select_samples(log)
     time, temperature = samples.time, samples.temperature
@@ -404,14 +380,31 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         fresh = part[~is_repeated[part]]
         is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
         kept.append(fresh[~is_outlier[fresh]])
-    settled, cut = _trim_settling(samples, kept)
-    divided = [part for rows in settled for part in _split_by_temperature(samples, rows)]
+    # margin or settling time, if longer, are cut off both ends; a time offset shows before a ramp,
+    # in the mirrored log
+    error, rate_change = samples.error, np.diff([np.median(samples.output[rows]) for rows in kept])
+    mirrored = [(len(time) - 1 - rows)[::-1] for rows in kept[:-1]]
+    after, before = (max(_MARGIN, _settling_time(*each))
+                     for each in ((time, error, kept[1:], rate_change),
+                                  (-time[::-1], error[::-1], mirrored, -rate_change)))
+    ends = [(time[rows[0]] + after, time[rows[-1]] - before) for rows in kept]
+    settled = [rows[(time[rows] >= begin) & (time[rows] <= end)]
+               for rows, (begin, end) in zip(kept, ends)]
+    divided = list[Numbers]()
+    for rows in settled:
+        pieces = 1
+        if temperature is not None and len(rows) >= 24:  # so that its slope can be fitted
+            twelfths = [part.mean() for part in np.array_split(temperature[rows], 12)]
+            pieces = max(1, min(math.ceil(float(np.ptp(twelfths)) / MIN_TEMPERATURE_SPREAD),
+                                int(samples.duration(rows) / _MIN_DURATION)))
+        divided += np.array_split(rows, pieces)
     dwells = [rows for rows in divided
               if len(rows) >= _MIN_SAMPLES and samples.duration(rows) >= _MIN_DURATION]
     if short := len(divided) - len(dwells):
         remarks.append(f'steady stretches shorter than {_MIN_DURATION:g} s without the '
                        f'settling, left out: {short}')
-    remarks.append(cut)
+    remarks.append(f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut '
+                   'away')
     if more := len(divided) - len(settled):
         remarks.append('dwells that warmed or cooled by more than '
                        f'{MIN_TEMPERATURE_SPREAD:g} K are divided, which makes {more} more')
@@ -453,7 +446,22 @@ def _find_straight(samples: _Samples) -> list[slice]:
     for cone in _split_into_lines(times, headings, 2.0 * tolerance):
         if times[cone.stop - 1] - times[cone.start] < 0.5 * _MIN_DURATION:
             continue
-        part = _extend_line(times, headings, cone, tolerance)
+        # a line through the middle is extended within the tolerance, without the ramps, by at most
+        # its own length at both ends, so that the time is linear in the length of the log
+        length = cone.stop - cone.start
+        middle = slice(cone.start + length // 5, cone.stop - length // 5)
+        begin, end = max(0, cone.start - length), min(len(times), cone.stop + length)
+        slope = fit_scale(headings[middle], times[middle])[1]
+        off = np.abs(headings[begin:end] - headings[middle].mean()
+                     - slope * (times[begin:end] - times[middle].mean()))
+        beyond = np.flatnonzero(off > tolerance)
+        before, after = (beyond[beyond < middle.start - begin],
+                         beyond[beyond >= middle.stop - begin])
+        if len(after):
+            end = begin + int(after[0]) - _count_ramp_blocks(off[after[0]:], tolerance)
+        if len(before):
+            begin += int(before[-1]) + 1 + _count_ramp_blocks(off[before[-1]::-1], tolerance)
+        part = slice(begin, max(begin, end))
         # of two stretches that overlap, the longer one has the more accurate line
         if kept and part.start < kept[-1].stop and _length(part) > _length(kept[-1]):
             kept.pop()
@@ -481,25 +489,6 @@ def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator
     yield slice(start, len(times))
 
 
-def _extend_line(time: Array, heading: Array, stretch: slice, tolerance: float) -> slice:
-    """Fit a line to the middle of a stretch, extend it within the tolerance, exclude the ramps."""
-    fifth = _length(stretch) // 5
-    middle = slice(stretch.start + fifth, stretch.stop - fifth)
-    # By at most its own length at both ends, so that the time is linear in the length of the log.
-    first = max(0, stretch.start - _length(stretch))
-    last = min(len(time), stretch.stop + _length(stretch))
-    line = heading[middle].mean() + fit_scale(heading[middle], time[middle])[1] * (
-        time[first:last] - time[middle].mean())
-    deviation = np.abs(heading[first:last] - line)
-    beyond = np.flatnonzero(deviation > tolerance)
-    before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
-    begin = (0 if not len(before) else int(before[-1]) + 1
-             + _count_ramp_blocks(deviation[before[-1]::-1], tolerance))
-    end = (len(deviation) if not len(after)
-           else int(after[0]) - _count_ramp_blocks(deviation[after[0]:], tolerance))
-    return slice(first + begin, first + max(begin, end))
-
-
 def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
     """
     Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
@@ -515,19 +504,6 @@ def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
 
 # settling and temperature
 
-def _trim_settling(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[list[Numbers], str]:
-    """Cut margin or settling time, if longer, off both ends of dwells; return a remark."""
-    time, error = samples.time, samples.error
-    rate_change = np.diff([np.median(samples.output[rows]) for rows in dwells])
-    # a time offset shows before a ramp, in the mirrored log
-    mirrored = [(len(time) - 1 - rows)[::-1] for rows in dwells[:-1]]
-    after, before = (max(_MARGIN, _settling_time(*each))
-                     for each in ((time, error, dwells[1:], rate_change),
-                                  (-time[::-1], error[::-1], mirrored, -rate_change)))
-    kept = [rows[(time[rows] >= time[rows[0]] + after) & (time[rows] <= time[rows[-1]] - before)]
-            for rows in dwells]
-    return kept, f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away'
-
 
 def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
                    rate_change: Array) -> float:
@@ -539,41 +515,27 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     shortest ones, and over the longest ones, which show a slower response. It is settled where it
     is within four standard deviations of its last half; below 20 ppm it always is.
     """
-    return max((_settling_of_longer(time, error, dwells, rate_change, share)
-                for share in ((0.25, 0.75) if len(dwells) else ())), default=0.0)
-
-
-def _settling_of_longer(time: Array, error: Array, dwells: Sequence[Numbers], rate_change: Array,
-                        share: float) -> float:
-    """Return the settling time, s, by the dwells that are longer than a share of them."""
     durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
-    interval, width = max(0.05, float(np.median(np.diff(time)))), 4
-    bins = int(min(np.quantile(durations, share), 9.0) / interval)
-    edges = np.arange(bins + 1) * interval
-    used = durations >= edges[-1]
-    if bins < 8 * width or not rate_change[used].any():
-        return 0.0
-    angles = [np.interp(edges, time[rows] - time[rows[0]], integrate(time[rows], error[rows]))
-              for rows, wanted in zip(dwells, used) if wanted]
-    means = np.diff(angles, axis=1) / interval
-    late = means[:, bins // 2:].mean(axis=1, keepdims=True)
-    response = uniform_filter1d(rate_change[used] @ (means - late) / np.sum(
-        rate_change[used] ** 2), width, mode='nearest')
-    spread = max(float(response[bins // 2:].std()), 2e-5)
-    unsettled = np.flatnonzero(np.abs(response[:bins // 2]) > 4.0 * spread)
-    # after ten bins within the limit the response has ended; later ones exceed it by chance
-    unsettled = unsettled[np.cumprod(np.diff(unsettled, prepend=-1) <= 10) > 0]
-    return (int(unsettled[-1]) + 1 + width // 2) * interval if len(unsettled) else 0.0
-
-
-def _split_by_temperature(samples: _Samples, rows: Numbers) -> list[Numbers]:
-    """Divide a dwell in which the temperature changes, so that its slope can be fitted."""
-    if samples.temperature is None or len(rows) < 24:
-        return [rows]
-    twelfths = np.array_split(samples.temperature[rows], 12)
-    change = float(np.ptp([part.mean() for part in twelfths]))
-    return np.array_split(rows, max(1, min(math.ceil(change / MIN_TEMPERATURE_SPREAD),
-                                           int(samples.duration(rows) / _MIN_DURATION))))
+    interval, width, found = max(0.05, float(np.median(np.diff(time)))), 4, 0.0
+    for share in (0.25, 0.75) if len(dwells) else ():
+        bins = int(min(np.quantile(durations, share), 9.0) / interval)
+        edges = np.arange(bins + 1) * interval
+        used = durations >= edges[-1]
+        if bins < 8 * width or not rate_change[used].any():
+            continue
+        angles = [np.interp(edges, time[rows] - time[rows[0]], integrate(time[rows], error[rows]))
+                  for rows in compress(dwells, used)]
+        means = np.diff(angles, axis=1) / interval
+        late = means[:, bins // 2:].mean(axis=1, keepdims=True)
+        response = uniform_filter1d(rate_change[used] @ (means - late) / np.sum(
+            rate_change[used] ** 2), width, mode='nearest')
+        spread = max(float(response[bins // 2:].std()), 2e-5)
+        unsettled = np.flatnonzero(np.abs(response[:bins // 2]) > 4.0 * spread)
+        # after ten bins within the limit the response has ended; later ones exceed it by chance
+        unsettled = unsettled[np.cumprod(np.diff(unsettled, prepend=-1) <= 10) > 0]
+        if len(unsettled):
+            found = max(found, (int(unsettled[-1]) + 1 + width // 2) * interval)
+    return found
 
 
 def _describe_left_out(log: Log, samples: _Samples, is_outlier: Mask, is_repeated: Mask,
@@ -625,8 +587,15 @@ def _average(samples: _Samples,
         reference = samples.heading[rows]
         angle = integrate(samples.time[rows], samples.output[rows])
         rate[place], output[place] = (samples.slope(rows, each) for each in (reference, angle))
-        blur[place] = abs(samples.scale) * _encoder_deviation(
-            reference, samples.step, durations[place])
+        # Over M steps of an encoder the deviation of the slope is about 0.35 step / (M duration),
+        # and below one step 0.6 step / duration (by simulation). Each step is observed late by up
+        # to a sample, which adds the square root of M over the number of samples. A heading that
+        # stays on one step for the whole dwell is taken as a rest.
+        blur[place] = 0.0
+        if np.ptp(reference) > 0.5 * samples.step > 0.0:
+            steps = abs(reference[-1] - reference[0]) / samples.step
+            blur[place] = abs(samples.scale) * samples.step / durations[place] * math.hypot(
+                0.35 / max(steps, 0.6), math.sqrt(min(steps, len(rows))) / len(rows))
         for variance, each in ((by_output, angle),
                                (by_error, angle - samples.scale * reference)):
             parts = np.array_split(np.arange(len(rows)), batches[place])
@@ -637,30 +606,23 @@ def _average(samples: _Samples,
     # same in all dwells under white noise.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
-    rounding = _coarse_rounding(rate, output, _find_rounding(samples.output, dwells))
+    # Step and noise of the samples. Up to a quarter of a squared step, the variance depends on the
+    # place in the step, so such dwells have one noise. Where most dwells are on one step each,
+    # their steps may be those of their rates; then the whole output shows it.
+    values = [samples.output[rows] for rows in dwells]
+    step = (quantization_step(np.concatenate(values))
+            if np.median([np.ptp(each) for each in values]) > 0.0
+            else _largest_divisor(np.unique(samples.output) - samples.output.min()))
+    noise: Array = np.zeros(len(dwells))
+    if step:
+        squares = np.array([float(np.var(each)) for each in values]) / step ** 2
+        if (quiet := squares <= 0.25).any():
+            squares[quiet] = squares[quiet].mean()
+        noise = np.sqrt(noise_before_rounding(squares))
+    rounding, of_steps = _coarse_rounding(rate, output, step, noise)
     deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2
-                        + _independent_rounding(rate, output, rounding) ** 2)
+                        + of_steps ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan), rounding
-
-
-def _find_rounding(output: Array, dwells: Sequence[Numbers]) -> Array:
-    """
-    Return step and noise of the samples of each dwell, rad/s, shape (n, 2).
-
-    Up to a quarter of a squared step, the variance of the samples depends on the place in the
-    step, so such dwells have one noise. Where most dwells are on one step each, their steps may be
-    those of their rates; then the whole output shows it.
-    """
-    is_noisy = np.median([np.ptp(output[rows]) for rows in dwells]) > 0.0
-    step = (quantization_step(output[np.concatenate(dwells)]) if is_noisy
-            else _largest_divisor(np.unique(output) - output.min()))
-    if not step:
-        return np.zeros((len(dwells), 2))
-    variances = np.array([float(np.var(output[rows])) for rows in dwells]) / step ** 2
-    if (quiet := variances <= 0.25).any():
-        variances[quiet] = variances[quiet].mean()
-    return step * np.column_stack([np.ones(len(dwells)),
-                                   np.sqrt(noise_before_rounding(variances))])
 
 
 def dwell_rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
@@ -690,40 +652,21 @@ def _place_in_steps(rate: Array, output: Array, rounding: Array) -> tuple[Array,
     return turned / step, max(variance, 0.0)
 
 
-def _coarse_rounding(rate: Array, output: Array, rounding: Array) -> Array:
-    """Return the rounding, or none where noise and wander of the bias average it out."""
-    if not rounding.any():
-        return np.empty((0, 2))
-    noise = float(np.min(rounding[:, 1] / rounding[:, 0])) ** 2
-    # from 0.5 on the series is below 1e-9, and the errors are a small part of the scatter
-    return (rounding if noise + 0.5 * _place_in_steps(rate, output, rounding)[1] < 0.5
-            else np.empty((0, 2)))
-
-
-def _independent_rounding(rate: Array, output: Array, rounding: Array) -> Array:
+def _coarse_rounding(rate: Array, output: Array, step: float, noise: Array) -> tuple[Array, Array]:
     """
-    Return deviations of independent errors as large as those by the steps, rad/s, shape (n,).
+    Return `Dwells.rounding`, with noise in steps, and deviations of its errors, rad/s, shape (n,).
 
-    Of n dwells with the same error, each has n times its variance.
+    None where noise or wander of the bias average the steps out. The deviations are those of
+    independent errors: of n dwells with the same error, each has n times its variance.
     """
-    if not len(rounding):
-        return np.zeros(len(rate))
-    return np.sqrt(np.maximum(dwell_rounding_covariance(rate, output, rounding), 0.0).sum(axis=1))
-
-
-def _encoder_deviation(heading: Array, step: float, duration: float) -> float:
-    """
-    Return the standard deviation of a heading's slope, due to the steps of an encoder, rad/s.
-
-    Over M steps it is about 0.35 step / (M duration), and below one step 0.6 step / duration (by
-    simulation). Each step is observed late by up to a sample, which adds the square root of M over
-    the number of samples. A heading that stays on one step for the whole dwell is taken as a rest.
-    """
-    if np.ptp(heading) <= 0.5 * step or step == 0.0:
-        return 0.0
-    steps, samples = abs(heading[-1] - heading[0]) / step, len(heading)
-    return step / duration * math.hypot(
-        0.35 / max(steps, 0.6), math.sqrt(min(steps, samples)) / samples)
+    if step:
+        rounding = step * np.column_stack([np.ones(len(noise)), noise])
+        wander = _place_in_steps(rate, output, rounding)[1]
+        # from 0.5 on the series is below 1e-9, and the errors are a small part of the scatter
+        if float(noise.min()) ** 2 + 0.5 * wander < 0.5:
+            shared = dwell_rounding_covariance(rate, output, rounding)
+            return rounding, np.sqrt(np.maximum(shared, 0.0).sum(axis=1))
+    return np.empty((0, 2)), np.zeros(len(rate))
 
 
 def _shrink_variances(variance: Array, dof: Array) -> Array:

@@ -25,6 +25,7 @@ the motion; that of s depends on the motion.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 
 from gyro_calibration.calibration.likelihood import (
@@ -107,17 +108,10 @@ class CalibrationForecast:
     def __init__(self, noise: Noise, duration: float, drive: Motion, drive_duration: float,
                  rest_duration: float = RunLimits.rest_duration):
         """
-        Prepare.
+        Prepare for a gyro, whose angle random walk is above 0; all durations are in s.
 
-        Parameters
-        ----------
-        noise : of the gyro; its angle random walk is above 0
-        duration : of the motions, s
-        drive : motion of the robot after the rest, repeated where it ends
-        drive_duration : of the drive, s
-        rest_duration : duration of the rest, which begins `SETTLING_TIME` s after the motion, s; 0
-            for none
-
+        The rest begins `SETTLING_TIME` s after the motion; a duration of 0 is none. The motion of
+        the robot after the rest, the drive, is repeated where it ends.
         """
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
@@ -128,7 +122,6 @@ class CalibrationForecast:
         self._drive_columns = np.vstack([heading, time])
         self.floor = (math.sqrt(2.0 / math.pi) * noise.angle_random_walk
                       * float(np.sqrt(time).mean()))
-        self._covariances: dict[int, _NoiseCovariances] = {}
 
     def predict(self, motion: Motion) -> Prediction:
         """Return the prediction for a motion that turns and has the length of the forecast."""
@@ -147,32 +140,11 @@ class CalibrationForecast:
         return self._predict(motion, blocks, False).heading_error
 
     def _predict(self, motion: Motion, blocks: int, with_tracking_error: bool) -> Prediction:
-        if blocks not in self._covariances:
-            self._covariances[blocks] = _noise_covariances(
-                self._noise, self._duration, blocks, self._rest_duration, self._drive_duration,
-                self._drive_columns.shape[1])
-        covariances = self._covariances[blocks]
-        weights, fit_covariance = self._weights(motion, blocks, covariances, with_tracking_error)
-        fit_covariance = fit_covariance + weights @ covariances.run_covariance @ weights.T
-        shared = weights @ covariances.cross_covariance
-        variance = (covariances.drive_variance - 2.0 * (self._drive_columns * shared).sum(axis=0)
-                    + (self._drive_columns * (fit_covariance @ self._drive_columns)).sum(axis=0))
-        error = math.sqrt(2.0 / math.pi) * float(np.sqrt(np.maximum(variance, 0.0)).mean())
-        # white noise is no part of the mean bias of the drive
-        drive_mean_variance = (float(covariances.drive_variance[-1]) / self._drive_duration ** 2
-                               - self._noise.angle_random_walk ** 2 / self._drive_duration)
-        bias_variance = (fit_covariance[1, 1] - 2.0 * shared[1, -1] / self._drive_duration
-                         + drive_mean_variance)
-        return Prediction(math.sqrt(fit_covariance[0, 0]), math.sqrt(bias_variance), error,
-                          self.floor)
-
-    def _weights(self, motion: Motion, blocks: int, covariances: _NoiseCovariances,
-                 with_tracking_error: bool) -> tuple[Array, Array]:
-        """
-        Return the weights of (s, b) on increments of the gyro's integral and the rest, (2, n).
-
-        Then their covariance by errors of gyro and robot that the fit does not determine, (2, 2).
-        """
+        white_precision, of_run, of_both, of_drive = _noise_covariances(
+            self._noise, self._duration, blocks, self._rest_duration, self._drive_duration,
+            self._drive_columns.shape[1])
+        # the fit: its weights of (s, b) on increments of the gyro's integral, shape (2, n), and
+        # the covariance by errors of the robot that it does not determine, (2, 2)
         count = blocks * _CELLS_PER_BLOCK ** 2
         point = (np.arange(count) + 0.5) * self._duration / count
         rate = motion.rate_at(point)
@@ -182,45 +154,53 @@ class CalibrationForecast:
             columns, deviations, parts = tracking_error_columns(motion, point, 0.0)
             known, prior = np.hstack([known, columns]), np.append(prior, parts[0] * deviations)
         columns = np.diff(known.reshape(blocks, -1, len(prior)).mean(axis=1), axis=0)
-        weighted = covariances.white_precision @ columns
+        weighted = white_precision @ columns
         covariance = np.linalg.inv(columns.T @ weighted + np.diag(prior ** -2.0))
         weights = (covariance @ weighted.T)[:2]
-        tracking_weights = weights @ columns[:, 4:] * prior[4:]
-        if not self._rest_duration:
-            return weights, tracking_weights @ tracking_weights.T
-        white = self._noise.angle_random_walk / math.sqrt(self._rest_duration)
-        stated = covariance[:2, :2] + np.diag([0.0, self._noise.allan_floor ** 2])
-        # the median rest: halves differ by twice the deviation of the mean, times `_MEDIAN_SIGMA`
-        expected, variance = (rest_variance(self._noise, self._rest_duration, white, change)
-                              for change in (0.0, 2.0 * _MEDIAN_SIGMA * white))
-        gain, combined = combine_with_rest(
-            stated, _MEDIAN_SIGMA * math.sqrt(stated[1, 1] + expected), variance)
-        run_share = np.eye(2) - np.outer(gain, (0.0, 1.0))
-        # the probability of another turn of the robot is no noise, but part of the stated variance
-        combination_excess = (combined - run_share @ stated @ run_share.T
-                              - variance * np.outer(gain, gain))
-        return (np.column_stack([run_share @ weights, gain]), run_share @ tracking_weights
-                @ tracking_weights.T @ run_share.T + combination_excess)
+        of_tracking = weights @ columns[:, 4:] * prior[4:]
+        unweighed = of_tracking @ of_tracking.T
+        if self._rest_duration:
+            # combined with the median rest: its halves differ by twice the deviation of the mean,
+            # times `_MEDIAN_SIGMA`
+            white = self._noise.angle_random_walk / math.sqrt(self._rest_duration)
+            stated = covariance[:2, :2] + np.diag([0.0, self._noise.allan_floor ** 2])
+            expected, variance = (rest_variance(self._noise, self._rest_duration, white, change)
+                                  for change in (0.0, 2.0 * _MEDIAN_SIGMA * white))
+            gain, combined = combine_with_rest(
+                stated, _MEDIAN_SIGMA * math.sqrt(stated[1, 1] + expected), variance)
+            share = np.eye(2) - np.outer(gain, (0.0, 1.0))
+            weights = np.column_stack([share @ weights, gain])
+            # the probability of another turn of the robot is no noise, but part of the stated
+            # variance
+            unweighed = share @ (unweighed - stated) @ share.T + combined - variance * np.outer(
+                gain, gain)
+
+        # the drive
+        fit_covariance = unweighed + weights @ of_run @ weights.T
+        shared = weights @ of_both
+        variances = (of_drive - 2.0 * (self._drive_columns * shared).sum(axis=0)
+                     + (self._drive_columns * (fit_covariance @ self._drive_columns)).sum(axis=0))
+        error = math.sqrt(2.0 / math.pi) * float(np.sqrt(np.maximum(variances, 0.0)).mean())
+        # white noise is no part of the mean bias of the drive
+        bias_variance = (fit_covariance[1, 1] - 2.0 * shared[1, -1] / self._drive_duration
+                         + float(of_drive[-1]) / self._drive_duration ** 2
+                         - self._noise.angle_random_walk ** 2 / self._drive_duration)
+        return Prediction(math.sqrt(fit_covariance[0, 0]), math.sqrt(bias_variance), error,
+                          self.floor)
 
 
-@dataclass(frozen=True)
-class _NoiseCovariances:
+@lru_cache(maxsize=64)
+def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration: float,
+                       drive_duration: float, drive_cells: int
+                       ) -> tuple[Array, Array, Array, Array]:
     """
-    Noise of the observations of a run and its rest, and of the heading of the drive.
+    Return the noise of the observations of a run and its rest, and of the heading of the drive.
 
     The n observations are the increments between the blocks of the run, rad, and the mean rate of
-    the rest, rad/s, if there is one.
+    the rest, rad/s, if there is one. Returned are the inverse of the covariance of the increments
+    by white noise, rad⁻²; the covariance of the observations by all noise, (n, n), and that with
+    the heading of the drive, (n, m); and the variance of that heading, rad², (m,).
     """
-
-    white_precision: Array  # of the covariance of the increments by white noise, rad⁻²
-    run_covariance: Array  # covariance of the observations by all noise, shape (n, n)
-    # covariance of the observations with the heading of the drive, shape (n, m)
-    cross_covariance: Array
-    drive_variance: Array  # variance of the heading of the drive, rad², shape (m,)
-
-
-def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration: float,
-                       drive_duration: float, drive_cells: int) -> _NoiseCovariances:
     cells = blocks * _CELLS_PER_BLOCK
     rest_times = np.cumsum([SETTLING_TIME, rest_duration]) if rest_duration else np.zeros(0)
     begin = duration + (rest_times[-1] if rest_duration else 0.0)
@@ -239,14 +219,14 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
     if rest_duration:
         observation_matrix = np.zeros((len(spread) + 1, before))
         observation_matrix[:-1, :cells], observation_matrix[-1, -1] = spread, 1.0
-    return _NoiseCovariances(np.linalg.inv(white), observation_matrix
-                             @ covariance[:before, :before] @ observation_matrix.T,
-                             observation_matrix @ covariance[:before, before:] @ sums.T,
-                             ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
+    return (np.linalg.inv(white),
+            observation_matrix @ covariance[:before, :before] @ observation_matrix.T,
+            observation_matrix @ covariance[:before, before:] @ sums.T,
+            ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
 
 
 @dataclass(frozen=True)
-class Turn:
+class _Turn:
     """One turn through an angle, rad, signed, at a rate above 0, rad/s, and its rest after, s."""
 
     angle: float
@@ -254,32 +234,29 @@ class Turn:
     rest: float
 
 
-def _build_motion(robot: RobotLimits, turns: list[Turn], first_rest: float) -> Motion:
+def _build_motion(robot: RobotLimits, turns: list[_Turn]) -> Motion:
     """Return the motion of a rest and then turns; angles are large enough for their rates."""
-    time, rate = [0.0, first_rest], [0.0, 0.0]
+    time, rate = [0.0, robot.rest], [0.0, 0.0]
     for turn in turns:
-        ramp = _ramp_shape(robot, turn.rate)
+        # a ramp: times, s, and fractions of the rate from 0 to 1; rounded where jerk is limited
+        rising, rounding = robot.ramp_times(turn.rate)
+        since, share = np.array([0.0, rising]), np.array([0.0, 1.0])
+        if rounding:
+            since = np.linspace(0.0, rising + rounding, 17)
+            squares = [np.maximum(since - begin, 0.0) ** 2
+                       for begin in (0.0, rising, rounding, rising + rounding)]
+            share = (squares[0] - squares[1] - squares[2] + squares[3]) / (
+                2.0 * rising * rounding)
         steady = abs(turn.angle) / turn.rate - robot.ramp_duration(turn.rate)
-        up = time[-1] + ramp[0][1:]
-        down = time[-1] + ramp[0][1:] + ramp[0][-1] + max(steady, 0.0)
-        rates = math.copysign(turn.rate, turn.angle) * ramp[1]
-        time += [*up, *([down[0] - ramp[0][1]] if steady > 1e-9 else []), *down]
+        up = time[-1] + since[1:]
+        down = time[-1] + since[1:] + since[-1] + max(steady, 0.0)
+        rates = math.copysign(turn.rate, turn.angle) * share
+        time += [*up, *([down[0] - since[1]] if steady > 1e-9 else []), *down]
         rate += [*rates[1:], *([rates[-1]] if steady > 1e-9 else []), *rates[-2::-1]]
         if turn.rest > 1e-9:
             time.append(time[-1] + turn.rest)
             rate.append(0.0)
     return motion_from_rates(np.array(time), np.array(rate))
-
-
-def _ramp_shape(robot: RobotLimits, rate: float) -> tuple[Array, Array]:
-    """Return times, s, and fractions of the rate from 0 to 1; rounded where jerk is limited."""
-    rising, rounding = robot.ramp_times(rate)
-    if not rounding:
-        return np.array([0.0, rising]), np.array([0.0, 1.0])
-    time = np.linspace(0.0, rising + rounding, 17)
-    squares = [np.maximum(time - since, 0.0) ** 2
-               for since in (0.0, rising, rounding, rising + rounding)]
-    return time, (squares[0] - squares[1] - squares[2] + squares[3]) / (2.0 * rising * rounding)
 
 
 class _MotionFamily:
@@ -302,12 +279,7 @@ class _MotionFamily:
 
     def motion_at(self, point: Array) -> Motion | None:
         """Return the motion at a point, or None where the robot is not able to do it."""
-        turns = self.turns_at(point)
-        return None if turns is None else _build_motion(self._robot, turns, self._robot.rest)
-
-    def turns_at(self, point: Array) -> list[Turn] | None:
-        """Return the turns at a point, the last followed by the rest at the end."""
-        count = int(2.0 * (self._max_turns / 2.0) ** point[0])
+        robot, count = self._robot, int(2.0 * (self._max_turns / 2.0) ** point[0])
         ends = np.zeros(count + 1)
         first = int(point[1] >= 0.5)
         ends[1 + first:-1:2] = point[2] * self._reach_up
@@ -315,28 +287,24 @@ class _MotionFamily:
         angles = np.diff(ends)
         if not np.abs(angles).min() > 0.0:
             return None
-        return self._fit_duration(angles, np.where(np.arange(count) // 2 % 2, point[5], point[4]),
-                                  point[6])
-
-    def _fit_duration(self, angles: Array, speeds: Array, rest_share: float) -> list[Turn] | None:
-        """Return turns of these proportions, at fractions of the fastest rate, in the time."""
-        robot, gaps = self._robot, len(angles) - 1
-        ends = np.cumsum(angles)
+        # stretched up to the time, at fractions of the fastest rate
         max_stretch = min(
             [place / end for place, end in ((self._reach_up, ends.max()),
                                             (self._reach_down, -ends.min())) if end > 0.0])
+        speeds = np.where(np.arange(count) // 2 % 2, point[5], point[4])
         rates = np.array([speed * robot.max_turn_rate(abs(angle) * max_stretch)
                           for speed, angle in zip(speeds, angles)])
-        stretch = ((self._moving_duration * (1.0 - rest_share) - robot.ramp_duration(rates).sum())
+        ramps = robot.ramp_duration(rates)
+        stretch = ((self._moving_duration * (1.0 - point[6]) - ramps.sum())
                    / (np.abs(angles) / rates).sum())
         angles = angles * min(stretch, max_stretch)
-        left = (self._moving_duration
-                - float((np.abs(angles) / rates + robot.ramp_duration(rates)).sum()))
+        left = self._moving_duration - float((np.abs(angles) / rates + ramps).sum())
         if (stretch <= 0.0 or left < -1e-9 or rates.min() < robot.slowest
-                or (np.abs(angles) < rates * robot.ramp_duration(rates)).any()):
+                or (np.abs(angles) < rates * ramps).any()):
             return None
-        rests = np.append(np.full(gaps, max(left, 0.0) / gaps), robot.rest)
-        return [Turn(*values) for values in zip(angles.tolist(), rates.tolist(), rests.tolist())]
+        rests = np.append(np.full(count - 1, max(left, 0.0) / (count - 1)), robot.rest)
+        return _build_motion(robot, [_Turn(*values) for values in zip(
+            angles.tolist(), rates.tolist(), rests.tolist())])
 
 
 @dataclass(frozen=True)
@@ -352,15 +320,8 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     """
     Return the motion of that length, s, with the least heading error in the forecast's drive.
 
-    Parameters
-    ----------
-    forecast : for motions of this length
-    generations : of the search; each tries 70 motions
-
-    Raises
-    ------
-    DataRefused : the robot cannot make such a motion, or none would calibrate it well enough
-
+    The forecast is for motions of this length. Each generation of the search tries 70 motions.
+    `DataRefused` is raised where the robot cannot make one, or none would calibrate well enough.
     """
     _refuse_impossible(robot, duration)
     family = _MotionFamily(robot, duration)
@@ -415,8 +376,8 @@ def plain_motion(robot: RobotLimits, duration: float) -> Motion:
     angle = min(place, rate * (half - robot.ramp_duration(rate)))
     between = 2.0 * (half - angle / rate - robot.ramp_duration(rate))
     side = 1.0 if robot.highest == place else -1.0
-    return _build_motion(robot, [Turn(side * angle, rate, between),
-                                 Turn(-side * angle, rate, robot.rest)], robot.rest)
+    return _build_motion(robot, [_Turn(side * angle, rate, between),
+                                 _Turn(-side * angle, rate, robot.rest)])
 
 
 def can_follow(robot: RobotLimits, motion: Motion) -> bool:

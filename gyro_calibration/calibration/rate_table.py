@@ -14,7 +14,7 @@ From dwells to a gyro's model: values of effects, covariance, and errors of left
 The errors are also those of full turns of 360 degrees (Ojeda et al., section 4): an error of the
 rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion to the duration
 of the turn. Two errors are compared: with the bias of a rest before the mission only, and with a
-model and then the bias that remains at rest.
+model and then the bias that remains at rest. Dwells that allow no answer raise `DataRefused`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MIN_TURN_RATE = 5.0 * DEGREE
 _MAX_REST_RATE = 0.1 * DEGREE
 
 
-class ColumnTest(NamedTuple):
+class _ColumnTest(NamedTuple):
     """How much columns explain of the errors of dwells."""
 
     p_value: float  # that errors without them are explained as well
@@ -92,8 +92,25 @@ class Calibration:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Return the distribution of the fitted values, of more dwells than there are values."""
-        return Uncertainty.from_fit(self.used, self.scatter, *_linearize_output(
-            self.used, self.terms, self.residual[self.scatter.inliers]))
+        model, channels = GyroModel(self.terms), channels_of(self.used)
+        columns = sensitivity_columns(self.used, self.terms)
+        residual = self.residual[self.scatter.inliers]
+        if model.uses_channel('output'):
+            # The polynomial depends on the output. With the measured one in the columns, a scale
+            # factor error of -1 would make every residual zero for any error of sweeps, and the
+            # likelihood would prefer a large scatter of their scale: the Jacobian of output
+            # against error is missing there. Columns and residual are therefore those of the
+            # output that the model expects: its change is that of the error over 1 - g, with g
+            # the slope of the error over the output.
+            expected, step = model.output_from_channels(channels), 1e-5
+            below, here, above = (channels.with_rate(channels.rate, expected + change)
+                                  for change in (-step, 0.0, step))
+            slope = (model.error(above) - model.error(below)) / (2.0 * step)
+            columns = np.column_stack([row for term in self.terms
+                                       for row in term.sensitivity(here)])
+            columns /= np.maximum(1.0 - slope, 0.1)[:, None]
+            residual = self.used.output - expected
+        return Uncertainty.from_fit(self.used, self.scatter, columns, residual)
 
     @cached_property
     def model(self) -> GyroModel:
@@ -120,7 +137,7 @@ class Calibration:
 
     def last_index(self, effect: Effect) -> int:
         """Return the index of the last value of an effect among all fitted values."""
-        owners = [term.effect for term in self.terms for _ in term.fitted_indices]
+        owners = [owner.effect for owner in value_owners(self.terms)]
         return len(owners) - 1 - owners[::-1].index(effect)
 
     def effect_deviation(self, effect: Effect) -> float:
@@ -147,26 +164,20 @@ class Calibration:
         replaced = replaced_term(self.given, effect)
         return zeros + new - (zeros if replaced is None else replaced.error(channels))
 
-    def test(self, columns: Array, known: Array, unexplained: Array | float = 0.0) -> ColumnTest:
+    def test(self, columns: Array, known: Array, unexplained: Array | float = 0.0) -> _ColumnTest:
         """
         Test whether columns explain the errors of the fitted dwells, given other columns.
 
         It is an F test, averaged over what the scatter may be, in addition to the uncertainty of
-        the given model.
-
-        Parameters
-        ----------
-        columns : that are tested, shape (n, m)
-        known : of other values that are fitted, shape (n, k)
-        unexplained : error in addition to the residual, rad/s, shape (n,)
-
+        the given model. The columns, (n, m), those of other fitted values, (n, k), and an error in
+        addition to the residual, rad/s, (n,), are given.
         """
         known_basis, white, new = self._whiten_beside(known, unexplained, columns)
         # a sine may have its zeros at the rates of all dwells
         new_basis = _orthonormal_columns(new, 1.0 / _MAX_CONDITION_NUMBER)
         count, freedom = new_basis.shape[1], len(white) - known_basis.shape[1] - new_basis.shape[1]
         if not count or freedom < 1:
-            return ColumnTest(1.0, 0.0, 0.0)
+            return _ColumnTest(1.0, 0.0, 0.0)
         gain, total = float(np.sum((new_basis.T @ white) ** 2)), float(white @ white)
         share = 1.0 - (total - gain) / freedom / max(total / (freedom + count), 1e-300)
         # Columns in their own unit, for the covariance of the dwells may be another one.
@@ -179,7 +190,7 @@ class Calibration:
         squares = np.einsum('ki,ki->k', values,
                             np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
         chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.dof))
-        return ColumnTest(chance, gain, min(max(share, 0.0), 1.0))
+        return _ColumnTest(chance, gain, min(max(share, 0.0), 1.0))
 
     def largest_gain(self, columns: Array, known: Array, unexplained: Array) -> float:
         """Return the gain of the best of several columns, with the arguments of `test`."""
@@ -202,9 +213,9 @@ class Calibration:
     @cached_property
     def given_errors(self) -> Array:
         """
-        Return what errors of the given model's values do to the fitted dwells, rad/s.
+        Return what independent errors of the given model's values do to the fitted dwells, rad/s.
 
-        Each of one standard deviation, and independent, shape (n, k); none where they are unknown.
+        Each is one standard deviation; shape (n, k), where k is 0 if they are unknown.
         """
         known, covariance = static_terms(self.given), self.given.covariance
         if covariance is None:
@@ -224,11 +235,7 @@ class Calibration:
 
     @property
     def min_non_monotonic_rate(self) -> float | None:
-        """
-        Return the slowest rate of the range, rad/s, at which the output no longer grows with it.
-
-        None where the output always grows with the rate.
-        """
+        """Return the slowest rate, rad/s, at which the output no longer grows with it, or None."""
         # also between the rates of the dwells, where a fast sine would hide
         rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
         channels = Channels(rate, rate, self.given.reference_temperature)
@@ -301,20 +308,15 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
 
     Effects of the rate are evaluated at the reference rate. The polynomial of Ojeda et al. (eq. 9
     to 12) is evaluated at the output, whose noise is small where it is an average. A shape is
-    found by Gauss-Newton steps from the best of a grid over its bounds.
+    found by Gauss-Newton steps from the best of a grid over its bounds. Dwells in which effects
+    look alike are refused.
 
     Parameters
     ----------
-    dwells : of a rate table or a log
     effects : each once
     scatter : of the dwells, if it is known already
     given : model that is corrected: its effects are known, unless they, or their confounders, are
         among the fitted ones. Temperatures count from its reference temperature, or the mean
-
-    Raises
-    ------
-    DataRefused : some of the effects look alike in these dwells, or there are too few dwells
-
     """
     _refuse_unobservable(dwells, effects)
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
@@ -342,7 +344,19 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
         raise DataRefused(f'{len(used)} dwells do not determine {values} values; '
                           'add dwells, or fit fewer effects')
     whitener = Whitener(used, scatter)
-    terms = _iterate_gauss_newton(used, _search_shapes(used, terms), whitener)
+    terms = _search_shapes(used, terms)
+    for _ in range(20):  # Gauss-Newton steps; the first is the solution for coefficients alone
+        orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
+        step = solve_triangular(
+            triangle, orthogonal.T @ whitener.whiten(_unexplained_error(used, terms))) / lengths
+        changes, new_terms = iter(step.tolist()), []
+        for term in terms:
+            for place in term.fitted_indices:
+                term = _replace_value(term, place, term.values[place] + next(changes))
+            new_terms.append(term)
+        terms = tuple(new_terms)
+        if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
+            break
     orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
     whitened = whitener.whiten(_unexplained_error(used, terms))
     left_out, deviation = np.full((2, len(dwells)), np.nan)
@@ -368,38 +382,27 @@ def sensitivity_columns(dwells: Dwells, terms: Sequence[Term],
         row + np.zeros(len(dwells)) for term in terms for row in term.sensitivity(channels))])
 
 
-def _linearize_output(dwells: Dwells, terms: Sequence[Term],
-                      residual: Array) -> tuple[Array, Array]:
-    """
-    Return the columns, shape (n, m), and residual of the output at the reference rate.
-
-    The columns are the change of the output for each fitted value; the residual is the output less
-    that of the model. The polynomial depends on the output. With the measured output in the
-    columns, a scale factor error of -1 would make every residual zero for any error of sweeps, and
-    the likelihood would prefer a large scatter of their scale: the Jacobian of output against
-    error is missing there. Columns and residual are therefore those at the expected output:
-    ``Δoutput = Δerror / (1 - g)`` with ``g`` the slope of the error over the output.
-    """
-    model, channels = GyroModel(tuple(terms)), channels_of(dwells)
-    if not model.uses_channel('output'):
-        return sensitivity_columns(dwells, terms), residual
-    expected, step = model.output_from_channels(channels), 1e-5
-    below, here, above = (channels.with_rate(channels.rate, expected + change)
-                          for change in (-step, 0.0, step))
-    slope = (model.error(above) - model.error(below)) / (2.0 * step)
-    columns = np.column_stack([row for term in terms for row in term.sensitivity(here)])
-    return columns / np.maximum(1.0 - slope, 0.1)[:, None], dwells.output - expected
-
-
 def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
     """Set each fitted shape in turn to the best of a grid over its bounds."""
+    channels = channels_of(dwells)
+
+    def misfit(tried: Sequence[Term]) -> float:
+        """Return the residual sum of squares with the coefficients fitted, the shapes fixed."""
+        columns = []
+        for term in tried:
+            shapes = len(term.effect.nonlinear_parameters)
+            columns += [term.columns(channels)[place - shapes]
+                        for place in term.fitted_indices if place >= shapes]
+        error = _unexplained_error(dwells, tried)
+        matrix = np.column_stack([*columns, np.zeros(len(dwells))])
+        return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
+
     for number, term in enumerate(terms):
         for place in term.fitted_indices:
             if place < len(term.effect.nonlinear_parameters):
                 grid = np.geomspace(*term.effect.nonlinear_parameters[place].bounds, 60).tolist()
-                tried = [(*terms[:number], _replace_value(term, place, value), *terms[number + 1:])
-                         for value in grid]
-                terms = min(tried, key=lambda each: _linear_misfit(dwells, each))
+                terms = min(((*terms[:number], _replace_value(term, place, value),
+                              *terms[number + 1:]) for value in grid), key=misfit)
     return terms
 
 
@@ -409,44 +412,27 @@ def _replace_value(term: Term, index: int, value: float) -> Term:
                                  *term.values[index + 1:]))
 
 
-def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
-    """Return the residual sum of squares with the coefficients fitted and the shapes fixed."""
-    channels = channels_of(dwells)
-    columns = [term.columns(channels)[place - len(term.effect.nonlinear_parameters)]
-               for term in terms
-               for place in term.fitted_indices if place >= len(term.effect.nonlinear_parameters)]
-    error = _unexplained_error(dwells, terms)
-    matrix = np.column_stack([*columns, np.zeros(len(dwells))])
-    return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
-
-
-def _iterate_gauss_newton(dwells: Dwells, terms: tuple[Term, ...],
-                          whitener: Whitener) -> tuple[Term, ...]:
-    """Take Gauss-Newton steps; where only coefficients are fitted the first is the solution."""
-    for _ in range(20):
-        orthogonal, triangle, lengths = _factor_columns(dwells, terms, whitener)
-        step = solve_triangular(
-            triangle, orthogonal.T @ whitener.whiten(_unexplained_error(dwells, terms))) / lengths
-        changes, new_terms = iter(step.tolist()), []
-        for term in terms:
-            for place in term.fitted_indices:
-                term = _replace_value(term, place, term.values[place] + next(changes))
-            new_terms.append(term)
-        terms = tuple(new_terms)
-        if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
-            break
-    return terms
-
-
 def _factor_columns(dwells: Dwells, terms: Sequence[Term],
                     whitener: Whitener) -> tuple[Array, Array, Array]:
     """Return Q and R of the whitened columns, each of length one, and their lengths before."""
     columns = whitener.whiten(sensitivity_columns(dwells, terms))
     lengths = np.linalg.norm(columns, axis=0)
     orthogonal, triangle = np.linalg.qr(columns / np.where(lengths > 0.0, lengths, 1.0))
-    if not np.linalg.cond(triangle) < _MAX_CONDITION_NUMBER:
-        raise _unidentifiable_error(terms, triangle)
-    return orthogonal, triangle, lengths
+    if np.linalg.cond(triangle) < _MAX_CONDITION_NUMBER:
+        return orthogonal, triangle, lengths
+    # the effects whose columns nearly cancel
+    direction = np.abs(np.linalg.svd(triangle)[2][-1])
+    owners = [owner.effect for owner in value_owners(terms)]
+    alike = [effect for effect in dict.fromkeys(owners)
+             if max(size for size, owner in zip(direction, owners) if owner is effect)
+             > 0.1 * direction.max()]
+    if len(alike) == 1:
+        raise DataRefused(f'{alike[0].name} cannot be determined from these dwells; '
+                          f'{alike[0].experiment}')
+    advice = '; '.join(dict.fromkeys(effect.experiment for effect in alike[::-1]
+                                     if effect.experiment))
+    raise DataRefused(f'{", ".join(effect.name for effect in alike)} look alike in these dwells '
+                      f'and cannot be distinguished; {advice}, or leave one out')
 
 
 def _orthonormal_columns(columns: Array, tolerance: float) -> Array:
@@ -492,27 +478,10 @@ def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
             f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature')
 
 
-def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> DataRefused:
-    """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
-    direction = np.abs(np.linalg.svd(triangle)[2][-1])
-    owners = [term.effect for term in terms for _ in term.fitted_indices]
-    alike = [effect for effect in dict.fromkeys(owners)
-             if max(size for size, owner in zip(direction, owners) if owner is effect)
-             > 0.1 * direction.max()]
-    names = [effect.name for effect in alike]
-    if len(names) == 1:
-        return DataRefused(
-            f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}')
-    advice = '; '.join(dict.fromkeys(effect.experiment for effect in alike[::-1]
-                                     if effect.experiment))
-    return DataRefused(f'{", ".join(names)} look alike in these dwells and cannot be '
-                       f'distinguished; {advice}, or leave one out')
-
-
 # bins of errors
 
 @dataclass(frozen=True)
-class Bin:
+class _Bin:
     """Dwells of nearly one rate, or nearly one temperature."""
 
     # low, high: ends of the bin, in the unit of what was binned
@@ -526,16 +495,16 @@ class Bin:
     rms: float  # of the residual, rad/s
 
 
-def bin_errors(fit: Calibration, values: Array) -> list[Bin]:
+def bin_errors(fit: Calibration, values: Array) -> list[_Bin]:
     """Return the errors over one quantity, shape (n,), in non-empty bins of equal width."""
     dwells, found = fit.dwells, []
     for low, high, within in equal_bins(values, 8):
         chosen = within & fit.scatter.inliers
         if chosen.any():
             part, residual = select_dwells(dwells, chosen), fit.residual[chosen]
-            found.append(Bin(low, high, len(part), float((part.output - part.rate).mean()),
-                             float(residual.mean()), fit.scatter.mean_deviation(part),
-                             rms(residual)))
+            found.append(_Bin(low, high, len(part), float((part.output - part.rate).mean()),
+                              float(residual.mean()), fit.scatter.mean_deviation(part),
+                              rms(residual)))
     return found
 
 
@@ -563,20 +532,10 @@ class TurnErrors:
 def compute_turn_errors(dwells: Dwells, rate: Array,
                         min_rate: float = MIN_TURN_RATE) -> TurnErrors:
     """
-    Return the errors of full turns at the rates and temperatures of some dwells.
+    Return the errors of full turns at the rates and temperatures of dwells that are not outlying.
 
-    Parameters
-    ----------
-    dwells : without those that are outlying
-    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); not finite where there is none,
-        as in `Calibration.left_out_rate`
-    min_rate : of a turn, rad/s
-
-    Raises
-    ------
-    DataRefused : no dwell of that rate has a rate by the model, none determines the static bias,
-        or the gyro is upside down
-
+    The rates by the model, rad/s, shape (n,), as in `Calibration.left_out_rate`, are not finite
+    where there is none. A turn is faster than `min_rate`, rad/s.
     """
     known = np.isfinite(rate)
     wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded
@@ -590,7 +549,13 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
     refuse_scale(scale - 1.0, 'reference', 'give or omit --invert, or turn the gyro over')
     rests, remark = _find_rests(dwells)
-    nearest = _find_nearest(dwells, turns, rests)
+    # the rest of each turn's sweep, or else the nearest in temperature, then in order
+    degc, at = ((np.zeros(len(each)) if each.temperature is None else each.temperature)
+                for each in (dwells, turns))
+    of_rest = {number: float(degc[rows].mean()) for number, (rows, _) in rests.items()}
+    nearest = [rests[min(rests, key=lambda number: (
+        number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
+        for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]
     static, modelled = (
         # eq. 1 and 2, eq. 13 to 16: the integral over a turn of errors of a rate, less the bias
         (error[wanted] - [weights @ error[rows] for rows, weights in nearest])
@@ -602,13 +567,15 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     return TurnErrors(turns, static, modelled, tuple(remarks))
 
 
-#: Number of a sweep -> the dwells that determine its static bias, and their weights.
-Rests = dict[int, tuple[Numbers, Array]]
+def _find_rests(dwells: Dwells) -> tuple[dict[int, tuple[Numbers, Array]], str]:
+    """
+    Return the rests of the sweeps (eq. 1), or if there is none the slowest turns both ways.
 
-
-def _find_rests(dwells: Dwells) -> tuple[Rests, str]:
-    """Return the rests of the sweeps (eq. 1), or if there is none the slowest turns both ways."""
-    speed, at_rest, between = np.abs(dwells.rate), Rests(), Rests()
+    By the number of a sweep, they are the dwells that determine its static bias, and their
+    weights. The second value is a remark on their source.
+    """
+    speed = np.abs(dwells.rate)
+    at_rest, between = dict[int, tuple[Numbers, Array]](), dict[int, tuple[Numbers, Array]]()
     sweeps = np.unique(dwells.sweep).tolist()
     for number in sweeps:
         rows = np.flatnonzero(dwells.sweep == number)
@@ -629,14 +596,3 @@ def _find_rests(dwells: Dwells) -> tuple[Rests, str]:
         remark += (f'; {others} of {len(sweeps)} sweeps have none and take that of the nearest '
                    'temperature')
     return found, remark
-
-
-def _find_nearest(dwells: Dwells, turns: Dwells,
-                  rests: Rests) -> list[tuple[Numbers, Array]]:
-    """Return the rest of each turn's sweep, or else the nearest in temperature, then in order."""
-    degc, at = ((np.zeros(len(each)) if each.temperature is None else each.temperature)
-                for each in (dwells, turns))
-    of_rest = {number: float(degc[rows].mean()) for number, (rows, _) in rests.items()}
-    return [rests[min(rests, key=lambda number: (
-        number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
-        for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]

@@ -68,15 +68,11 @@ _UNIT_CONFUSIONS = {
 UNIT_TOLERANCE = 1.1
 
 
-def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
+def refuse_unit_error(scale: float, reference: str) -> None:
     """
-    Raise `DataRefused` for a scale that a confused unit explains.
+    Raise `DataRefused` for a scale, reported over true rate, that a confused unit explains.
 
-    Parameters
-    ----------
-    scale : reported over true rate
-    reference : its name, if its unit may be the wrong one; else ''
-
+    The name of the reference is given if its unit may be the wrong one; else ''.
     """
     size = max(abs(scale), 1e-300)
     found = [factor for factor in _UNIT_CONFUSIONS
@@ -130,21 +126,25 @@ def split_run(time: Array, rate: Array) -> RunPieces:
 def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
                         slip: str = '') -> None:
     """
-    Refuse a run that another motion explains far better than the profile, with the cause.
+    Raise `DataRefused` for a run that another motion explains far better than its profile.
 
-    Parameters
-    ----------
-    slip : message on a slip, where one is known better than the pieces show it
-
-    Raises
-    ------
-    DataRefused : with the cause that explains it best
-
+    `slip` is a message on a slip, where one is known better than the pieces show it.
     """
-    trials = [*((unexplained, unexplained, message) for unexplained, message
-                in _try_motions(run, motion, largest_offset)),
-              *((_SLIP_PENALTY * unexplained, unexplained, slip or message)
-                for unexplained, message in _try_slips(run, motion, largest_offset))]
+    trials = [(unexplained, unexplained, message) for unexplained, message
+              in _try_motions(run, motion, largest_offset)]
+    # a stretch of another turn
+    edges = np.arange(0, len(run.gyro_angle) + 1, 5)
+    interval = float(np.median(np.diff(run.edges)))
+    steps = np.where(np.arange(len(run.gyro_angle))[:, None] >= edges, interval, 0.0)
+    whole = max(float(np.sum((run.gyro_angle - run.gyro_angle.mean()) ** 2)), 1e-300)
+    for offset in _trial_offsets(largest_offset):
+        reference = run.reference_angle(motion, offset)
+        found = find_deviating_stretch(
+            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.gyro_angle)
+        unexplained = run.fit_scale(reference)[0] - found.explained_squares / whole
+        turned = found.excess_rate * float(edges[found.last] - edges[found.first]) * interval
+        trials.append((_SLIP_PENALTY * unexplained, unexplained, slip or format_slip(
+            motion, abs(turned), float(run.edges[edges[found.first]]))))
     _, unexplained, message = min(trials)
     if _SLIP_PENALTY * unexplained > fit_profile(
             run, motion, largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
@@ -204,22 +204,6 @@ def _try_motions(run: RunPieces, motion: Motion,
                    'the profile: begin with it, or allow a larger time offset' if is_profile else
                    f'the gyro is {abs(offset):.1f} s {"behind" if offset > 0 else "ahead of"} the '
                    'reference: correct the time of the reference')
-
-
-def _try_slips(run: RunPieces, motion: Motion,
-               largest_offset: float) -> Iterator[tuple[float, str]]:
-    """Give the unexplained part of a run with a stretch of another turn, and the cause."""
-    edges = np.arange(0, len(run.gyro_angle) + 1, 5)
-    interval = float(np.median(np.diff(run.edges)))
-    steps = np.where(np.arange(len(run.gyro_angle))[:, None] >= edges, interval, 0.0)
-    whole = max(float(np.sum((run.gyro_angle - run.gyro_angle.mean()) ** 2)), 1e-300)
-    for offset in _trial_offsets(largest_offset):
-        reference = run.reference_angle(motion, offset)
-        found = find_deviating_stretch(
-            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.gyro_angle)
-        turned = found.excess_rate * float(edges[found.last] - edges[found.first]) * interval
-        yield (run.fit_scale(reference)[0] - found.explained_squares / whole,
-               format_slip(motion, abs(turned), float(run.edges[edges[found.first]])))
 
 
 def format_slip(motion: Motion, angle: float, time: float, sigmas: float = math.nan) -> str:

@@ -228,11 +228,7 @@ def find_inliers(dwells: Dwells) -> Mask:
 
 
 def _smooth_surface(dwells: Dwells) -> Array:
-    """
-    Return orthonormal columns of a smooth surface over rate and temperature, shape (n, m).
-
-    There is at most one column for three dwells.
-    """
+    """Return orthonormal columns of a surface, (n, m), at most one for three dwells."""
     if len(dwells) < 2:
         raise DataRefused('a single dwell shows no effect: '
                           'turn at more rates, and rest between them')
@@ -264,12 +260,9 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     """
     Fit columns (n, m) to an error (n,) for each of k scatters of sweeps' bias and scale, (k, 2).
 
-    Returns
-    -------
-    logarithm of the determinants of the covariance, in that of the dwells, and of the Gram matrix,
-    shape (k,); sum of the squared whitened residuals, shape (k,); values, shape (k, m); inverse of
-    the Gram matrix of the whitened columns, shape (k, m, m)
-
+    Returned are the logarithm of the determinants of the covariance, in that of the dwells, and of
+    the Gram matrix, (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and
+    the inverse of the Gram matrix of the whitened columns, (k, m, m).
     """
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
@@ -319,21 +312,29 @@ class Uncertainty:
     def from_fit(cls, dwells: Dwells, scatter: Scatter, columns: Array,
                  error: Array) -> Uncertainty:
         """
-        Average over the possible scatters.
+        Average over the possible scatters of dwells, of which there are more than values.
 
-        Parameters
-        ----------
-        dwells : that were fitted, more than there are values
-        scatter : of them
-        columns : change of the error for each value, shape (n, m)
-        error : residual of the fitted values, rad/s, shape (n,)
-
+        The columns are the change of the error for each value, shape (n, m), and the error is the
+        residual of the fitted values, rad/s, shape (n,).
         """
         lengths, deviation = np.linalg.norm(columns, axis=0), scatter.deviation(dwells)
         dof, likeliest = len(dwells) - len(lengths), (scatter.sweep_bias, scatter.sweep_scale)
-        axes, priors = zip(*(_scatter_grid(size, variances) for size, variances in zip(
-            likeliest, _sweep_variances(dwells, deviation)))
-            if _count_scatter_terms(dwells) == 4 else ((np.zeros(1), np.ones(1)),) * 2)
+        axes, priors = [np.zeros(1)] * 2, [np.ones(1)] * 2
+        if _count_scatter_terms(dwells) == 4:
+            # variance of bias and scale of each sweep by its dwells, shape (2, sweeps)
+            weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
+            variances = 1.0 / sum_by_part(
+                weights / deviation[:, None] ** 2, _sweep_numbers(dwells)).T
+            for place, variance in enumerate(variances):
+                # possible sizes of this scatter about the likely one, and their prior
+                typical, size = 1.0 / math.sqrt(float(np.mean(1.0 / variance))), likeliest[place]
+                grid = np.geomspace(
+                    max(0.3 * typical, size / 30.0), 100.0 * max(typical, size), 25)
+                prior = grid ** 2 * np.sqrt(
+                    np.mean((grid[:, None] ** 2 + variance) ** -2.0, axis=1))
+                axes[place] = np.append(0.0, grid)
+                priors[place] = np.append(
+                    0.5 + 0.5 * prior[0], prior * math.log(grid[1] / grid[0]))
         sizes = [np.column_stack([np.full(len(axes[1]), bias), axes[1]])
                  for bias in axes[0]]  # in turn, for the memory
         log_determinant, misfit, offsets, inverses = (np.concatenate(each) for each in zip(*(
@@ -387,40 +388,19 @@ class Uncertainty:
         return covariance * np.outer(widening, widening)
 
 
-def _sweep_variances(dwells: Dwells, deviation: Array) -> Array:
-    """Return the variance of bias and scale of each sweep by its dwells, shape (2, sweeps)."""
-    weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
-    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, _sweep_numbers(dwells)).T
-
-
-def _scatter_grid(size: float, variances: Array) -> tuple[Array, Array]:
-    """Return possible sizes of a scatter about the likely one, and their prior."""
-    typical = 1.0 / math.sqrt(float(np.mean(1.0 / variances)))
-    sizes = np.geomspace(max(0.3 * typical, size / 30.0), 100.0 * max(typical, size), 25)
-    prior = sizes ** 2 * np.sqrt(np.mean((sizes[:, None] ** 2 + variances) ** -2.0, axis=1))
-    return np.append(0.0, sizes), np.append(
-        0.5 + 0.5 * prior[0], prior * math.log(sizes[1] / sizes[0]))
-
-
 # errors in another run
 
 def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
                        columns: Callable[[Array, Array], Array], covariance: Array) -> Tolerance:
     """
-    Return the error of a rate that the covariance of the values does not contain.
+    Return the error of a rate that the covariance of the values, (m, m), does not contain.
 
     Effects that were not fitted may exist below the noise: a fit with more columns has a larger
-    variance than that of the values. Its mean over the dwells is added to the variance of the
-    bias; its value half a width outside of the calibrated range gives the slopes.
-
-    Parameters
-    ----------
-    dwells : that were fitted
-    whitener : of their scatter
-    sweep_scatter : scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,)
-    columns : of rates, rad/s, and temperatures, degC: change of the output for each value, (n, m)
-    covariance : of the values, shape (m, m)
-
+    variance than that of the values. Its mean over the fitted dwells is added to the variance of
+    the bias; its value half a width outside of the calibrated range gives the slopes. Given are
+    the scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,), and a
+    function of rates, rad/s, and temperatures, degC: the change of the output for each value,
+    (n, m).
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = (np.zeros(len(dwells)) if dwells.temperature is None

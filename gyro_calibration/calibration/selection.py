@@ -28,7 +28,7 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import (
     Calibration, channels_of, CONFOUNDERS, fit_effects)
 from gyro_calibration.calibration.scatter import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
-from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, Effect,
     SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STATIC_EFFECTS)
@@ -51,7 +51,7 @@ BASIC_EFFECTS = BIAS, SCALE_FACTOR_ERROR
 
 
 @dataclass(frozen=True)
-class EffectChoice:
+class _EffectChoice:
     """Why an effect was taken or not."""
 
     effect: str  # its name
@@ -64,7 +64,7 @@ class EffectChoice:
 
 
 @dataclass(frozen=True)
-class ConfoundedPair:
+class _ConfoundedPair:
     """Two effects that explain the same errors."""
 
     # taken, other: their names
@@ -89,8 +89,8 @@ class SelectedEffects:
     """A calibration with the effects that the data support, the reasons, and confounded pairs."""
 
     calibration: Calibration
-    choices: tuple[EffectChoice, ...]
-    confounders: tuple[ConfoundedPair, ...]
+    choices: tuple[_EffectChoice, ...]
+    confounders: tuple[_ConfoundedPair, ...]
 
     @property
     def model(self) -> GyroModel:
@@ -102,15 +102,7 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> SelectedEff
     """
     Fit the effects that the dwells support, each with its reason.
 
-    Parameters
-    ----------
-    dwells : of a rate table or a log
-    technology : one of `TECHNOLOGY_EFFECTS`, of the instrument; it decides where causes tie
-
-    Raises
-    ------
-    DataRefused : too few dwells for anything
-
+    The technology of the instrument, one of `TECHNOLOGY_EFFECTS`, decides where causes tie.
     """
     base = _add_slopes(_fit_base(dwells, None))
     best = _add_slopes(find_supported_effects(dwells, FALSE_ALARM_RATE, base=base))
@@ -209,7 +201,7 @@ def _remove_superfluous(fit: Calibration, base: Sequence[Effect],
 # confounders
 
 def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect: Effect
-                        | None = None) -> tuple[Calibration, tuple[ConfoundedPair, ...]]:
+                        | None = None) -> tuple[Calibration, tuple[_ConfoundedPair, ...]]:
     """
     Decide between sine response and cubic nonlinearity where a fit has one of them.
 
@@ -240,8 +232,8 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
         reason += f', although the physics of {technology} gives {CONFOUNDERS[taken].name}'
     elif technology is not None and sigmas < limit:
         reason = f'{taken.name} is what the physics of {technology} gives, and {fits}'
-    return best, (ConfoundedPair(taken.name, CONFOUNDERS[taken].name, sigmas,
-                                 distinguishing_rate(best, second), reason),)
+    return best, (_ConfoundedPair(taken.name, CONFOUNDERS[taken].name, sigmas,
+                                  distinguishing_rate(best, second), reason),)
 
 
 def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
@@ -251,24 +243,18 @@ def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
     Their outputs are then to differ by one standard deviation more than is needed. None if that is
     more than three times the fastest rate.
     """
-    fastest = float(np.abs(fit.dwells.rate).max())
-    for rate in fastest * np.arange(1.05, 3.0, 0.05):
-        if (_separation_sigmas(fit, other, np.array([rate, rate, -rate, -rate]))
-                >= MIN_DISTINGUISHING_SIGMAS + 1.0):
+    known = fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
+    deviation = np.full(4, np.median(known) if len(known) else np.nan)
+    temperature = np.full(4, fit.model.reference_temperature)
+    for rate in float(np.abs(fit.dwells.rate).max()) * np.arange(1.05, 3.0, 0.05):
+        rates = rate * np.array([1.0, 1.0, -1.0, -1.0])
+        sweep = Dwells(rates, rates, temperature, deviation, np.zeros(4, dtype=int), ('',) * 4)
+        apart = np.asarray(fit.model.error(channels_of(sweep))
+                           - other.model.error(channels_of(sweep)))
+        sigmas = math.sqrt(apart @ np.linalg.solve(fit.prediction_covariance(sweep), apart))
+        if sigmas >= MIN_DISTINGUISHING_SIGMAS + 1.0:
             return float(rate)
     return None
-
-
-def _separation_sigmas(fit: Calibration, other: Calibration, rates: Array) -> float:
-    """Return the difference of two fits in one more sweep at rates (n,), standard deviations."""
-    count, known = len(rates), fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
-    sweep = Dwells(rates, rates, np.full(count, fit.model.reference_temperature),
-                   np.full(count, np.median(known) if len(known) else np.nan),
-                   np.zeros(count, dtype=int), ('',) * count)
-    difference = np.asarray(fit.model.error(channels_of(sweep))
-                            - other.model.error(channels_of(sweep)))
-    return math.sqrt(float(
-        difference @ np.linalg.solve(fit.prediction_covariance(sweep), difference)))
 
 
 def try_replace(fit: Calibration, taken: Effect, other: Effect) -> Calibration | None:
@@ -279,24 +265,24 @@ def try_replace(fit: Calibration, taken: Effect, other: Effect) -> Calibration |
 # reasons
 
 def _explain_choice(fit: Calibration, effect: Effect, significance: float,
-                    confounders: Sequence[ConfoundedPair]) -> EffectChoice:
+                    confounders: Sequence[_ConfoundedPair]) -> _EffectChoice:
     """Return the gain of a fit with the effect over one without it, or with its confounder."""
     for pair in confounders:
         if effect.name == pair.other:
             swapped = try_replace(fit, CONFOUNDERS[effect], effect)
             assert swapped is not None
             reason = f'explains the same as {pair.taken}, in place of which it is tried here'
-            return EffectChoice(effect.name, False, fit.left_out_rms, swapped.left_out_rms,
-                                math.nan, reason)
+            return _EffectChoice(effect.name, False, fit.left_out_rms, swapped.left_out_rms,
+                                 math.nan, reason)
     taken = effect in fit.effects
     rest = tuple(each for each in fit.effects if each is not effect)
     if taken and not rest:
-        return EffectChoice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
-                            'the only effect that these dwells determine')
+        return _EffectChoice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
+                             'the only effect that these dwells determine')
     try:
         other = fit.refit(rest if taken else _add_effect(rest, effect))
     except DataRefused as error:
-        return EffectChoice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
+        return _EffectChoice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
     reason = 'does not predict left-out sweeps better'
     if not larger.dof:
@@ -306,5 +292,5 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
                   if _is_supported(smaller, larger, significance) else 'belongs to every model')
     elif larger.p_value(effect) >= significance:
         reason = f'its p-value is above {significance:.2g}, the limit for one effect'
-    return EffectChoice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
-                        larger.p_value(effect), reason)
+    return _EffectChoice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
+                         larger.p_value(effect), reason)

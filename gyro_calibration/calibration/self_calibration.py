@@ -14,6 +14,11 @@ Scale factor error and bias from about 20 s of known motion, with the reasons to
 The model is ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three methods:
 the two of the paper, unchanged, and a likelihood fit, which has no error by the rectangle rule and
 estimates the time offset between gyro and motion.
+
+In all functions, `time` is in s since the start of the motion, and `rate` is the output of the
+gyro, after its model if it has one, in rad/s, both of shape (n,). `output` is that before the
+model, where it differs, which shows a gyro that is dead or at its limit. `noise` is that of the
+gyro, if it is known. Data that are not credible raise `DataRefused`, with reason and remedy.
 """
 
 from __future__ import annotations
@@ -36,6 +41,19 @@ from gyro_calibration.model.motion import Motion, motion_from_rates
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
+
+#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
+#: equal slip in all turns is indistinguishable from a scale factor error.
+_MAX_WHEEL_SLIP = 0.01
+#: Standard deviations from which on a stretch is a slip. With three times the noise of the
+#: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
+_MIN_SLIP_SIGMAS = 4.5
+#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
+#: is stated, s.
+DRIVE_DURATION = 300.0
+#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
+#: which the robot is driving, rad/s.
+SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
 
 
 @dataclass(frozen=True)
@@ -76,20 +94,10 @@ class ReferenceErrors:
     random_walk: float = 0.0  # of its heading, rad/√s
 
 
-#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
-#: equal slip in all turns is indistinguishable from a scale factor error.
-_MAX_WHEEL_SLIP = 0.01
-
-
 def default_reference_errors(motion: Motion) -> ReferenceErrors:
     """Return the usual errors of a reference whose errors are not given: commanded rates slip."""
     commanded = motion.rate is not None
     return ReferenceErrors(_MAX_WHEEL_SLIP / math.sqrt(3.0)) if commanded else ReferenceErrors()
-
-
-#: Standard deviations from which on a stretch is a slip. With three times the noise of the
-#: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
-_MIN_SLIP_SIGMAS = 4.5
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
@@ -98,12 +106,6 @@ def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
 
     The rectangle rule of eq. 4 is kept: against a continuous heading it errs by several percent
     where the sampling is slow.
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, rad/s, shape (n,)
-
     """
     step = np.diff(time)
     g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
@@ -112,15 +114,7 @@ def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
 
 
 def fit_rate(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
-    """
-    Fit by Hong and Park's rate reference (eq. 8 and 9), with columns in the order of q = [s̄, b̄].
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, rad/s, shape (n,)
-
-    """
+    """Fit by Hong and Park's rate reference (eq. 8 and 9), in the order of q = [s̄, b̄]."""
     true = motion.rate_at(time)
     g = np.array([[rate @ rate, rate.sum()], [rate.sum(), len(rate)]])
     return _solve_inverse_model(g, np.array([true @ rate, true.sum()]))
@@ -147,22 +141,13 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
     Parameters
     ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
-    noise : of the gyro, if it is known; the wander of the bias goes into its standard deviation,
-        and the residual is compared with it
+    noise : the wander of the bias goes into its standard deviation, and the residual is compared
+        with it
     reference : the errors of the motion; goes into the standard deviations. By default a motion of
         rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
-    output : of the gyro before its model, where that differs, shape (n,); it shows a gyro that is
-        dead or at its limit
     prior : standard deviations of (s, b) about zero before the run, as
         `GyroModel.prior_deviations` of a fleet, shape (2,); what the run leaves open is drawn to
         it, in a method that gives a covariance
-
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
-
     """
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits, output)
@@ -182,15 +167,29 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
          noise.allan_floor ** 2 + (scale * reference.rate_deviation) ** 2])
     of_steps, rounding = rounding_covariance(time, rate if output is None else output, fit)
+    goodness = None
+    if noise.angle_random_walk and fit.dof:
+        # the residual against the known noise of means over neighbouring blocks
+        block = float(np.median(np.diff(fit.influence[:, 2])))
+        known = noise.allan_variance(block) * block + (scale * reference.random_walk) ** 2
+        chi_square = fit.residual_squares / known
+        goodness = GoodnessOfFit(chi_square, fit.dof, float(chdtrc(fit.dof, chi_square)),
+                                 fit.angle_random_walk / math.sqrt(known))
     fit = replace(fit, covariance=fit.covariance + unobservable + of_steps,
-                  rounding_variance=rounding, goodness=_goodness_of_fit(fit, reference, noise))
+                  rounding_variance=rounding, goodness=goodness)
     if prior is not None and np.isfinite(fit.covariance).all():
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
     _refuse_fit(fit, run, motion, limits, white_noise)
-    _refuse_shared_noise(fit, white_noise, noise)
+    # a reference that follows the noise of the gyro: that of the model, or less by the samples
+    own = min(noise.angle_random_walk, white_noise) ** 2
+    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-_MIN_SLIP_SIGMAS):
+        raise DataRefused(
+            'the reference is computed from this gyro, since they differ by '
+            f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
+            'gyro: give a reference without it, such as odometry of the wheels')
     return fit
 
 
@@ -200,17 +199,8 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
     By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
     error, which is no noise of a fit; between codes the errors are independent, of the sizes of
-    `rounding_errors`. Ramps within a block average them out. Zeros without steps.
-
-    Parameters
-    ----------
-    time : s, shape (n,)
-    output : rad/s, shape (n,)
-
-    Returns
-    -------
-    covariance, shape (2, 2), and variance, (rad/s)²
-
+    `rounding_errors`. Ramps within a block average them out. The covariance has shape (2, 2), the
+    variance is in (rad/s)²; both are zero without steps.
     """
     step = quantization_step(output)
     if not step:
@@ -242,17 +232,6 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     return sums @ sums.T, float(error[slowest] ** 2)
 
 
-def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise) -> None:
-    """Refuse a reference that follows the noise of the gyro: it is computed from this gyro."""
-    # that of the model, if it is known, or less by the samples, `white_noise`, rad/√s
-    own = min(noise.angle_random_walk, white_noise) ** 2
-    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-_MIN_SLIP_SIGMAS):
-        raise DataRefused(
-            'the reference is computed from this gyro, since they differ by '
-            f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
-            'gyro: give a reference without it, such as odometry of the wheels')
-
-
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
                     slip_deviation: float,
                     excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
@@ -263,35 +242,17 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
                               slip_deviation=slip_deviation, excess_turn=excess_turn)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
-    return fit if motion.rate is not None else _add_asymmetry_variance(fit, rate)
-
-
-def _add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
-    """
-    Return the fit with the variance of a scale difference between both senses of turning added.
-
-    For measured headings; against a profile the fit includes it. Such an error is proportional to
-    the absolute value of the rate. The part of it that is proportional to the rate, or constant,
-    is indistinguishable from scale factor error and bias. In a swing without rests, the mean
-    absolute rate is indistinguishable from a bias.
-    """
+    if motion.rate is not None:
+        return fit
+    # Against a profile the fit includes a scale difference between both senses of turning; for
+    # measured headings its variance is added. Such an error is proportional to the absolute value
+    # of the rate. The part of it that is proportional to the rate, or constant, is
+    # indistinguishable from scale factor error and bias. In a swing without rests, the mean
+    # absolute rate is indistinguishable from a bias.
     columns = np.column_stack([rate, np.ones(len(rate))])
     absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
     return replace(
         fit, covariance=fit.covariance + ASYMMETRY_DEVIATION ** 2 * np.outer(absorbed, absorbed))
-
-
-def _goodness_of_fit(fit: ScaleBiasFit, reference: ReferenceErrors,
-                     noise: Noise) -> GoodnessOfFit | None:
-    """Compare the residual with the known noise of means over neighbouring blocks."""
-    if not noise.angle_random_walk or not fit.dof:
-        return None
-    block = float(np.median(np.diff(fit.influence[:, 2])))
-    known = (noise.allan_variance(block) * block
-             + ((1.0 + fit.scale_factor_error) * reference.random_walk) ** 2)
-    chi_square = fit.residual_squares / known
-    return GoodnessOfFit(chi_square, fit.dof, float(chdtrc(fit.dof, chi_square)),
-                         fit.angle_random_walk / math.sqrt(known))
 
 
 def refuse_samples(time: Array, rate: Array, limits: RunLimits, output: Array | None) -> None:
@@ -405,18 +366,25 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           f'{limits.max_noise_ratio:g} are allowed: check that the robot follows '
                           f'the {motion.name}, fasten the gyro, stop vibration, or measure the '
                           'noise again (allan)')
-    _refuse_no_improvement(fit, limits.max_heading_error)
+    # the heading after a drive with a whole turn, by its own covariance and without a calibration
+    error_with = math.sqrt(
+        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * math.tau)
+        * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
+    error_without = math.hypot(fit.bias * DRIVE_DURATION, s * math.tau)
+    if error_with > max(limits.max_heading_error, error_without):
+        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
+                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
+                          'deg in five minutes; without the calibration it is '
+                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
+                          'for longer')
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
     """
     Return a remark on a scale factor error that gyros of a technology hardly have, or ''.
 
-    Parameters
-    ----------
-    prior_deviation : standard deviation of the scale factor error of such gyros, 1
-    reference : name of the motion
-
+    The standard deviation of the scale factor error of such gyros, 1, and the name of the motion
+    are given.
     """
     size = 100.0 * fit.scale_factor_error
     sigmas = abs(fit.scale_factor_error) / math.hypot(
@@ -427,37 +395,6 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
             f'such gyros have, about {100.0 * prior_deviation:g} %: compare the turn of the '
             f'{reference} with a mark on the floor (calibrate by whole turns), and check radius '
             'and track of the wheels, or the sensitivity of the gyro')
-
-
-#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
-#: is stated, s.
-DRIVE_DURATION = 300.0
-
-
-def _refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
-    """
-    Refuse a calibration that by its own covariance makes a heading less accurate.
-
-    Parameters
-    ----------
-    limit : accepted standard deviation of the heading after a drive of five minutes and a whole
-        turn, rad, whatever it was before
-
-    Raises
-    ------
-    DataRefused : the standard deviation exceeds the limit, and the error without the calibration
-
-    """
-    error_with = math.sqrt(
-        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * math.tau)
-        * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
-    error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * math.tau)
-    if error_with > max(limit, error_without):
-        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
-                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
-                          'deg in five minutes; without the calibration it is '
-                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
-                          'for longer')
 
 
 @dataclass(frozen=True)
@@ -475,18 +412,9 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
     """
     Check a calibration by a rest after its run, and refuse it if the gyro still drifts.
 
-    Parameters
-    ----------
-    time : s, shape (n,); at least 75 % of the length in the limits
-    rate : of the gyro as it went into the fit, rad/s, shape (n,)
-    fit : which corrects it
-    noise : of the gyro, if it is known; else its white noise is taken from the samples
-    false_refusal_rate : how often a good calibration is refused, if the noise is as given
-
-    Raises
-    ------
-    DataRefused : too few samples, motion, or drift
-
+    The rest lasts at least 75 % of the length in the limits. Without a known noise its white noise
+    is taken from the samples; `false_refusal_rate` tells how often a good calibration is refused,
+    if the noise is as given.
     """
     duration = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     if duration < 0.75 * limits.rest_duration or len(time) < 10:
@@ -529,20 +457,10 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     bias. The samples after the motion show it, even where the robot still settles: its response
     to the profile is fitted together with the rest. A turn that they do not show, of a prior
     deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
-    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn.
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : of the gyro as it went into the fit, rad/s, shape (n,)
-    fit : without a check by a rest; returned unchanged where fewer than 10 samples follow the
-        motion or the robot drives on, of a measured reference, or without a covariance
-    reference : as in `self_calibrate`
-
-    Raises
-    ------
-    DataRefused : the robot turned throughout the motion, or goes on turning after it
-
+    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn. The fit
+    is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
+    a measured reference, and without a covariance. It is refused where the robot turned throughout
+    the motion, or goes on turning after it.
     """
     limits = RunLimits()
     reference = default_reference_errors(motion) if reference is None else reference
@@ -554,7 +472,16 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
         return fit
     with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
                                   np.append(motion.rate, 0.0))
-    turn_end = _find_turn_end(time[time > end], rate[time > end]) or end
+    # the robot may turn on until the mean rate of the rest changes beyond white noise
+    turn_end, after, rest = end, time[time > end], rate[time > end]
+    count = np.arange(5, len(rest) - 4)
+    if len(count):
+        before = np.cumsum(rest)[count - 1]
+        changes = np.abs(before / count - (rest.sum() - before) / (len(rest) - count))
+        change_sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rest) - count))
+        best = int(np.argmax(change_sigmas))
+        if change_sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rest, 1):
+            turn_end = float(after[count[best]])
     at_rest = _fit_likelihood(
         time, rate, with_rest, limits.max_time_offset, reference.scale_deviation,
         (turn_end - max(fit.time_offset, 0.0), limits.max_bias))
@@ -580,32 +507,14 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
 
 
-def _find_turn_end(time: Array, rate: Array) -> float | None:
-    """Return the time in a rest at which its mean rate changes beyond white noise, s, if any."""
-    count = np.arange(5, len(rate) - 4)
-    if not len(count):
-        return None
-    before = np.cumsum(rate)[count - 1]
-    changes = np.abs(before / count - (rate.sum() - before) / (len(rate) - count))
-    sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rate) - count))
-    best = int(np.argmax(sigmas))
-    return (float(time[count[best]])
-            if sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rate, 1) else None)
-
-
 def rest_variance(noise: Noise, duration: float, white_deviation: float,
                   half_difference: float) -> float:
     """
     Return the variance of a mean at rest about the bias, (rad/s)².
 
-    A robot that settles in the first half of the rest moves the mean by half of the change.
-
-    Parameters
-    ----------
-    duration : of the rest, s
-    white_deviation : standard deviation of the mean by the white noise of the samples, rad/s
-    half_difference : by how much the means of both halves differ, rad/s
-
+    Given are the duration, s, the deviation of the mean by the white noise of the samples, and by
+    how much the means of both halves differ, rad/s: a robot that settles in the first half of the
+    rest moves the mean by half of the change.
     """
     return (max(white_deviation, noise.angle_random_walk / math.sqrt(duration)) ** 2
             + float(noise.mean_change_variance(duration, duration)) + 0.25 * half_difference ** 2)
@@ -613,22 +522,14 @@ def rest_variance(noise: Noise, duration: float, white_deviation: float,
 
 def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[Array, Array]:
     """
-    Combine a run with the rest after it.
+    Return derivatives of (s, b) by the rate at rest, shape (2,), and their covariance, (2, 2).
 
-    The error of a run may exceed its stated deviation: by a slip, a turn by hand, or another
-    response of the robot. That and a run as stated have even odds before the rest is seen. The
-    ratio of that error to the stated deviation has a half-Cauchy prior with a median of 1.
-
-    Parameters
-    ----------
-    covariance : of (s, b) by the run, shape (2, 2)
-    rate, variance : mean of the output at rest less the bias of the run, rad/s, and the variance
-        of that mean, (rad/s)²
-
-    Returns
-    -------
-    derivatives of s and b by that rate, shape (2,), and their covariance, shape (2, 2)
-
+    The rest after a run is combined with the covariance of (s, b) by the run, shape (2, 2). The
+    rate is the mean of the output at rest less the bias of the run, rad/s; its variance is that of
+    the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a turn by
+    hand, or another response of the robot. That and a run as stated have even odds before the rest
+    is seen. The ratio of that error to the stated deviation has a half-Cauchy prior with a median
+    of 1.
     """
     stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
@@ -655,12 +556,6 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     It begins later, by up to its length in the limits, where the robot still moves then, as after
     an overshoot. It lasts until the robot moves, at most as long as the motion did. None where
     the log ends before, or the robot drives on.
-
-    Parameters
-    ----------
-    time : s since the start of the motion, shape (n,)
-    rate : of the gyro as it went into the fit, rad/s, shape (n,)
-
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
@@ -694,11 +589,6 @@ def _half_difference(rate: Array) -> float:
     return abs(ended - begun)
 
 
-#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
-#: which the robot is driving, rad/s.
-SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
-
-
 def _deviation_of_mean(rate: Array) -> float:
     """Return the standard deviation of a mean at rest by white noise, rad/s."""
     return white_noise_deviation(rate, 1) / math.sqrt(len(rate))
@@ -710,19 +600,8 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
     Return the bias of a gyro at rest and its standard deviation, rad/s.
 
     See Ojeda et al., eq. 1, or 15 for compensated rates. The mean includes the Earth's rate about
-    the axis. A slow and steady turn looks like a bias; only the limit on the bias excludes it.
-
-    Parameters
-    ----------
-    time : s, shape (n,)
-    rate : compensated by the model, rad/s, shape (n,)
-    noise : of the gyro, if it is known; it gives the smallest standard deviation of the mean
-    output : of the gyro before its model, where that differs, shape (n,); it shows a dead gyro
-
-    Raises
-    ------
-    DataRefused : too few samples, a dead gyro, motion, or a mean that is no bias
-
+    the axis. A slow and steady turn looks like a bias; only the limit on the bias excludes it. The
+    noise gives the smallest standard deviation of the mean.
     """
     refuse_samples(time, rate, limits, output)
     parts = np.array_split(rate, 10)

@@ -49,7 +49,7 @@ FALSE_REFUSAL_RATE = 1e-4
 
 
 @dataclass(frozen=True)
-class TurnCalibration:
+class _TurnCalibration:
     """The result of a calibration by whole turns."""
 
     fit: ScaleBiasFit  # s and b with their covariance
@@ -61,28 +61,19 @@ class TurnCalibration:
 def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
                     limits: RunLimits = RunLimits(), noise: Noise = Noise(),
                     mark_deviation: float = MARK_DEVIATION,
-                    output: Array | None = None) -> TurnCalibration:
+                    output: Array | None = None) -> _TurnCalibration:
     """
     Find scale factor error and bias from whole turns between two rests on one mark.
 
     The rates of the turns do not matter, only the net number of turns. The number is accepted only
     where the gyro agrees to less than `_MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
-    factor error needs few turns.
+    factor error needs few turns. Arguments and `DataRefused` are those of `self_calibrate`.
 
     Parameters
     ----------
-    time : s, shape (n,)
-    rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
     turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
         factor error up to `_MAX_COUNTING_SCALE_ERROR`
-    noise : of the gyro, if it is known; the standard deviations include the wander of the bias
     mark_deviation : standard deviation of the angle between the two rests on the mark, rad
-    output : of the gyro before its model, where that differs, shape (n,)
-
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
-
     """
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
@@ -91,15 +82,44 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
                         noise.angle_random_walk ** 2)
     begin, end = _find_turns(time, rate, white_density)
     rest_durations, duration = (float(begin - time[0]), float(time[-1] - end)), end - begin
-    bias, variance = _compare_rests(
-        (float(rate[time <= begin].mean()), float(rate[time >= end].mean())),
-        white_density / rest_durations[0] + white_density / rest_durations[1],
-        noise.mean_change_variance(duration, min(rest_durations)), limits)
+    means = float(rate[time <= begin].mean()), float(rate[time >= end].mean())
+    # variances of their difference by white noise, and by the wander of the bias
+    of_white = white_density / rest_durations[0] + white_density / rest_durations[1]
+    of_wander = noise.mean_change_variance(duration, min(rest_durations))
+    difference, deviation = means[1] - means[0], math.sqrt(of_white + of_wander)
+    if abs(difference) > max(-float(ndtri(0.5 * FALSE_REFUSAL_RATE)) * deviation,
+                             limits.max_rest_rate):
+        raise DataRefused(
+            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
+            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
+            'both ends, or the gyro still warms up; wait, and run again')
+    bias, variance = 0.5 * (means[0] + means[1]), 0.25 * of_white + 0.5 * of_wander
+    refuse_bias(bias, limits, 'let the robot rest at both ends')
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
-    count = _count_turns(gyro_angle / math.tau, turns, limits)
+    # the number of turns
+    measured = gyro_angle / math.tau
+    count = round(measured) if turns is None else turns
+    if not count:
+        raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
+                          'turn once at least, all in one direction or nearly so')
+    if turns is None and _MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
+        raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
+                          f'off by {100 * _MAX_COUNTING_SCALE_ERROR:g} %: give the number of '
+                          'turns')
+    scale = measured / count
+    if turns is not None:
+        # another unit or sign explains the scale; a factor of two may be a wrong count
+        if abs(scale - 1.0) > limits.max_scale_factor_error and not 0.4 < abs(scale) < 2.5:
+            refuse_unit_error(scale, '')
+        refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
+                     "else set the driver's parameter invert")
+    if abs(measured - count) > (_MAX_COUNT_ERROR if turns else _MAX_COUNTING_SCALE_ERROR
+                                * abs(count)):
+        given = f', and {turns} were given' if turns else ''
+        raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '
+                          'whole number; close the turns on the mark, count them, or make fewer')
     true_angle = count * math.tau
-    scale = gyro_angle / true_angle
     if abs(scale - 1.0) > limits.max_scale_factor_error:
         raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
@@ -108,8 +128,8 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
                       + (scale * mark_deviation) ** 2)
     shared = -variance * duration / true_angle
     covariance = np.array([[angle_variance / true_angle ** 2, shared], [shared, variance]])
-    return TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
-                           rest_durations)
+    return _TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
+                            rest_durations)
 
 
 def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, float]:
@@ -131,49 +151,3 @@ def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, 
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and does the gyro respond?')
     return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
-
-
-def _compare_rests(means: tuple[float, float], difference_variance: float,
-                   wander_variance: float, limits: RunLimits) -> tuple[float, float]:
-    """
-    Return the bias by two rests, rad/s, and its variance, or refuse rests that differ.
-
-    The variances, (rad/s)², of the difference of the means are those by white noise and by the
-    wander of the bias.
-    """
-    difference, deviation = means[1] - means[0], math.sqrt(difference_variance + wander_variance)
-    if abs(difference) > max(-float(ndtri(0.5 * FALSE_REFUSAL_RATE)) * deviation,
-                             limits.max_rest_rate):
-        raise DataRefused(
-            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
-            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
-            'both ends, or the gyro still warms up; wait, and run again')
-    bias = 0.5 * (means[0] + means[1])
-    refuse_bias(bias, limits, 'let the robot rest at both ends')
-    return bias, 0.25 * difference_variance + 0.5 * wander_variance
-
-
-def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
-    """Return the number of turns, or refuse an angle that is no whole number of turns."""
-    count = round(measured) if turns is None else turns
-    if not count:
-        raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
-                          'turn once at least, all in one direction or nearly so')
-    if turns is None and _MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
-        raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
-                          f'off by {100 * _MAX_COUNTING_SCALE_ERROR:g} %: give the number of '
-                          'turns')
-    if turns is not None:
-        # another unit or sign explains the scale; a factor of two may be a wrong count
-        scale = measured / turns
-        if (abs(scale - 1.0) > limits.max_scale_factor_error
-                and not 0.4 < abs(scale) < 2.5):
-            refuse_unit_error(scale, '')
-        refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
-                     "else set the driver's parameter invert")
-    if abs(measured - count) > (_MAX_COUNT_ERROR if turns else _MAX_COUNTING_SCALE_ERROR
-                                * abs(count)):
-        given = f', and {turns} were given' if turns else ''
-        raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '
-                          'whole number; close the turns on the mark, count them, or make fewer')
-    return count

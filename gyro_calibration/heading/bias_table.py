@@ -39,7 +39,7 @@ import hashlib
 import json
 import math
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from gyro_calibration.files import describe_error, keep_aside, to_printable, write_atomically
 from gyro_calibration.logs.log import Array, DEGREE, Number
@@ -107,9 +107,6 @@ class Jump:
     time: float
 
 
-_Dated = TypeVar('_Dated', Entry, Jump)
-
-
 class BiasTable:
     """Biases at rest over temperature, of one gyro behind one model with a digest."""
 
@@ -133,12 +130,10 @@ class BiasTable:
 
     def shift_clock(self, step: float) -> None:
         """Correct the dates since this table began for a clock that was set by a step, s."""
-        self.entries, self._held_entries = ([self._shift_time(each, step) for each in rows]
-                                            for rows in (self.entries, self._held_entries))
-        self.jumps = [self._shift_time(each, step) for each in self.jumps]
-
-    def _shift_time(self, row: _Dated, step: float) -> _Dated:
-        return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first_run else row
+        for name in ('entries', 'jumps', '_held_entries'):
+            setattr(self, name, [
+                replace(each, time=max(each.time + step, 0.0)) if each.run >= self._first_run
+                else each for each in getattr(self, name)])
 
     def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
         """
@@ -157,34 +152,28 @@ class BiasTable:
             self._held_entries.clear()
             self._add_entry(given)
             return ''
-        self._held_entries = [each for each in self._held_entries
-                              if self._is_consistent(each, given)] + [given]
+        # of those held back, the ones that agree with this one
+        self._held_entries = [each for each in self._held_entries if abs(
+            bias - each.bias) <= OUTLIER_SIGMAS * math.sqrt(
+                each.variance + variance + self._wander_variance(time - each.time)
+                + self._prior.coefficient ** 2 * _mean_square_change(
+                    temperature - each.temperature, self._prior.correlation_length))] + [given]
         off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
                f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
         if len(self._held_entries) < _JUMP_ESTIMATES:
             self.held_back_count += 1
             return f'a bias that is {off} is not used: check whether the robot turned slowly'
-        self._add_jump((bias - before) ** 2)
-        return (f'the bias jumped: {_JUMP_ESTIMATES} rests in a row are {off}; earlier entries '
-                'are shifted')
-
-    def _is_consistent(self, held: Entry, given: Entry) -> bool:
-        variance = (held.variance + given.variance + self._wander_variance(given.time - held.time)
-                    + self._prior.coefficient ** 2 * _mean_square_change(
-                        given.temperature - held.temperature, self._prior.correlation_length))
-        return abs(given.bias - held.bias) <= OUTLIER_SIGMAS * math.sqrt(variance)
-
-    def _add_jump(self, variance: float) -> None:
-        """Add a jump at all temperatures, and the estimates held back for it."""
         self.held_back_count -= _JUMP_ESTIMATES - 1
         self.run += 1
-        self.jumps.append(Jump(self.run, variance, self._held_entries[0].time))
+        self.jumps.append(Jump(self.run, (bias - before) ** 2, self._held_entries[0].time))
         if len(self.jumps) > MAX_ENTRIES:
             first, second, *others = self.jumps
             self.jumps = [replace(second, variance=first.variance + second.variance), *others]
         for each in self._held_entries:
             self._add_entry(replace(each, run=self.run))
         self._held_entries.clear()
+        return (f'the bias jumped: {_JUMP_ESTIMATES} rests in a row are {off}; earlier entries '
+                'are shifted')
 
     def _add_entry(self, given: Entry) -> None:
         for place, entry in enumerate(self.entries):
@@ -264,14 +253,21 @@ class BiasTable:
         here, made = calibration.temperature, time - age
         if here is None:
             here = self._model.reference_temperature if temperature is None else temperature
+        run: float = self.run
+        if not this_run or any(each.time > made for each in self.jumps):
+            # that of an entry of about this time, else a number between the jumps around it
+            after = max([-1, *(each.run for each in self.jumps if each.time <= made)])
+            until = min([run, *(each.run for each in self.jumps if each.time > made)])
+            near = {abs(each.time - made): each.run for each in self.entries
+                    if after <= each.run < until and abs(each.time - made) < AGE_TOLERANCE}
+            run = near[min(near)] if near else after + 0.5
         why = ('at a temperature that is not known'
                if calibration.temperature is None or temperature is None
                else f'at {here:.1f} degC, and now it is {temperature:.1f} degC')
         entry = Entry(
             here, calibration.bias,
             own + (self._unknown_variance() if calibration.temperature is None else 0.0), made,
-            self.run if this_run and not any(each.time > made for each in self.jumps)
-            else self._run_at(made))
+            run)
         bias, variance, weight = self._predict_with_weight(
             [*self.entries, entry], here if temperature is None else temperature, time)
         if temperature is None:
@@ -282,14 +278,6 @@ class BiasTable:
             f'{math.sqrt(own) / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
         covariance = (of_scale, weight * shared), (weight * shared, variance)
         return replace(calibration, bias=bias, covariance=covariance), message
-
-    def _run_at(self, time: float) -> float:
-        """Return the run of a time, or a number between the jumps before and after it."""
-        after = max([-1, *(each.run for each in self.jumps if each.time <= time)])
-        until = min([self.run, *(each.run for each in self.jumps if each.time > time)])
-        near = {abs(each.time - time): each.run for each in self.entries
-                if after <= each.run < until and abs(each.time - time) < AGE_TOLERANCE}
-        return near[min(near)] if near else after + 0.5
 
     def _unknown_variance(self) -> float:
         """Return the variance of the bias, (rad/s)², where the model has no temperature."""
@@ -315,23 +303,10 @@ class BiasTable:
     def _posterior_at(self, entries: Sequence[Entry], temperature: float,
                       time: float) -> _Posterior:
         """Return the estimates of the bias in this run, now, at a temperature."""
-        covariance = self._covariance(entries, temperature, time)
-        rests = np.array([each.bias - entries[0].bias for each in entries])
-        inverse = np.linalg.inv(covariance)
-        of_ones, of_rests = inverse.sum(axis=2), inverse @ rests
-        information = of_ones.sum(axis=1)
-        mean = of_rests.sum(axis=1) / information
-        misfit = of_rests @ rests - mean ** 2 * information
-        logarithms = -0.5 * (np.linalg.slogdet(covariance)[1] + np.log(information) + misfit)
-        likely = _SIZE_PROBABILITIES * np.exp(logarithms - logarithms.max())
-        return _Posterior(likely / likely.sum(), mean, information, of_ones,
-                          of_rests - mean[:, None] * of_ones, inverse)
-
-    def _covariance(self, entries: Sequence[Entry], temperature: float, time: float) -> Array:
-        """Return the covariance of the errors of entries now, (rad/s)², shape (sizes, n, n)."""
-        temperatures, variances, times, runs = (
+        temperatures, variances, times, runs, biases = (
             np.array([getattr(each, name) for each in entries])
-            for name in ('temperature', 'variance', 'time', 'run'))
+            for name in ('temperature', 'variance', 'time', 'run', 'bias'))
+        # covariance of the errors of the entries now, (rad/s)², shape (sizes, n, n)
         age, runs_apart = np.abs(time - times), _pairwise_differences(runs) != 0.0
         by_temperature = _covariance_of_differences(
             self._temperature_variance(temperature, temperatures),
@@ -346,7 +321,18 @@ class BiasTable:
             fixed += jump.variance * np.outer(runs < jump.run, runs < jump.run)
         by_run = (self._prior.turn_on ** 2
                   * _covariance_of_differences(2.0 * (runs != self.run), 2.0 * runs_apart))
-        return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
+        covariance = fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run)
+
+        # generalized least squares, and the restricted likelihood of each of the sizes
+        rests, inverse = biases - biases[0], np.linalg.inv(covariance)
+        of_ones, of_rests = inverse.sum(axis=2), inverse @ rests
+        information = of_ones.sum(axis=1)
+        mean = of_rests.sum(axis=1) / information
+        misfit = of_rests @ rests - mean ** 2 * information
+        logarithms = -0.5 * (np.linalg.slogdet(covariance)[1] + np.log(information) + misfit)
+        likely = _SIZE_PROBABILITIES * np.exp(logarithms - logarithms.max())
+        return _Posterior(likely / likely.sum(), mean, information, of_ones,
+                          of_rests - mean[:, None] * of_ones, inverse)
 
     def is_write_due(self, now: float, ending: bool = False) -> bool:
         """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
@@ -478,7 +464,12 @@ def write_bias_table(path: str | Path, table: BiasTable,
     A file in its place that is unreadable or not of this model is kept under another name, in a
     sentence that is returned first, else ''. Raise `OSError` where the folder is not writable.
     """
-    message = _keep_aside(Path(path), table.digest)
+    path = Path(path)
+    try:
+        is_ours = not path.exists() or _read_file(path)[0] == table.digest
+    except (OSError, ValueError, TypeError, KeyError, OverflowError):
+        is_ours = False  # a file of unknown content is not overwritten
+    message = '' if is_ours else keep_aside(path)
     entries = [{'temperature': round(each.temperature, 3), 'bias': _round_digits(each.bias),
                 **_common_fields(each)} for each in table.entries]
     content = {'format': _FORMAT, 'version': _VERSION, 'model': table.digest, 'entries': entries,
@@ -486,15 +477,6 @@ def write_bias_table(path: str | Path, table: BiasTable,
     written = write_atomically(path, (_HEADER + format_settings(content)).encode())
     table.mark_written(now)
     return message, written
-
-
-def _keep_aside(path: Path, digest: str) -> str:
-    try:
-        if not path.exists() or _read_file(path)[0] == digest:
-            return ''
-    except (OSError, ValueError, TypeError, KeyError, OverflowError):
-        pass  # a file of unknown content is not overwritten
-    return keep_aside(path)
 
 
 def _read_file(path: Path) -> tuple[str, list[Entry], list[Jump]]:

@@ -62,17 +62,6 @@ class Assumptions:
         return (self.scale_factor_error ** 2, 0.0), (0.0, self.bias ** 2)
 
 
-def _with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroModel:
-    """Return the model with an assumed covariance in its self-calibration if it has none."""
-    calibration = model.self_calibration
-    if calibration is None:
-        return (model if model.covariance is not None else with_self_calibration(
-            model, SelfCalibration(covariance=assumptions.covariance)))
-    if calibration.covariance is not None and np.isfinite(calibration.covariance).all():
-        return model
-    return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
-
-
 @dataclass
 class _RestStretch:
     """Samples at rest, as sums."""
@@ -159,9 +148,36 @@ class HeadingEstimator:
 
     def _restart(self, now: float, is_fresh: bool = False) -> None:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
-        self._calibration_message = ''
-        self.current_model, age = ((_with_assumed_covariance(self.model, self._assumptions), 0.0)
-                                   if is_fresh else self._propagated_model(now))
+        model, here, self._calibration_message = self.model, self._known_temperature, ''
+        calibration, assumed = model.self_calibration, self._assumptions.covariance
+        if calibration is None and model.covariance is None:
+            calibration = SelfCalibration(covariance=assumed)
+        elif calibration is not None and (calibration.covariance is None
+                                          or not np.isfinite(calibration.covariance).all()):
+            calibration = replace(calibration, covariance=assumed)
+        if calibration is not model.self_calibration:
+            model = with_self_calibration(model, calibration)
+        age: float | None = 0.0
+        if not is_fresh and calibration is None:
+            if here is None or not self.table.entries:
+                age = None
+            else:  # the bias of earlier runs
+                bias, variance = self.table.predict(here, now)
+                model = with_self_calibration(
+                    model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance))))
+        elif (not is_fresh and self.model.self_calibration is None
+              and not self.table.entries):
+            age = None
+        elif calibration is not None and not is_fresh:
+            calibration, self._calibration_message = self.table.propagate_calibration(
+                calibration, self.age(now), now, here, self.is_calibrated_this_run)
+            model = with_self_calibration(model, calibration)
+            if (self._dated_age(now) or 0.0) < -AGE_TOLERANCE:
+                self._calibration_message = (
+                    f'the calibration is dated {calibration.time}, which is later than the clock '
+                    'of this computer: its age is not known and taken for a year; set the clock, '
+                    'or calibrate again')
+        self.current_model = model
         self.covariance: Array = block_diag(self._assumptions.bias_temperature_coefficient ** 2,
                                             uncertainty_covariance(self.current_model))
         temperature = self.model.reference_temperature
@@ -191,41 +207,6 @@ class HeadingEstimator:
         self._follows_temperature = here is not None
         self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
                             if here is not None and coefficient else None)
-
-    def _resume_temperature(self, now: float, around: Channels | None) -> None:
-        """Continue at the first temperature with a calibration of this run made without one."""
-        # It was made after the model at the temperature that was assumed up to the last sample.
-        # The different output of the model at the present temperature is not a change of the rate.
-        here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
-        last = self.last_compensated.temperature
-        before = None if around is None else replace(around, temperature=last)
-        held = compensate(self.current_model, 0.0, last, before).model_rate
-        self._bias_shift = float(here) - float(held)
-        self._unobserved_distance = _lost_temperature_distance(self._time - self._unknown_since)
-        self._start_correction(now)
-
-    def _propagated_model(self, now: float) -> tuple[GyroModel, float | None]:
-        """Return the model to compensate with, and the age of its self-calibration, s, or None."""
-        model = _with_assumed_covariance(self.model, self._assumptions)
-        calibration = model.self_calibration
-        if calibration is None:
-            here = self._known_temperature
-            if here is None or not self.table.entries:
-                return model, None
-            # the bias of earlier runs
-            bias, variance = self.table.predict(here, now)
-            return with_self_calibration(
-                model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
-        if self.model.self_calibration is None and not self.table.entries:
-            return model, None
-        calibration, self._calibration_message = self.table.propagate_calibration(
-            calibration, self.age(now), now, self._known_temperature, self.is_calibrated_this_run)
-        if (self._dated_age(now) or 0.0) < -AGE_TOLERANCE:
-            self._calibration_message = (
-                f'the calibration is dated {calibration.time}, which is later than the clock of '
-                'this computer: its age is not known and taken for a year; set the clock, or '
-                'calibrate again')
-        return with_self_calibration(model, calibration), 0.0
 
     @property
     def calibration_message(self) -> str:
@@ -320,10 +301,27 @@ class HeadingEstimator:
         goes_on = self.is_calibrated_this_run and last > -math.inf
         if self._age_changed or known_again and not goes_on:
             self._restart(now)
-        around = (self._follow_channels(time - last, force, supply)
-                  if self.current_model.needs_history else None)
+        around = None
+        if self.current_model.needs_history:
+            # Time increases with the stamps, also over gaps, and is constant when they jump back.
+            # The heading is that of the tracker without its resets, extrapolated to this sample.
+            interval = max(time - last, 0.0) if last > -math.inf else 0.0
+            self._elapsed += interval
+            ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
+            around = self._history.update(
+                self._elapsed, self.temperature, force, supply,
+                heading=self.heading_before_resets + self.tracker.heading + ahead)
         if known_again and goes_on:
-            self._resume_temperature(now, around)
+            # This run's calibration was made without a temperature, after the model at the one
+            # that was assumed up to the last sample. The different output of the model at the
+            # present temperature is not a change of the rate.
+            assumed = self.last_compensated.temperature
+            before = None if around is None else replace(around, temperature=assumed)
+            here, held = (float(compensate(self.current_model, 0.0, degc, channels).model_rate)
+                          for degc, channels in ((self.temperature, around), (assumed, before)))
+            self._bias_shift = here - held
+            self._unobserved_distance = _lost_temperature_distance(time - self._unknown_since)
+            self._start_correction(now)
         self.last_compensated = result = compensate(self.current_model, output, self.temperature,
                                                     around)
         change, distance = self._bias_change(time, self.temperature, self._temperature_lateness)
@@ -347,7 +345,7 @@ class HeadingEstimator:
             self._add_to_table(now, True)
         return message
 
-    def is_plausible(self, time: float, output: float, force: float | None = None) -> bool:
+    def is_plausible(self, time: float, output: float, force: float | None) -> bool:
         """Tell whether a sample is plausible for the gyro; `add` refuses others, and any nan."""
         limit = self.current_model.rate_limit
         return (-limit <= output <= limit and -MAX_TIME <= time <= MAX_TIME
@@ -382,18 +380,6 @@ class HeadingEstimator:
         """Return the time since the temperature is too old, s."""
         return abs(self._time - self._temperature_time) - TEMPERATURE_TIMEOUT
 
-    def _follow_channels(self, interval: float, force: float | None,
-                         supply: float | None) -> Channels:
-        """Return the channels of effects other than rate, output and temperature."""
-        # Time increases with the stamps, also over gaps, and is constant when they jump back. The
-        # heading is that of the tracker without its resets, extrapolated to this sample.
-        interval = max(interval, 0.0) if interval < math.inf else 0.0
-        self._elapsed += interval
-        ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
-        return self._history.update(
-            self._elapsed, self.temperature, force, supply,
-            heading=self.heading_before_resets + self.tracker.heading + ahead)
-
     # A whole log
 
     def follow(self, time: Array, output: Array, start_time: float,
@@ -409,7 +395,23 @@ class HeadingEstimator:
         """
         found, place = np.empty((len(time), 8)), 0
         while place < len(time):
-            end = self._end_of_even_part(time, output, temperature, place)
+            # up to where model, table or temperature correction may change
+            end = place
+            if not (self.current_model.needs_history or self._time == -math.inf
+                    or self._age_changed or self._follows_temperature == (temperature is None)
+                    or temperature is None and self.temperature is not None):
+                # a complete stretch of rest may restart the tracker
+                begin = self._stretch.start_time if self._stretch else float(time[place])
+                end += int(np.searchsorted(time[place:], begin + REST_DURATION - TIME_TOLERANCE))
+                end = min(end + (self._stretch is not None), len(time),
+                          place + CACHE_BLOCK_SAMPLES)
+                rows, limit = slice(place, end), self.current_model.rate_limit
+                known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= MAX_TIME)
+                if temperature is not None:
+                    coldest, hottest = self.model.temperature_limits
+                    known &= (coldest <= temperature[rows]) & (temperature[rows] <= hottest)
+                if not known.all():
+                    end = place + int(np.argmin(known))
             if end > place:
                 rows = slice(place, end)
                 self._follow_even_samples(time[rows], output[rows],
@@ -435,24 +437,6 @@ class HeadingEstimator:
                 found[place - 1, [1, 3]] = self.tracker.variance, self.tracker.rate_variance
         return found
 
-    def _end_of_even_part(self, time: Array, output: Array, temperature: Array | None,
-                          place: int) -> int:
-        """Return the end of the samples with the same model, table and temperature correction."""
-        if (self.current_model.needs_history or self._time == -math.inf or self._age_changed
-                or self._follows_temperature == (temperature is None)
-                or temperature is None and self.temperature is not None):
-            return place
-        # a complete stretch of rest may restart the tracker
-        begin = self._stretch.start_time if self._stretch else float(time[place])
-        end = int(np.searchsorted(time[place:], begin + REST_DURATION - TIME_TOLERANCE)) + place
-        end = min(end + (self._stretch is not None), len(time), place + CACHE_BLOCK_SAMPLES)
-        rows, limit = slice(place, end), self.current_model.rate_limit
-        known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= MAX_TIME)
-        if temperature is not None:
-            coldest, hottest = self.model.temperature_limits
-            known &= (coldest <= temperature[rows]) & (temperature[rows] <= hottest)
-        return end if known.all() else place + int(np.argmin(known))
-
     def _follow_even_samples(self, time: Array, output: Array, temperature: Array | None,
                              wheels: Sequence[bool | None] | None, found: Array) -> None:
         """Take plausible samples, at most up to the end of a stretch of rest."""
@@ -468,8 +452,21 @@ class HeadingEstimator:
         calibration = used.self_calibration
         scale = 1.0 if calibration is None else calibration.scale
         rate = np.asarray(result.rate) - change * scale
-        still, moving = self._held_sensitivities(time, output, result, distance)
-        found[:, :5] = tracker.follow(time, rate, moving, wheels, still)
+        # the sensitivities at rest and in motion, as `add` holds them, (n, m) each
+        places = [place for place, at in enumerate(time.tolist()) if self._is_outdated(at)]
+        counts, degc = np.diff([0, *places, len(time)]), result.temperature
+        if isinstance(degc, np.ndarray):
+            degc = degc[places]
+        held = list[Array]()
+        for before, seen in ((self._rest_sensitivity, np.zeros(len(time))),
+                             (self._sensitivity, np.asarray(result.rate))):
+            rows = before[None]
+            if places:
+                rows = np.concatenate([rows, self._uncertain_sensitivity(
+                    output[places], seen[places], degc, None, distance[places]).T])
+            held.append(np.repeat(rows, counts, axis=0))
+        self._rest_sensitivity, self._sensitivity = held[0][-1], held[1][-1]
+        found[:, :5] = tracker.follow(time, rate, held[1], wheels, held[0])
         found[:, 5], found[:, 6] = rate, result.temperature_clipped
         found[:, 7] = result.beyond_range
         self.last_compensated = CompensatedSamples(
@@ -486,24 +483,6 @@ class HeadingEstimator:
             self._extend_stretch(float(time[first]), self._time, len(time) - first,
                                  float(np.sum(result.model_rate[first:])),
                                  float(temperature[first:].sum()))
-
-    def _held_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
-                            distance: Array) -> list[Array]:
-        """Return the sensitivities at rest and in motion, as `add` holds them, (n, m) each."""
-        places = [place for place, at in enumerate(time.tolist()) if self._is_outdated(at)]
-        counts, temperature = np.diff([0, *places, len(time)]), result.temperature
-        if isinstance(temperature, np.ndarray):
-            temperature = temperature[places]
-        held = list[Array]()
-        for last, rate in ((self._rest_sensitivity, 0.0 * output),
-                           (self._sensitivity, np.asarray(result.rate))):
-            rows = last[None]
-            if places:
-                rows = np.concatenate([rows, self._uncertain_sensitivity(
-                    output[places], rate[places], temperature, None, distance[places]).T])
-            held.append(np.repeat(rows, counts, axis=0))
-        self._rest_sensitivity, self._sensitivity = held[0][-1], held[1][-1]
-        return held
 
     # The bias at rest for the next run
 
@@ -540,8 +519,16 @@ class HeadingEstimator:
                                  for total in (stretch.rate_sum, stretch.temperature_sum))
             variance = (self.current_model.noise.angle_random_walk ** 2 / REST_DURATION
                         + self.tracker.bias_ambiguity ** 2)
-            expected, deviation = self._expected_bias(temperature, stretch.sensitivity)
-            if abs(bias - expected) > OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
+            # That by the tracker at present, after the model and before the self-calibration: by
+            # now the rest may be over, and the temperature may have changed.
+            calibration = self.current_model.self_calibration or SelfCalibration()
+            expected = calibration.bias + self._bias_shift
+            if self._correction is not None:
+                expected += float(self._correction.change_at(temperature)[0])
+            off, deviation = (value / calibration.scale
+                              for value in self.tracker.bias_for(stretch.sensitivity))
+            if abs(bias - expected - off) > OUTLIER_SIGMAS * math.sqrt(
+                    deviation ** 2 + variance):
                 continue
             message = self.table.add(temperature, bias, variance, now)
             self._table_message = message or self._table_message
@@ -550,17 +537,6 @@ class HeadingEstimator:
                     and abs(temperature - self._correction.start_temperature)
                     > Prior.correlation_length / 3.0):
                 self._restart(now)
-
-    def _expected_bias(self, temperature: float, seen: Array) -> tuple[float, float]:
-        """Return bias at a temperature and its deviation by the tracker at present, rad/s."""
-        # It is the bias after the model and before the self-calibration. When a stretch is tested,
-        # its rest may be over, and the temperature may have changed.
-        calibration = self.current_model.self_calibration or SelfCalibration()
-        change = self._bias_shift
-        if self._correction is not None:
-            change += float(self._correction.change_at(temperature)[0])
-        off, deviation = self.tracker.bias_for(seen)
-        return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 
 
 def _lost_temperature_distance(delay: float) -> float:

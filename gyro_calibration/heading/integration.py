@@ -44,6 +44,11 @@ MAX_RATE = 1e4
 _MAX_INTERVALS, _MIN_INTERVALS = 256, 16
 #: Share of short intervals in the memory above which stamps come in bursts.
 _MIN_BURST_SHARE = 0.1
+#: Longest gap in the stamps that is integrated, s, unless the samples are as far apart.
+MAX_GAP = 1.0
+#: Duration, s, of the rates that show how the robot moves in a gap, and in which a rate after a
+#: jump may be erroneous.
+RECENT_DURATION = 2.0
 
 
 class Intervals:
@@ -62,7 +67,17 @@ class Intervals:
         self._history.append(interval)
         self._until_update -= 1
         if not self._until_update:
-            self._update_usual_interval()
+            # the usual interval is the median, unless the stamps come in bursts
+            self._until_update = max(len(self._history) // 4, _MIN_INTERVALS)
+            steps = sorted(self._history)
+            mean = sum(steps) / len(steps)
+            usual = self._even_interval = steps[len(steps) // 2]
+            if steps[int(_MIN_BURST_SHARE * len(steps))] < SHORT_RATIO * mean:
+                # the longest may be gaps
+                self._even_interval = steps[-1 - len(steps) // 100]
+                usual = sum(min(step, self._even_interval) for step in steps) / len(steps)
+            self.usual_interval = max(usual, MIN_SAMPLE_INTERVAL)
+            self._gap_limit = self._even_interval + SHORT_RATIO * self.usual_interval
         return self.count_lost(interval)
 
     def add_many(self, intervals: Array) -> tuple[Array, Array]:
@@ -104,21 +119,8 @@ class Intervals:
             self._late_samples = 0
         return 0
 
-    def _update_usual_interval(self) -> None:
-        """Find the usual interval: the median, unless the stamps come in bursts."""
-        self._until_update = max(len(self._history) // 4, _MIN_INTERVALS)
-        steps = sorted(self._history)
-        mean = sum(steps) / len(steps)
-        usual = self._even_interval = steps[len(steps) // 2]
-        if steps[int(_MIN_BURST_SHARE * len(steps))] < SHORT_RATIO * mean:
-            # the longest may be gaps
-            self._even_interval = steps[-1 - len(steps) // 100]
-            usual = sum(min(step, self._even_interval) for step in steps) / len(steps)
-        self.usual_interval = max(usual, MIN_SAMPLE_INTERVAL)
-        self._gap_limit = self._even_interval + SHORT_RATIO * self.usual_interval
 
-
-def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[int]:
+def block_ends(intervals: Array, length: float, elapsed: float) -> list[int]:
     """
     Return the numbers of samples up to the ends of blocks of `length` s or slightly longer.
 
@@ -146,13 +148,6 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
     surplus = np.minimum(lost * usual, interval)
     return (interval ** 2 * np.maximum(step ** 2 - 2.0 * ends, 0.0) / 12.0,
             ends * surplus * (0.5 * surplus + usual))
-
-
-#: Longest gap in the stamps that is integrated, s, unless the samples are as far apart.
-MAX_GAP = 1.0
-#: Duration, s, of the rates that show how the robot moves in a gap, and in which a rate after a
-#: jump may be erroneous.
-RECENT_DURATION = 2.0
 
 
 def varied_variance(noise: Noise, usual: float, interval: float, time: Array,

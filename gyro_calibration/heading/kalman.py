@@ -75,7 +75,7 @@ class RateIntegral:
 
 @dataclass(frozen=True)
 class _Transition:
-    """_Transition of the state over some time, without the rotation itself."""
+    """Transition of the state over some time, without the rotation itself."""
 
     observation: Array  # of each component in the integral of the compensated rate, shape (n,)
     retention: Array  # decay factor of each component, shape (n,)
@@ -223,7 +223,7 @@ class HeadingState:
         return replace(self, mean=self.mean + gain * (heading - self.mean[HEADING_INDEX]),
                        covariance=self.covariance + (variance - own) * np.outer(gain, gain))
 
-    def with_heading(self, heading: float, variance: float = 0.0) -> HeadingState:
+    def with_heading(self, heading: float, variance: float) -> HeadingState:
         """Return the state with another heading, rad, and its variance, rad²."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[HEADING_INDEX] = heading

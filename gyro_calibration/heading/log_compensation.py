@@ -24,12 +24,9 @@ from gyro_calibration.heading.kalman import HEADING_INDEX, HeadingState, smooth_
 from gyro_calibration.heading.tracker import HeadingTracker, MAX_ACCELERATION, MAX_RATE_STEP
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, select_rows
 from gyro_calibration.model.compensation import compensate, CompensatedSamples, rate_sensitivity
-from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel, STEP_TOLERANCE
 import numpy as np
 from numpy.typing import NDArray
-
-_MAX_PASSES = 50  # largest number of the iteration of a heading
 
 
 class LogCompensation:
@@ -57,7 +54,24 @@ class LogCompensation:
                 np.zeros(len(log)) if log.time is None else log.time, log.temperature,
                 log.specific_force, log.supply, 0.0)
             if self._model.uses_channel('heading') and log.time is not None:
-                channels = self._iterate_heading(log, channels)
+                # compensate with a heading, and integrate the rates to the next heading
+                last_time, last_rate, begin = self._last_integration
+                carried = len(last_time)
+                time = np.concatenate([last_time, self.true_time(log.time)])
+                reference = np.append(np.full(carried, begin), np.full(len(log), np.nan)
+                                      if log.reference_heading is None else log.reference_heading)
+                known, heading = np.isfinite(reference), np.full(len(time), begin)
+                for _ in range(50):
+                    channels = replace(channels, heading=heading[carried:])
+                    rate = np.concatenate([last_rate, compensate(
+                        self._model, log.output, log.temperature, channels).rate])
+                    before, heading = heading, integrate(time, rate, begin)
+                    if known.any():
+                        heading += np.interp(time, time[known], (reference - heading)[known])
+                    if np.abs(heading - before).max() < STEP_TOLERANCE:
+                        break
+                self._last_integration = time[-1:], rate[-1:], float(heading[-1])
+                channels = replace(channels, heading=heading[carried:])
         result = compensate(self._model, log.output, log.temperature, channels)
         sensitivity = rate_sensitivity(self._model, log.output, result.rate, result.temperature,
                                        channels)
@@ -70,27 +84,6 @@ class LogCompensation:
             self._start_time = float(time[0])
         begin = self._start_time or 0.0
         return np.asarray(begin + self._model.true_time(time - begin))
-
-    def _iterate_heading(self, log: Log, channels: Channels) -> Channels:
-        """Iterate: compensate with a heading, and integrate the rates to the next heading."""
-        assert log.time is not None
-        last_time, last_rate, begin = self._last_integration
-        carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
-        reference = np.append(np.full(carried, begin), np.full(len(log), np.nan)
-                              if log.reference_heading is None else log.reference_heading)
-        known = np.isfinite(reference)
-        heading = np.full(len(time), begin)
-        for _ in range(_MAX_PASSES):
-            channels = replace(channels, heading=heading[carried:])
-            rate = np.concatenate([last_rate, compensate(
-                self._model, np.asarray(log.output), log.temperature, channels).rate])
-            before, heading = heading, integrate(time, rate, begin)
-            if known.any():
-                heading += np.interp(time, time[known], (reference - heading)[known])
-            if np.abs(heading - before).max() < STEP_TOLERANCE:
-                break
-        self._last_integration = time[-1:], rate[-1:], float(heading[-1])
-        return replace(channels, heading=heading[carried:])
 
 
 def plausible_rows(model: GyroModel, log: Log) -> Mask:
@@ -123,18 +116,6 @@ def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
     return select_rows(replace(log, others={}), rows)
 
 
-def _remove_spikes(time: Array, rate: Array) -> Array:
-    """Return rates with the outliers of the tracker interpolated, shape (n,)."""
-    jumps = np.abs(np.diff(rate)) > MAX_RATE_STEP + MAX_ACCELERATION * np.diff(time)
-    back = (np.abs(rate[2:] - rate[:-2]) <= MAX_RATE_STEP
-            + MAX_ACCELERATION * (time[2:] - time[:-2]))
-    spikes = np.flatnonzero(jumps[:-1] & back) + 1
-    if not len(spikes):
-        return rate
-    kept = np.delete(np.arange(len(rate)), spikes)
-    return np.interp(time, time[kept], rate[kept])
-
-
 def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
     """Return smoothed heading, rad, its variance, rad², and rest, shape (n,) each."""
     # The heading is the integral of the rates, with the correction interpolated between the steps.
@@ -162,7 +143,14 @@ def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
             step.rate_integral.wander[0] + step.state_before.noise.angle_random_walk ** 2
             * step.rate_integral.duration)) for step in steps] or [1.0])
     place = np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(share) - 1)
-    turned = integrate(time, _remove_spikes(time, rate))
+    # with the outliers of the tracker interpolated
+    jumps = np.abs(np.diff(rate)) > MAX_RATE_STEP + MAX_ACCELERATION * np.diff(time)
+    back = (np.abs(rate[2:] - rate[:-2]) <= MAX_RATE_STEP
+            + MAX_ACCELERATION * (time[2:] - time[:-2]))
+    kept = np.delete(np.arange(len(rate)), np.flatnonzero(jumps[:-1] & back) + 1)
+    if len(kept) < len(rate):
+        rate = np.interp(time, time[kept], rate[kept])
+    turned = integrate(time, rate)
     followed = turned - np.interp(time, ends, np.interp(ends, time, turned))
     resting = np.array([step.is_resting for step in steps] or [False])[place]
     return (np.interp(time, ends, heading) + share[place] * followed,

@@ -61,6 +61,10 @@ PRIOR_COUNTS[0] = 3.0
 _MAX_STRETCHES = 20.0
 #: Rates at which a straight way ends, 1/s, on average after the longest lag; a rest may last.
 ENDING_RATES = (SCATTER_RATIOS > 0.0) / MEAN_LAGS[-1]
+#: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
+_TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
+#: Time constant with which a pending correction of the heading is applied in motion, s.
+CORRECTION_TIME = 1.0
 
 
 @dataclass(slots=True)
@@ -100,10 +104,6 @@ def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
                      for each in degrees_of_freedom.tolist()])
 
 
-#: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
-_TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
-
-
 class EnergyDetector:
     """The energy of the last `WINDOW_DURATION` s."""
 
@@ -116,7 +116,7 @@ class EnergyDetector:
         self._ratios = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
         self._since_last_window = 0.0
         # of the next blocks: quiet, noise factor, and limit of the samples after it, rad/s
-        self._results = deque[tuple[bool | None, float, float]]()
+        self.results_ahead = deque[tuple[bool | None, float, float]]()
         self.configure(noise, false_alarms)
 
     def configure(self, noise: Noise, false_alarms: float) -> None:
@@ -129,12 +129,12 @@ class EnergyDetector:
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
         self._blocks.clear()
-        self._results.clear()
+        self.results_ahead.clear()
 
     def add(self, block: Block) -> bool | None:
         """Add a block; tell whether the window contains only noise; None until it is full."""
-        if self._results:
-            quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
+        if self.results_ahead:
+            quiet, self.noise_factor, self.sudden_limit = self.results_ahead.popleft()
             return quiet
         blocks = self._blocks
         blocks.append(block)
@@ -192,20 +192,15 @@ class EnergyDetector:
         return (mean_threshold_sigmas(round(interval, 9), self._sample_false_alarms)
                 * math.sqrt(variance))
 
-    @property
-    def has_results(self) -> bool:
-        """Tell whether results of the next blocks are known."""
-        return bool(self._results)
-
     def quiet_ahead(self, number: int) -> tuple[bool | None, float]:
         """Return whether a block ahead is quiet, and the limit of its samples."""
-        limit = self._results[number - 1][2] if number else self.sudden_limit
-        return self._results[number][0], limit
+        limit = self.results_ahead[number - 1][2] if number else self.sudden_limit
+        return self.results_ahead[number][0], limit
 
     def skip(self, count: int) -> None:
         """Add blocks that were looked at, without their results."""
         for _ in range(count):
-            _, self.noise_factor, self.sudden_limit = self._results.popleft()
+            _, self.noise_factor, self.sudden_limit = self.results_ahead.popleft()
 
     def look_ahead(self, blocks: Array) -> None:
         """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
@@ -241,7 +236,7 @@ class EnergyDetector:
                                                           self._false_alarm_chance)))
         self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
                              in sums[:5, begin[-1]:].T.tolist())
-        self._results.extend(
+        self.results_ahead.extend(
             (each, factor, self._sample_limit(*sampled)) if known
             else (None, factor, self.sudden_limit) for known, each, factor, *sampled in zip(
                 full.tolist(), quiet.tolist(), factors, interval.tolist(), variance.tolist()))
@@ -334,10 +329,6 @@ class SlowTurn:
     snapshot: Snapshot  # when it began
     rate: float  # rad/s
     rate_integral: RateIntegral  # since then
-
-
-#: Time constant with which a pending correction of the heading is applied in motion, s.
-CORRECTION_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -470,20 +461,18 @@ class EvenSamples:
             first = here.start - epoch.start_index
             found[here, 0] = (turned - pending)[first:]
             found[here, 1] = pending[first:] ** 2 + unknown
-        if moving:
-            self._add_variances(moving)
-
-    def _add_variances(self, epochs: list[Epoch]) -> None:
-        """Add the variance of the heading in epochs of motion."""
-        opens = [each for epoch in epochs for each in epoch.open_integrals]
-        states = [epoch.state for epoch in epochs for places, *_ in epoch.open_integrals
+        if not moving:
+            return
+        # the variance of the heading in motion
+        opens = [each for epoch in moving for each in epoch.open_integrals]
+        states = [epoch.state for epoch in moving for places, *_ in epoch.open_integrals
                   for _ in places]
         places, *turns = map(np.concatenate, zip(*opens))
-        known = heading_variances(states, *turns)
-        white = [state.noise.angle_random_walk ** 2 for state in states]
+        variances = heading_variances(states, *turns)
+        white = np.array([state.noise.angle_random_walk ** 2 for state in states])
         until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1
         rows = np.concatenate(
-            [np.arange(max(epoch.start_index, 0), epoch.end_index) for epoch in epochs])
+            [np.arange(max(epoch.start_index, 0), epoch.end_index) for epoch in moving])
         block = np.searchsorted(places, rows, side='right') - 1
-        self.results[rows, 1] += (known[block]
-                                  + np.array(white)[block] * (until[rows] - until[places[block]]))
+        found[rows, 1] += (variances[block]
+                           + white[block] * (until[rows] - until[places[block]]))

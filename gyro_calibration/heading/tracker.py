@@ -35,7 +35,7 @@ from gyro_calibration.heading.stationary import (
     Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
 from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
-    Array, CACHE_BLOCK_SAMPLES, DEGREE, Mask, MIN_SAMPLE_INTERVAL, Number)
+    Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, Number)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -145,12 +145,10 @@ class HeadingTracker:
         self._steady_rates: SteadyRates | None = SteadyRates(covariance)
         self._heading_begin_time = self._last_time
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
-        self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
+        self._open_integral = self._zero_integral
+        self._block_integral = replace(self._zero_integral)
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
-
-    def _new_integral(self) -> RateIntegral:
-        return RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
 
     def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
         """Go on with other settings."""
@@ -315,7 +313,14 @@ class HeadingTracker:
         if gap is None or lost:  # `_follow_piece` remembers the others
             self._remember([time], [rate])
         if self._detects_rest:
-            self._detect_motion(interval, last[1], wheels)
+            # sudden motion at each sample, and slower motion at the end of each block
+            self._block.add(interval, rate, last[1])
+            if self.is_resting and (wheels or abs(rate - self._rate_error(sensitivity))
+                                    > math.hypot(self._energy.sudden_limit, self._bias_margin)):
+                self._revert_to_motion(0.0)
+            self._wheels_moved = self._wheels_moved or bool(wheels)
+            if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
+                self._end_block(self._wheels_moved, wheels)
         elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
             self._close_block()
             if self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
@@ -351,46 +356,38 @@ class HeadingTracker:
                         else np.broadcast_to(still, sensitivity.shape))
         found, begin = np.empty((len(time), 5)), 0
         while begin < len(time):
-            count = self._count_even(time[begin:begin + CACHE_BLOCK_SAMPLES],
-                                     rate[begin:begin + CACHE_BLOCK_SAMPLES])
-            if count:
-                self._follow_even_samples(given, begin, begin + count, found)
-            else:
+            # up to the next jump of stamps or rates
+            end = begin
+            if (self._detects_rest and self._last_sample is not None and self._held_jump is None
+                    and not self._may_be_erroneous(float(time[begin]))):
+                here = slice(begin, begin + CACHE_BLOCK_SAMPLES)
+                intervals = np.diff(time[here], prepend=self._last_sample[0])
+                with np.errstate(invalid='ignore'):
+                    steps = np.abs(np.diff(rate[here], prepend=self._last_sample[1]))
+                    even = ((np.abs(rate[here]) < MAX_RATE) & (intervals >= 0.0)
+                            & (intervals <= self._settings.maximum_gap)
+                            & (steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals))
+                end += len(even) if even.all() else int(np.argmin(even))
+            if end == begin:
                 self.add(*given.sample(begin))
                 found[begin] = self._result_row(self.intervals.usual_interval)
-            begin += count or 1
+                begin += 1
+                continue
+            # whole pieces between lost samples, and these singly
+            usual, lost = self.intervals.add_many(intervals[:end - begin])
+            for gap in [*(np.flatnonzero(lost) + begin).tolist(), end]:
+                if gap > begin:
+                    self._follow_piece(given, begin, gap, usual[begin - end:][:gap - begin], found)
+                if gap < end:
+                    known = float(usual[gap - end])
+                    self._take_sample(*given.sample(gap), gap=(int(lost[gap - end]), known))
+                    found[gap] = self._result_row(known)
+                begin = min(gap + 1, end)
         return found
 
     def _result_row(self, usual: float) -> tuple[float, float, float, float, bool]:
         return (self.heading, self.variance, self.rate, self._rate_variance(usual),
                 self.is_resting)
-
-    def _count_even(self, time: Array, rate: Array) -> int:
-        """Return how many samples come without a jump of stamps or rates."""
-        if (not self._detects_rest or self._last_sample is None or self._held_jump is not None
-                or self._may_be_erroneous(float(time[0]))):
-            return 0
-        intervals = np.diff(time, prepend=self._last_sample[0])
-        with np.errstate(invalid='ignore'):
-            steps = np.abs(np.diff(rate, prepend=self._last_sample[1]))
-            even = ((np.abs(rate) < MAX_RATE) & (intervals >= 0.0)
-                    & (intervals <= self._settings.maximum_gap)
-                    & (steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals))
-        return len(even) if even.all() else int(np.argmin(even))
-
-    def _follow_even_samples(self, given: Samples, begin: int, end: int, found: Array) -> None:
-        """Take samples without jumps: whole pieces between lost samples, and these singly."""
-        assert self._last_sample is not None
-        usual, lost = self.intervals.add_many(
-            np.diff(given.time[begin:end], prepend=self._last_sample[0]))
-        for gap in [*(np.flatnonzero(lost) + begin).tolist(), end]:
-            if gap > begin:
-                self._follow_piece(given, begin, gap, usual[begin - end:][:gap - begin], found)
-            if gap < end:
-                self._take_sample(*given.sample(gap),
-                                  gap=(int(lost[gap - end]), float(usual[gap - end])))
-                found[gap] = self._result_row(float(usual[gap - end]))
-            begin = gap + 1
 
     def _follow_piece(self, given: Samples, begin: int, end: int, usual: Array,
                       found: Array) -> None:
@@ -445,11 +442,26 @@ class HeadingTracker:
 
     def _pass_blocks(self, piece: EvenSamples, number: int) -> int:
         """Take the whole blocks before the next in which a decision falls; return their number."""
-        if (piece.wheels is not None or not self._energy.has_results
+        if (piece.wheels is not None or not self._energy.results_ahead
                 or piece.last_at_rest != self.is_resting):
             return 0
-        passed = (self._count_quiet_blocks(piece, number) if self.is_resting
-                  else self._count_moving_blocks(piece, number))
+        if self.is_resting:
+            until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
+            begin, end = piece.block_starts[number], piece.block_stops[until - 1]
+            rates = np.abs(piece.rate[begin:end] - self._wander_rate
+                           + piece.rest_sensitivity[begin:end] @ self._calibration_errors)
+            peaks = np.maximum.reduceat(rates, np.array(piece.block_starts[number:until]) - begin)
+            duration, passed = self._open_integral.duration, until - number - 1
+            for place, (peak, more) in enumerate(zip(
+                    peaks.tolist(), piece.block_sums[0, number:until].tolist())):
+                quiet, limit = self._energy.quiet_ahead(place)
+                duration += more
+                if (quiet is False or peak > math.hypot(limit, self._bias_margin)
+                        or duration >= _STEP_DURATION - TIME_TOLERANCE):
+                    passed = place
+                    break
+        else:
+            passed = self._count_moving_blocks(piece, number)
         if not passed:
             return 0
         here = slice(number, number + passed)
@@ -467,10 +479,10 @@ class HeadingTracker:
                 squares[last].tolist()))
         if not self.is_resting:
             turn, ends = self._open_integral, piece.block_ends[here]
-            until = turn.duration + np.cumsum(durations)
+            totals = turn.duration + np.cumsum(durations)
             piece.epochs[-1].open_integrals.append((
-                ends, until, np.full(passed, turn.lost_variance + turn.extra_noise_variance),
-                self._unbiased_sensitivity(until, turn.sensitivity + np.cumsum(rows, axis=0),
+                ends, totals, np.full(passed, turn.lost_variance + turn.extra_noise_variance),
+                self._unbiased_sensitivity(totals, turn.sensitivity + np.cumsum(rows, axis=0),
                                            None if piece.still is None else piece.still[ends])))
             self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
         self._integrate_blocks(piece, here, whole)
@@ -495,24 +507,6 @@ class HeadingTracker:
         self._last_sample = time, rate, rate, used[last]
         self._interval, self._last_time = float(piece.intervals[last]), time
         self._still_sensitivity = None if piece.still is None else piece.still[last]
-
-    def _count_quiet_blocks(self, piece: EvenSamples, number: int) -> int:
-        """Return how many of the next whole blocks are at rest before a decision."""
-        duration, passed = self._open_integral.duration, 0
-        begin = piece.block_starts[number]
-        until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
-        end = piece.block_stops[until - 1]
-        rates = np.abs(piece.rate[begin:end] - self._wander_rate
-                       + piece.rest_sensitivity[begin:end] @ self._calibration_errors)
-        peaks = np.maximum.reduceat(rates, np.array(piece.block_starts[number:until]) - begin)
-        for peak, more in zip(peaks.tolist(), piece.block_sums[0, number:until].tolist()):
-            quiet, limit = self._energy.quiet_ahead(passed)
-            duration += more
-            if (quiet is False or peak > math.hypot(limit, self._bias_margin)
-                    or duration >= _STEP_DURATION - TIME_TOLERANCE):
-                return passed
-            passed += 1
-        return passed - 1
 
     def _count_moving_blocks(self, piece: EvenSamples, number: int) -> int:
         """Return how many of the next whole blocks are in motion before a decision."""
@@ -539,33 +533,27 @@ class HeadingTracker:
                 tested.append(end)
                 first.append(begin + 1)
         if tested:
-            stands = self._stands(piece, number, np.array(durations), np.array(first),
-                                  np.array(tested))
+            # whether the mean over each of these parts is that of a rest
+            recent, here = self._recent_blocks, slice(number, until)
+            rows = np.zeros((len(durations) + 1, 3 + len(self._calibration_errors)))
+            rows[1:, 0] = durations
+            for row, each in zip(rows[1:], recent):
+                row[1], row[2] = each.angle, each.lost_variance + each.extra_noise_variance
+                row[3:] = each.sensitivity
+            rows[1 + len(recent):, 1] = piece.block_angles[here]
+            rows[1 + len(recent):, 3:] = piece.sensitivity_integrals[False][here]
+            sums, last = np.cumsum(rows, axis=0), np.array(tested)
+            parts = sums[last] - sums[first]
+            if piece.still is not None:
+                parts[:, 3:] = parts[:, :1] * piece.still[
+                    piece.block_ends[here][last - len(recent) - 1]]
+            expected, variances = self._state.expected_rest_angles(
+                parts[:, 0], parts[:, 2], parts[:, 3:])
+            stands = (np.abs(parts[:, 1] - expected)
+                      < self._sigmas[WINDOW_DURATION] * np.sqrt(variances))
             if stands.any():
                 end = tested[int(np.argmax(stands))] - 1
         return max(end - len(self._recent_blocks), 0)
-
-    def _stands(self, piece: EvenSamples, number: int, durations: Array, first: Array,
-                last: Array) -> Mask:
-        """Tell of parts of recent and next blocks whether their means are those of a rest."""
-        recent, count = self._recent_blocks, len(durations) - len(self._recent_blocks)
-        here = slice(number, number + count)
-        rows = np.zeros((len(durations) + 1, 3 + len(self._calibration_errors)))
-        rows[1:, 0] = durations
-        for row, each in zip(rows[1:], recent):
-            row[1], row[2] = each.angle, each.lost_variance + each.extra_noise_variance
-            row[3:] = each.sensitivity
-        rows[1 + len(recent):, 1] = piece.block_angles[here]
-        rows[1 + len(recent):, 3:] = piece.sensitivity_integrals[False][here]
-        until = np.cumsum(rows, axis=0)
-        held = until[last] - until[first]
-        if piece.still is not None:
-            held[:, 3:] = held[:, :1] * piece.still[
-                piece.block_ends[here][last - len(recent) - 1]]
-        expected, variances = self._state.expected_rest_angles(
-            held[:, 0], held[:, 2], held[:, 3:])
-        return np.asarray(np.abs(held[:, 1] - expected)
-                          < self._sigmas[WINDOW_DURATION] * np.sqrt(variances))
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
@@ -631,26 +619,12 @@ class HeadingTracker:
         self._pending_correction -= settled
         self.heading += corrected + settled
 
-    def _detect_motion(self, duration: float, before: float, wheels: bool | None) -> None:
-        """Detect sudden motion at each sample, and slower motion at the end of each block."""
-        assert self._last_sample is not None
-        _, rate, _, sensitivity = self._last_sample
-        self._block.add(duration, rate, before)
-        if self.is_resting:
-            limit = math.hypot(self._energy.sudden_limit, self._bias_margin)
-            if wheels or abs(rate - self._rate_error(sensitivity)) > limit:
-                self._revert_to_motion(0.0)
-        self._wheels_moved = self._wheels_moved or bool(wheels)
-        if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
-            self._end_block(self._wheels_moved, wheels)
-
     def _end_block(self, driven: bool, wheels: bool | None) -> None:
+        """Decide on rest or motion; whether wheels moved in the block, and at its last sample."""
         quiet = self._energy.add(self._block)
-        self._decide_rest(False if driven else quiet, driven or wheels)
+        if driven:
+            quiet, wheels = False, True
         self._block, self._wheels_moved = Block(), False
-
-    def _decide_rest(self, quiet: bool | None, wheels: bool | None) -> None:
-        """Decide on rest or motion at the end of a block."""
         part = self._close_block()
         if wheels is not False:
             self._wheel_motion_time = self._last_time
@@ -670,66 +644,53 @@ class HeadingTracker:
         if wheels:
             # a constant turn has the energy of a rest: no blocks are held while wheels move
             self._enter_motion(WINDOW_DURATION)
-        self._hold_block(part)
+
+        # the last blocks, which may be the begin of a rest, are held
+        self._recent_blocks.append(part)
+        duration = sum(each.duration for each in self._recent_blocks)
+        least = self._quiet_duration - TIME_TOLERANCE
+        while (len(self._recent_blocks) > 2
+               and duration - self._recent_blocks[0].duration >= least):
+            duration -= self._recent_blocks.popleft().duration
+        first, *others = self._recent_blocks
+        self._held_integral = sum(others, first)
         beyond = self._open_integral.duration - self._held_integral.duration
         if beyond >= _STEP_DURATION - TIME_TOLERANCE:
             self._advance_state(self._held_integral)
-        if quiet and self._is_mean_at_rest(wheels):
-            held = self._held_rest_integral()
-            change = self._unexpected_bias_change(self._with_still_sensitivity(held))
-            self._advance_state(held)
-            # it may have come at any time since the last rest
-            self._state = self._state.with_added_variance(
-                HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
-            self._enter_rest(change)
-            self._rest_blocks.extend([*self._recent_blocks][1:])
+        if not quiet or self._held_integral.duration < least or len(self._recent_blocks) < 2:
+            return
+
+        # whether the mean over them is that of a rest; in the first the robot may still move
+        held = self._held_integral - self._recent_blocks[0]
+        still, least_sigmas = self._with_still_sensitivity(held), self._sigmas[WINDOW_DURATION]
+        innovation = self._normalized_innovation(
+            self._state, still, _WHEEL_BIAS_CHANGE if wheels is False else 0.0)
+        after_slow_turn = self._quiet_duration > WINDOW_DURATION
+        if not abs(innovation) < (0.5 if after_slow_turn else 1.0) * self._sigmas[
+                self._quiet_duration]:
+            if after_slow_turn and not self._accept_slow_turn_as_bias():
+                self._enter_motion(self._quiet_duration)
+            return
+        # a change of the bias that only the wheels explain may have come at any time since the
+        # last rest
+        change = 0.0
+        if (self._last_time - self._wheel_motion_time >= _WHEEL_DELAY
+                and not abs(self._normalized_innovation(self._state, still)) < least_sigmas):
+            change = (held.angle - self._state.expected_rest_angle(still)[0]) / held.duration
+        self._advance_state(held)
+        self._state = self._state.with_added_variance(
+            HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
+        self._enter_rest(change)
+        self._rest_blocks.extend([*self._recent_blocks][1:])
 
     def _close_block(self) -> RateIntegral:
         """Add the integral of the block to the open one, and return it."""
-        part, self._block_integral = self._block_integral, self._new_integral()
+        part, self._block_integral = self._block_integral, replace(self._zero_integral)
         if part.duration > 0.0:
             part.block_count, part.block_square_sum = 1, part.angle ** 2 / part.duration
         self._open_integral += part
         self._open_variance = None
         return part
-
-    def _hold_block(self, part: RateIntegral) -> None:
-        """Hold the last blocks, which may be the begin of a rest."""
-        self._recent_blocks.append(part)
-        held = sum(each.duration for each in self._recent_blocks)
-        least = self._quiet_duration - TIME_TOLERANCE
-        while (len(self._recent_blocks) > 2
-               and held - self._recent_blocks[0].duration >= least):
-            held -= self._recent_blocks.popleft().duration
-        first, *others = self._recent_blocks
-        self._held_integral = sum(others, first)
-
-    def _held_rest_integral(self) -> RateIntegral:
-        """Return the held integral without its first block, in which the robot may move."""
-        return self._held_integral - self._recent_blocks[0]
-
-    def _is_mean_at_rest(self, wheels: bool | None) -> bool:
-        """Tell whether the mean over a quiet time of sufficient length is that of a rest."""
-        if (self._held_integral.duration < self._quiet_duration - TIME_TOLERANCE
-                or len(self._recent_blocks) < 2):
-            return False
-        factor = 1.0 if self._quiet_duration == WINDOW_DURATION else 0.5
-        innovation = self._normalized_innovation(
-            self._state, self._with_still_sensitivity(self._held_rest_integral()),
-            _WHEEL_BIAS_CHANGE if wheels is False else 0.0)
-        stands = abs(innovation) < factor * self._sigmas[self._quiet_duration]
-        if (not stands and self._quiet_duration > WINDOW_DURATION
-                and not self._accept_slow_turn_as_bias()):
-            self._enter_motion(self._quiet_duration)
-        return stands
-
-    def _unexpected_bias_change(self, turn: RateIntegral) -> float:
-        """Return the change of the bias by a rest that only the wheels explain, rad/s, or 0."""
-        if (self._last_time - self._wheel_motion_time < _WHEEL_DELAY
-                or abs(self._normalized_innovation(self._state, turn))
-                < self._sigmas[WINDOW_DURATION]):
-            return 0.0
-        return (turn.angle - self._state.expected_rest_angle(turn)[0]) / turn.duration
 
     def _accept_slow_turn_as_bias(self) -> bool:
         """Attribute a slow, constant turn to a change of the bias at rest; tell whether so."""
@@ -919,32 +880,23 @@ class HeadingTracker:
                 self._advance_at_rest(still, remaining)
             else:
                 self._propagate_state(turn, end)
-            if self._detects_rest and self._steady_rates is not None:
-                self._compare_steady_rates(self._steady_rates, still, end)
+            rates, sigmas = self._steady_rates, self._sigmas.get(MEAN_LAGS[0], 0.0)
+            if (self._detects_rest and rates is not None
+                    and rates.add(still, end, self._state.noise, sigmas, self.is_resting)
+                    and (not self.is_resting or rates.variance)
+                    and (change := rates.compare(self._state, sigmas)) and not self.is_resting):
+                self._state = self._state.with_bias_change(
+                    *change, end - self._heading_begin_time)
+                # there was no rest: the steps are computed again with the change
+                first = self.recalibrations[-1][0] if self.recalibrations else 0
+                if self._keeps_steps:
+                    state = self.steps[first].state_before
+                    state = state.with_bias_change(
+                        change[0] + self._state.wander_rate[0], change[1], 0.0)
+                for place, step in enumerate(self.steps[first:], first):
+                    self.steps[place] = TrackStep(state, step.rate_integral, False, step.end_time)
+                    state = state.propagate(step.rate_integral)
         self._adopt_state()
-
-    def _compare_steady_rates(self, rates: SteadyRates, turn: RateIntegral, end: float) -> None:
-        """Compare the bias with steady rates, and an integral that ends at a time, s."""
-        sigmas = self._sigmas[MEAN_LAGS[0]]
-        if not rates.add(turn, end, self._state.noise, sigmas, self.is_resting) or (
-                self.is_resting and not rates.variance):
-            return
-        change = rates.compare(self._state, sigmas)
-        if change is None or self.is_resting:
-            return
-        self._state = self._state.with_bias_change(*change, end - self._heading_begin_time)
-        if self._keeps_steps:
-            self._revise_steps(*change)
-
-    def _revise_steps(self, change: float, variance: float) -> None:
-        """Compute the steps again with a change of the bias, rad/s: there was no rest."""
-        first = self.recalibrations[-1][0] if self.recalibrations else 0
-        state = self.steps[first].state_before.with_bias_change(
-            change + self._state.wander_rate[0], variance, 0.0)
-        for place in range(first, len(self.steps)):
-            step = self.steps[place]
-            self.steps[place] = TrackStep(state, step.rate_integral, False, step.end_time)
-            state = state.propagate(step.rate_integral)
 
     def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""

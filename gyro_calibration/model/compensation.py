@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import math
 import sys
 
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, Number
+from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, Number
 from gyro_calibration.model.channels import clip
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
@@ -61,9 +61,24 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     from the history (`GyroModel.start_history`) that took the same temperatures.
     """
     given = model.reference_temperature if temperature is None else temperature
-    return (_compensate_blocks(model, output, given)
-            if isinstance(output, np.ndarray) and environment is None
-            else _compensate_at_once(model, output, given, environment))
+    if not isinstance(output, np.ndarray) or environment is not None:
+        return _compensate_at_once(model, output, given, environment)
+    modelled, clipped, beyond = (
+        np.empty(len(output)), np.zeros(len(output), bool), np.zeros(len(output), bool))
+    rate = modelled if model.self_calibration is None else np.empty(len(output))
+    for begin in range(0, len(output), CACHE_BLOCK_SAMPLES):
+        block = slice(begin, begin + CACHE_BLOCK_SAMPLES)
+        part = _compensate_at_once(
+            model, output[block], given[block] if isinstance(given, np.ndarray) else given)
+        modelled[block] = part.model_rate
+        if part.temperature_clipped is not False:
+            clipped[block] = part.temperature_clipped
+        if part.beyond_range is not False:
+            beyond[block] = part.beyond_range
+        if rate is not modelled:
+            rate[block] = part.rate
+    plausible = clip(given, *model.temperature_limits) if clipped.any() else given
+    return CompensatedSamples(modelled, rate, plausible, clipped, beyond)
 
 
 def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
@@ -100,26 +115,6 @@ def _mask_outside(values: Number, low: float, high: float) -> Number:
     if len(values) and low <= values.min() and values.max() <= high:
         return False
     return (values < low) | (values > high)
-
-
-def _compensate_blocks(model: GyroModel, output: Array, temperature: Number) -> CompensatedSamples:
-    modelled, clipped, beyond = (
-        np.empty(len(output)), np.zeros(len(output), bool), np.zeros(len(output), bool))
-    rate = modelled if model.self_calibration is None else np.empty(len(output))
-    for begin in range(0, len(output), CACHE_BLOCK_SAMPLES):
-        block = slice(begin, begin + CACHE_BLOCK_SAMPLES)
-        part = _compensate_at_once(
-            model, output[block],
-            temperature[block] if isinstance(temperature, np.ndarray) else temperature)
-        modelled[block] = part.model_rate
-        if part.temperature_clipped is not False:
-            clipped[block] = part.temperature_clipped
-        if part.beyond_range is not False:
-            beyond[block] = part.beyond_range
-        if rate is not modelled:
-            rate[block] = part.rate
-    plausible = clip(temperature, *model.temperature_limits) if clipped.any() else temperature
-    return CompensatedSamples(modelled, rate, plausible, clipped, beyond)
 
 
 def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number,

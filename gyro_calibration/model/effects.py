@@ -471,13 +471,13 @@ _SIGNAL_EFFECTS = (
                (abs(channels.rate) < dead_zone) * -channels.rate,),
            (Parameter('dead_zone', 'rad/s', bounds=(1e-7, 1.0)), ), 'sweep slowly through zero',
            along='rate',
-           not_compensated='An output of zero does not determine the rate within the zone.'))
-SATURATION = Effect(
-    'saturation', 'The output cannot go beyond a limit.',
-    nonlinear_parameters=(Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),),
-    experiment='turn faster than the limit: the output stays at its extreme code', along='rate',
-    distortion=lambda signal, _time, limit: np.clip(signal, -limit, limit), stage='output',
-    not_compensated='An output at the limit does not determine the rate beyond it.')
+           not_compensated='An output of zero does not determine the rate within the zone.'),
+    Effect('saturation', 'The output cannot go beyond a limit.',
+           nonlinear_parameters=(Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),),
+           experiment='turn faster than the limit: the output stays at its extreme code',
+           distortion=lambda signal, _time, limit: np.clip(signal, -limit, limit), stage='output',
+           along='rate',
+           not_compensated='An output at the limit does not determine the rate beyond it.'))
 QUANTIZATION = Effect(
     'quantization', 'The output comes in steps.',
     nonlinear_parameters=(Parameter('quantization', 'rad/s', bounds=(1e-12, 1.0)),),
@@ -491,7 +491,7 @@ STATIC_EFFECTS = {effect.name: effect for effect in (
     SINE_RESPONSE, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
 #: All effects except the polynomial.
 CATALOGUE = STATIC_EFFECTS | {effect.name: effect for effect in (
-    *_THERMAL_HISTORY_EFFECTS, *_TIME_EFFECTS, *_ENVIRONMENT_EFFECTS, *_SIGNAL_EFFECTS, SATURATION,
+    *_THERMAL_HISTORY_EFFECTS, *_TIME_EFFECTS, *_ENVIRONMENT_EFFECTS, *_SIGNAL_EFFECTS,
     QUANTIZATION)}
 #: Effects of the user, which `add_effects` added to the catalogue.
 USER_EFFECTS: dict[str, Effect] = {}

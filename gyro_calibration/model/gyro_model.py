@@ -239,27 +239,25 @@ class GyroModel:
         # with the rate at some used temperature, or where the output would not be plausible.
         low, high = self.rate_range
         centre = min(max(0.0, low), high)
-        down, up = (self._monotone_distance(centre, side) for side in (-1.0, 1.0))
-        return centre - down, centre + up
-
-    def _monotone_distance(self, centre: float, side: float) -> float:
-        """Return how far from a rate to one side the output grows with the rate, rad/s."""
-        dependent = self._split_by_rate[1]
+        dependent, ends = self._split_by_rate[1], list[float]()
         distances = np.concatenate(
             [[0.0], self.rate_limit / _MIN_OUTPUT_SLOPE * np.geomspace(1e-6, 1.0, 4000)])
 
-        def output(distance: Array, temperature: float) -> Array:
-            rate = centre + side * distance
-            return side * (rate + _sum_errors(dependent, Channels(rate, rate, temperature)))
+        def output(rate: Array, temperature: float) -> Array:
+            return rate + _sum_errors(dependent, Channels(rate, rate, temperature))
 
-        with np.errstate(all='ignore'):
-            # between the distances, and closely before each: a step down may be narrow
-            good = np.all([
-                output(distances[1:], temperature) - output(begin, temperature)
-                >= _MIN_OUTPUT_SLOPE * (distances[1:] - begin)
-                for begin in (distances[:-1], (1.0 - 1e-6) * distances[1:])
-                for temperature in self.extrapolation_range], axis=0)
-        return float(distances[-1] if good.all() else distances[np.argmin(good)])
+        for side in (-1.0, 1.0):
+            with np.errstate(all='ignore'):
+                # between the distances, and closely before each: a step down may be narrow
+                good = np.all([
+                    side * (output(centre + side * distances[1:], temperature)
+                            - output(centre + side * begin, temperature))
+                    >= _MIN_OUTPUT_SLOPE * (distances[1:] - begin)
+                    for begin in (distances[:-1], (1.0 - 1e-6) * distances[1:])
+                    for temperature in self.extrapolation_range], axis=0)
+            ends.append(centre + side * float(
+                distances[-1] if good.all() else distances[np.argmin(good)]))
+        return ends[0], ends[1]
 
     def uses_channel(self, channel: str) -> bool:
         return any(channel in term.effect.inputs for term in self.terms)
@@ -312,7 +310,29 @@ class GyroModel:
             seen.__dict__['rate'] = rate
             return _sum_errors(dependent, seen)
 
-        return _invert_response(error_at, given, output, self.rate_domain)
+        # solve ``rate + error_at(rate) = given``; in the domain the left side grows with the rate
+        low, high = self.rate_domain
+        many = isinstance(given, np.ndarray)
+        with np.errstate(all='ignore') if many else _NO_ERROR_STATE:
+            # a single sample may leave the domain by at most 1 rad/s during the iteration
+            rate, step = _iterate_secant(
+                lambda x: given - error_at(x), output, low - 1.0, high + 1.0)
+            solved = ((low <= rate) & (rate <= high)
+                      & (abs(step) <= STEP_TOLERANCE * (1.0 + abs(rate))))
+        if solved.all() if many else solved:
+            return rate, False
+        with np.errstate(all='ignore'):
+            at_low, at_high = error_at(low), error_at(high)
+            below, above = given < low + at_low, given > high + at_high
+            if not np.all(solved | below | above):
+                begin, end = low + 0.0 * given, high + 0.0 * given
+                for _ in range(80):
+                    middle = 0.5 * (begin + end)
+                    higher = middle + error_at(middle) < given
+                    begin, end = np.where(higher, middle, begin), np.where(higher, end, middle)
+                rate = np.where(solved, rate, begin)
+            rate = np.where(below, given - at_low, np.where(above, given - at_high, rate))
+        return (rate, below | above) if many else (float(rate), bool(below or above))
 
     def distort(self, stage: str, signal: Array, time: Array) -> Array:
         """Return the signal of a log after the effects of a stage, 'rate' or 'output'."""
@@ -368,37 +388,6 @@ def _iterate_secant(g: Callable[[Number], Number], start: Number, low: float = -
             b = min(max(b, low), high)
         step = b - a
     return b, step
-
-
-def _invert_response(error_at: Callable[[Number], Number], output: Number, start: Number,
-                     domain: tuple[float, float]) -> tuple[Number, Number]:
-    """
-    Solve ``rate + error_at(rate) = output`` in a domain where the left side grows with the rate.
-
-    Return the rate, and whether there is none in the domain; the correction at the nearer end of
-    the domain is used then. A start and an output have shape (n,), or are numbers.
-    """
-    low, high = domain
-    many = isinstance(output, np.ndarray)
-    with np.errstate(all='ignore') if many else _NO_ERROR_STATE:
-        # a single sample may leave the domain by at most 1 rad/s during the iteration
-        rate, step = _iterate_secant(lambda x: output - error_at(x), start, low - 1.0, high + 1.0)
-        solved = ((low <= rate) & (rate <= high)
-                  & (abs(step) <= STEP_TOLERANCE * (1.0 + abs(rate))))
-    if solved.all() if many else solved:
-        return rate, False
-    with np.errstate(all='ignore'):
-        at_low, at_high = error_at(low), error_at(high)
-        below, above = output < low + at_low, output > high + at_high
-        if not np.all(solved | below | above):
-            begin, end = low + 0.0 * output, high + 0.0 * output
-            for _ in range(80):
-                middle = 0.5 * (begin + end)
-                higher = middle + error_at(middle) < output
-                begin, end = np.where(higher, middle, begin), np.where(higher, end, middle)
-            rate = np.where(solved, rate, begin)
-        rate = np.where(below, output - at_low, np.where(above, output - at_high, rate))
-    return (rate, below | above) if many else (float(rate), bool(below or above))
 
 
 def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None) -> GyroModel:

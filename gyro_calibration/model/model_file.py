@@ -58,45 +58,42 @@ def read_model(path: str | Path) -> GyroModel:
 def parse_model(content: Any, name: str = 'the model') -> GyroModel:
     """Return the model that a mapping holds, with the keys of a model file."""
     try:
-        return _parse_content(content)
+        top = validate('the file', content, None)
+        if top.get('format', _FORMAT) != _FORMAT:
+            raise InvalidValue('format', top['format'], f'{_FORMAT}: this is not a model file')
+        version = top.get('version', _VERSION)
+        if not isinstance(version, int) or version > _VERSION:
+            raise InvalidValue('version', version,
+                               f'at most {_VERSION}: install a newer gyro_calibration')
+        if 'effects' not in top:
+            raise InvalidValue('effects', None,
+                               'the effects with their values, such as {bias: {bias: 0.01}}')
+        terms = tuple(_parse_term(name, values)
+                      for name, values in validate('effects', top['effects'] or {}, None).items())
+        size = sum(len(term.fitted_indices) for term in terms)
+        valid = validate('valid', top.get('valid', {}), None)
+        temperature_range = _parse_range('valid.temperature', valid.get('temperature'))
+        is_finite = all(map(math.isfinite, temperature_range))
+        middle = sum(temperature_range) / 2.0 if is_finite else 25.0
+
+        def parse_section(name: str, schema: Any) -> Any:
+            return validate(name, top.get(name, {}), schema)
+
+        return GyroModel(
+            terms, None if top.get('covariance') is None
+            else _parse_covariance('covariance', top['covariance'], size),
+            _parse_range('valid.rate', valid.get('rate')), temperature_range,
+            parse_number('reference_temperature', top.get('reference_temperature', middle)),
+            Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_noise_figure))),
+            {name: parse_text(f'gyro.{name}', value)
+             for name, value in parse_section('gyro', None).items()},
+            parse_section('origin', None), _parse_self_calibration(top.get('self_calibration')),
+            Tolerance(**parse_section('tolerance', dict.fromkeys(Tolerance.__dataclass_fields__,
+                                                                 _parse_nonnegative))),
+            parse_section('noise_bounds', dict.fromkeys(_NOISE_NAMES, _parse_range)))
     except InvalidValue as error:
         raise ModelError(f'{name}: {error}; correct it (see docs/reference/error_model.md) '
                          'or calibrate again') from None
-
-
-def _parse_content(content: Any) -> GyroModel:
-    top = validate('the file', content, None)
-    if top.get('format', _FORMAT) != _FORMAT:
-        raise InvalidValue('format', top['format'], f'{_FORMAT}: this is not a model file')
-    version = top.get('version', _VERSION)
-    if not isinstance(version, int) or version > _VERSION:
-        raise InvalidValue('version', version,
-                           f'at most {_VERSION}: install a newer gyro_calibration')
-    if 'effects' not in top:
-        raise InvalidValue('effects', None,
-                           'the effects with their values, such as {bias: {bias: 0.01}}')
-    terms = tuple(_parse_term(name, values)
-                  for name, values in validate('effects', top['effects'] or {}, None).items())
-    size = sum(len(term.fitted_indices) for term in terms)
-    valid = validate('valid', top.get('valid', {}), None)
-    temperature_range = _parse_range('valid.temperature', valid.get('temperature'))
-    middle = sum(temperature_range) / 2.0 if all(map(math.isfinite, temperature_range)) else 25.0
-
-    def parse_section(name: str, schema: Any) -> Any:
-        return validate(name, top.get(name, {}), schema)
-
-    return GyroModel(
-        terms, None if top.get('covariance') is None
-        else _parse_covariance('covariance', top['covariance'], size),
-        _parse_range('valid.rate', valid.get('rate')), temperature_range,
-        parse_number('reference_temperature', top.get('reference_temperature', middle)),
-        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_noise_figure))),
-        {name: parse_text(f'gyro.{name}', value)
-         for name, value in parse_section('gyro', None).items()},
-        parse_section('origin', None), _parse_self_calibration(top.get('self_calibration')),
-        Tolerance(**parse_section('tolerance', dict.fromkeys(Tolerance.__dataclass_fields__,
-                                                             _parse_nonnegative))),
-        parse_section('noise_bounds', dict.fromkeys(_NOISE_NAMES, _parse_range)))
 
 
 def _parse_nonnegative(key_path: str, value: Any) -> float:
@@ -146,13 +143,29 @@ def _parse_covariance(key_path: str, value: Any, size: int = 2) -> Array:
 def _parse_term(name: str, values: Any) -> Term:
     place = f'effects.{name}'
     given = validate(place, values, None)
-    if name == POLYNOMIAL:
-        return _parse_polynomial(place, given)
-    if name not in CATALOGUE:
-        raise InvalidValue(place, given, 'an effect that this version knows, or one of your own '
-                           f'(--catalogue): {", ".join([*CATALOGUE, POLYNOMIAL])}'
-                           f'{suggest_nearest(name, CATALOGUE)}')
-    return Term(CATALOGUE[name], _parse_values(place, CATALOGUE[name], given))
+    if name != POLYNOMIAL:
+        if name not in CATALOGUE:
+            raise InvalidValue(place, given, 'an effect that this version knows, or one of your '
+                               f'own (--catalogue): {", ".join([*CATALOGUE, POLYNOMIAL])}'
+                               f'{suggest_nearest(name, CATALOGUE)}')
+        return Term(CATALOGUE[name], _parse_values(place, CATALOGUE[name], given))
+    # the paper's matrix, or orders [rate, temperature] with named values
+    if 'matrix_dps' in given:
+        refuse_unknown_names(place, given, ['matrix_dps'])
+        place, rows = f'{place}.matrix_dps', given['matrix_dps']
+        wanted = f'rows of finite numbers of one length, up to order {_MAX_POLYNOMIAL_ORDER}'
+        matrix = _parse_matrix(place, rows, wanted)
+        if max(matrix.shape) > _MAX_POLYNOMIAL_ORDER + 1:
+            raise InvalidValue(place, rows, wanted)
+        return Term(*polynomial_from_matrix(matrix))
+    orders = given.get('orders')
+    if not isinstance(orders, list) or len(orders) != 2 or not all(
+            type(order) is int and 0 <= order <= _MAX_POLYNOMIAL_ORDER for order in orders):
+        raise InvalidValue(f'{place}.orders', orders,
+                           'the orders in rate and temperature, such as [3, 2], or matrix_dps')
+    effect = rate_temperature_polynomial(*orders)
+    return Term(effect, _parse_values(
+        place, effect, {key: value for key, value in given.items() if key != 'orders'}))
 
 
 def _parse_values(key_path: str, effect: Effect, given: Mapping[str, Any]) -> tuple[float, ...]:
@@ -167,26 +180,6 @@ def _parse_values(key_path: str, effect: Effect, given: Mapping[str, Any]) -> tu
             raise InvalidValue(place, value, f'{low:g} to {high:g} {parameter.unit}')
         values.append(value)
     return tuple(values)
-
-
-def _parse_polynomial(key_path: str, given: Mapping[str, Any]) -> Term:
-    """Read a polynomial: the paper's matrix, or orders [rate, temperature] with named values."""
-    if 'matrix_dps' in given:
-        refuse_unknown_names(key_path, given, ['matrix_dps'])
-        place, rows = f'{key_path}.matrix_dps', given['matrix_dps']
-        wanted = f'rows of finite numbers of one length, up to order {_MAX_POLYNOMIAL_ORDER}'
-        matrix = _parse_matrix(place, rows, wanted)
-        if max(matrix.shape) > _MAX_POLYNOMIAL_ORDER + 1:
-            raise InvalidValue(place, rows, wanted)
-        return Term(*polynomial_from_matrix(matrix))
-    orders = given.get('orders')
-    if not isinstance(orders, list) or len(orders) != 2 or not all(
-            type(order) is int and 0 <= order <= _MAX_POLYNOMIAL_ORDER for order in orders):
-        raise InvalidValue(f'{key_path}.orders', orders,
-                           'the orders in rate and temperature, such as [3, 2], or matrix_dps')
-    effect = rate_temperature_polynomial(*orders)
-    return Term(effect, _parse_values(
-        key_path, effect, {name: value for name, value in given.items() if name != 'orders'}))
 
 
 _SELF_CALIBRATION_SCHEMA = {

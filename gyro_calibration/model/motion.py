@@ -14,6 +14,7 @@ from collections.abc import Iterable
 import csv
 from dataclasses import dataclass, replace
 import io
+import itertools
 import math
 import os
 from pathlib import Path
@@ -167,8 +168,20 @@ def read_motion(path: str | Path) -> Motion:
             raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
                               'heading_deg, heading_rad, rate_dps, rate_rad_s')
         name = found[0]
-        time, values = np.fromiter((_parse_number(path, each, row[each] or '') for row in rows
-                                    for each in ('time_s', name)), float).reshape(-1, 2).T
+        numbers = []
+        for row, column in itertools.product(rows, ('time_s', name)):
+            try:
+                value = float(row[column] or '')
+            except ValueError:
+                value = math.inf
+            # nan is a number where a reference may be lost
+            if not (abs(value) <= MAX_MAGNITUDE
+                    or value != value and column.startswith('reference_')):
+                raise MotionError(
+                    f'{path}: column {column}: {excerpt(row[column] or "") or "an empty cell"} is '
+                    'not a finite number; correct or remove the row')
+            numbers.append(value)
+        time, values = np.reshape(numbers, (-1, 2)).T
     except MotionError:
         raise
     except (OSError, ValueError, csv.Error) as error:
@@ -179,18 +192,6 @@ def read_motion(path: str | Path) -> Motion:
     if len(time) < 2 or not (np.diff(time) >= MIN_SAMPLE_INTERVAL).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
     return (motion_from_rates if 'rate' in name else motion_from_headings)(time, values)
-
-
-def _parse_number(path: str | Path, column: str, text: str) -> float:
-    """Return a number; nan is one where a reference may be lost."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.inf
-    if abs(value) <= MAX_MAGNITUDE or value != value and column.startswith('reference_'):
-        return value
-    raise MotionError(f'{path}: column {column}: {excerpt(text) or "an empty cell"} is not '
-                      'a finite number; correct or remove the row')
 
 
 def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,

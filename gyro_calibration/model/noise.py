@@ -17,6 +17,7 @@ import math
 from gyro_calibration.logs.log import Array, Number
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import xlogy
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR_RATIO = math.sqrt(2.0 * math.log(2.0) / math.pi)
@@ -155,16 +156,10 @@ class NoiseTerm:
         return self.allan_factor * np.asarray(time, dtype=float) ** (2.0 * self.slope)
 
 
-def _flicker_covariance(time: Number) -> Array:
-    """Return t² ln t / (2 pi): the second difference has the Allan variance 2 ln 2 / pi."""
-    size = np.abs(time)
-    return size ** 2 * np.log(np.where(size == 0.0, 1.0, size)) / (2.0 * math.pi)
-
-
 ANGLE_RANDOM_WALK = NoiseTerm('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
                               lambda time: -0.5 * np.abs(time))
 FLICKER = NoiseTerm('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 2,
-                    _flicker_covariance)
+                    lambda time: xlogy(np.square(time), np.abs(time)) / (2.0 * math.pi))
 RATE_RANDOM_WALK = NoiseTerm('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
                              lambda time: np.abs(time) ** 3 / 12.0)
 QUANTIZATION_NOISE = NoiseTerm('quantization', 'Q', 'rad', -1.0, 3.0,

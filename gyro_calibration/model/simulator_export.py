@@ -60,7 +60,7 @@ def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussM
 
 
 @dataclass(frozen=True)
-class SimulatorParameters:
+class _SimulatorParameters:
     """The parameters of a gyro that simulators support, in rad/s and s; 0 where there is none."""
 
     bias: float  # output at rest
@@ -74,7 +74,7 @@ class SimulatorParameters:
 
 
 def simulator_parameters(model: GyroModel, sample_rate: float, temperature: float,
-                         span: float) -> tuple[SimulatorParameters, float]:
+                         span: float) -> tuple[_SimulatorParameters, float]:
     """
     Return the parameters of a model that simulators support, and the error of their wander.
 
@@ -91,13 +91,13 @@ def simulator_parameters(model: GyroModel, sample_rate: float, temperature: floa
     deviation = run.standard_deviations[1] if run else math.nan
     values = {term.effect.name: term.values[0] for term in model.terms}
     wander, error = fit_gauss_markov(model.noise, interval, span)
-    return SimulatorParameters(bias, 0.0 if math.isnan(deviation) else deviation,
-                               math.sqrt(model.noise.rate_variance(interval)), wander,
-                               values.get('saturation', 0.0), values.get('quantization', 0.0),
-                               values.get('time_offset', 0.0), interval), error
+    return _SimulatorParameters(bias, 0.0 if math.isnan(deviation) else deviation,
+                                math.sqrt(model.noise.rate_variance(interval)), wander,
+                                values.get('saturation', 0.0), values.get('quantization', 0.0),
+                                values.get('time_offset', 0.0), interval), error
 
 
-def _format_sdf(parameters: SimulatorParameters) -> tuple[str, set[str]]:
+def _format_sdf(parameters: _SimulatorParameters) -> tuple[str, set[str]]:
     """Return the noise of the z axis for an `<imu>` in SDF."""
     # Gazebo draws the sign of `bias_mean` at random and decays it with the correlation time, so
     # the bias is exported as the mean of the noise. `dynamic_bias_stddev` is the density of a
@@ -118,7 +118,7 @@ def _format_sdf(parameters: SimulatorParameters) -> tuple[str, set[str]]:
                       '</imu>']), names
 
 
-def _format_isaac(parameters: SimulatorParameters) -> tuple[str, set[str]]:
+def _format_isaac(parameters: _SimulatorParameters) -> tuple[str, set[str]]:
     """Return the noise of an observation term of Isaac Lab, which draws the bias at each reset."""
     return '\n'.join(
         ['from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg', '',
@@ -128,7 +128,7 @@ def _format_isaac(parameters: SimulatorParameters) -> tuple[str, set[str]]:
          f'std={parameters.bias_deviation:.9g}),', ')']), {'bias', 'angle_random_walk'}
 
 
-def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
+def _format_mujoco(parameters: _SimulatorParameters) -> tuple[str, set[str]]:
     """Return a sensor of MuJoCo; from release 3.1.4 on it stores `noise`, but adds none."""
     attributes = {'name': 'gyro', 'site': 'imu', 'noise': f'{parameters.white_noise:.9g}'}
     names = set()
@@ -145,12 +145,12 @@ def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
     return f'<sensor>\n  <gyro {inside}/>\n</sensor>', names | {'angle_random_walk'}
 
 
-_FORMATTERS: dict[str, Callable[[SimulatorParameters], tuple[str, set[str]]]] = {
+_FORMATTERS: dict[str, Callable[[_SimulatorParameters], tuple[str, set[str]]]] = {
     'sdf': _format_sdf, 'isaac': _format_isaac, 'mujoco': _format_mujoco}
 SIMULATORS = tuple(_FORMATTERS)  # names of the simulators
 
 
-def export_model(parameters: SimulatorParameters, model: GyroModel,
+def export_model(parameters: _SimulatorParameters, model: GyroModel,
                  simulator: str) -> tuple[str, list[str]]:
     """Return a text for one of `SIMULATORS`, and what it does not hold, which a comment lists."""
     text, names = _FORMATTERS[simulator](parameters)
