@@ -533,7 +533,9 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     treatment = replace(treatment, prior=(float(scale), float(bias), treatment.prior[2]),
                         wide_prior=(_WIDE_PRIOR[0], min(_WIDE_PRIOR[1], float(measured_type[1]))))
     time, measured = log.time - log.time[0], log.output
-    output, white = bridge_gaps(measured), white_noise_deviation(measured)
+    output, step = bridge_gaps(measured), quantization_step(measured[np.isfinite(measured)])
+    # less than a thousandth of a step does not show
+    white = max(white_noise_deviation(measured), 1e-3 * step)
     reference, at = _place_values(log, instants)
     measured_rows, noisier, rate = np.isfinite(measured), 0.0, log.reference_rate
     if given is None and rate is not None:
@@ -587,7 +589,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
-                 find_holes(time[measured_rows], length), quantization_step(measured),
+                 find_holes(time[measured_rows], length), step,
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
 
 
@@ -1128,4 +1130,9 @@ def is_noisy(log: Log) -> bool:
         spans.base_columns(), spans.acceleration_changes(),
         spans.cause_columns(CauseTerm('reference_once_per_rev'))])[:count]
     residual = robust_residual(columns, spans.observed[:count], 10)
-    return robust_deviation(residual) > math.sqrt(2.0) * MIN_COURSE_NOISE
+    # at a steady rate, an output with steps above its noise errs by up to half of one
+    step = spans.output_step
+    is_coarse = white_noise_deviation(np.asarray(log.output)) < 0.5 * step
+    return robust_deviation(residual) > max(
+        math.sqrt(2.0) * MIN_COURSE_NOISE,
+        is_coarse * 0.5 * step * float(np.median(np.diff(spans.time))))

@@ -273,6 +273,21 @@ def test_the_code_at_which_a_coarse_output_rests_is_not_its_bias(bias):
     assert deviation < step / math.sqrt(12.0)
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_what_a_coarse_output_errs_by_at_a_steady_rate_is_no_error_of_the_reference(seed):
+    generator, time = np.random.default_rng(70 + seed), np.arange(29000) / 100.0
+    ends = np.cumsum(generator.uniform(4.0, 10.0, 100))
+    rates = 60.0 * DEGREE * generator.uniform(-1.0, 1.0, 101) * (generator.random(101) < 0.7)
+    rate = uniform_filter1d(rates[np.searchsorted(ends, time)], 100)
+    output = 1.01 * rate + (0.33 + 0.1 * generator.standard_normal(len(time))) * DEGREE
+    step = 0.005 * DEGREE
+    found = calibrate_encoder(Log(
+        time=time, output=np.round(output / DEGREE) * DEGREE,
+        reference_heading=step * np.round(np.cumsum(rate) / 100.0 / step)))
+    assert found.method == 'likelihood'
+    assert abs(found.fit.bias - 0.33 * DEGREE) < 3.0 * math.sqrt(found.fit.covariance[1, 1])
+
+
 def test_a_held_heading_with_fine_steps_is_no_encoder_that_moves_step_by_step():
     generator, time = np.random.default_rng(68), np.arange(20000) / 100.0
     rate = 30.0 * DEGREE * np.sin(0.2 * np.pi * time) * ((time // 10.0) % 3.0 == 1.0)
