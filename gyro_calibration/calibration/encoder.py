@@ -47,7 +47,7 @@ from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, is_course, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, refuse_unit_error, RunPieces, split_run)
+    fit_profile, refuse_unit_error, RunPieces, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects)
 from gyro_calibration.calibration.self_calibration import (
@@ -320,8 +320,8 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
 
     Of a heading and a rate it is the heading, unless this is known for less than half as long: a
     rate may be filtered, or a command, where a heading is what was turned. If a rate is preferred,
-    it is that where both turn alike. Where they contradict each other, it is the one that explains
-    more than half of what the gyro turned, if the other does not.
+    it is that where both turn alike. Where they contradict each other, and one is further from the
+    gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -348,10 +348,10 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         if contradiction and log.output is not None:
             rows = np.isfinite(log.output[known])
             gyro = split_run(time[rows], log.output[known][rows])
-            by_rate_alone, by_heading_alone = (
-                _explains(gyro, each) for each in (motion_from_rates(time, rate[known]), motion))
-            if by_rate_alone != by_heading_alone:
-                by_rate = by_rate_alone
+            left = [_unexplained_share(gyro, each)
+                    for each in (motion_from_rates(time, rate[known]), motion)]
+            if max(left) > max((UNIT_TOLERANCE - 1.0) ** 2, 2.0 * min(left)):
+                by_rate = left[0] < left[1]
     remarks = [f'The reference heading is known in {counts[1]} samples only; the rate, known in '
                f'{counts[0]}, is used.'] if by_rate and 2 * counts[1] < counts[0] else []
     if contradiction:
@@ -362,11 +362,11 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
             else replace(log, reference_rate=None)), remarks
 
 
-def _explains(gyro: RunPieces, motion: Motion) -> bool:
-    """Tell whether a motion explains more than half of what the gyro turned."""
+def _unexplained_share(gyro: RunPieces, motion: Motion) -> float:
+    """Return the share of the squares of what the gyro turned that a motion leaves."""
     _, _, delay = fit_profile(gyro, motion, COURSE_TREATMENT.largest_delay)
     left = gyro.gyro_angle - gyro.reference_angle(motion, delay)
-    return bool(np.var(left) < 0.5 * np.var(gyro.gyro_angle))
+    return float(np.var(left)) / max(float(np.var(gyro.gyro_angle)), 1e-300)
 
 
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
@@ -666,6 +666,10 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     """
     for log in logs.values():
         _refuse_own_reference(log)
+    chosen = {path: choose_reference(log) for path, log in logs.items()}
+    # the rate alone, where the gyro shows that the heading is wrong
+    alone = {path: each for path, (each, _) in chosen.items() if each.reference_heading is None}
+    logs, remarks = {**logs, **alone}, [each for path in alone for each in chosen[path][1]]
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
     if method == 'dwells' or method is None and (others or any(
             log.time is None or log.reference_rate is not None or log.reference_heading is None
@@ -676,6 +680,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                                  else extract_dwells(log, min_share=(
                                      MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE))
                                  for path, log in logs.items()])
+            table = replace(table, remarks=(*remarks, *table.remarks))
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
                 return (SelectedEffects(fit_effects(table, effects), (), ()) if effects
@@ -694,10 +699,10 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     if log.reference_heading is not None:
         return found
     return replace(found, remarks=(
-        f'the log has a reference rate, which is constant {_MIN_DWELLS - 1} times at most, or for '
-        f'up to {100.0 * FEW_DWELLS_SHARE:g} % of the time; so the rate is integrated, and '
-        'headings are compared. For other effects than bias and scale factor error, hold each '
-        'rate for some seconds', *found.remarks))
+        *remarks, 'the log has a reference rate, which is constant '
+        f'{_MIN_DWELLS - 1} times at most, or for up to {100.0 * FEW_DWELLS_SHARE:g} % of the '
+        'time; so the rate is integrated, and headings are compared. For other effects than bias '
+        'and scale factor error, hold each rate for some seconds', *found.remarks))
 
 
 def _refuse_own_reference(log: Log) -> None:

@@ -31,8 +31,10 @@ from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
-#: Delays of the gyro behind a reference that are tried, s.
-_TRIAL_DELAYS = tuple(0.1 * each for each in range(-15, 16))
+#: Delays of the gyro behind a reference that are tried, and those around the best, s; and the
+#: rows that are compared.
+_TRIAL_DELAYS, _FINE_DELAYS = (0.1 * np.arange(-15.0, 16.0)).tolist(), 0.01 * np.arange(-9.0, 10.0)
+_TRIAL_ROWS = 5000
 #: Largest error of an exact reference heading as a share of the difference of the headings over a
 #: second: a fifth of its variance.
 _MAX_HEADING_ERROR_SHARE = 0.25
@@ -139,6 +141,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     if own.sum() < 2 * _BLOCK_SAMPLES:
         return HeadingDifference(0.0, 0.0)
     signals = [integrate_with_curvature(stamps, output), output, np.gradient(output, stamps)]
+    sample, white = float(np.median(np.diff(stamps))), white_noise_deviation(output)
     heading, time, *crossing = (each[own] for each in (
         log.reference_heading, stamps, *cross_rotation(log).T))
     # a slow reference has its values at the samples next to its own instants
@@ -146,23 +149,34 @@ def heading_difference(log: Log) -> HeadingDifference:
     interval = float(apart[apart < 2.0 * np.median(apart)].mean())
     longest = max(round(_COMPARISON_SPAN / interval), 4)
 
-    def find_variance(lag: int, delay: float) -> float:
+    def find_variance(lag: int, delay: float, every: int = 1) -> float:
         """Return the variance of second differences, rad²; nan where too few are known."""
-        at = time + delay
-        delayed = [np.interp(at, stamps, each) for each in signals]
-        off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
-                         for each in (heading - delayed[0], *delayed, *crossing))
-        known = ((np.abs(time[2 * lag:] - time[:-2 * lag] - 2.0 * lag * interval) < interval)
-                 & (at[:-2 * lag] >= stamps[0]) & (at[2 * lag:] <= stamps[-1]))
+        begin, middle, end = (np.arange(shift, len(time) - 2 * lag + shift, every)
+                              for shift in (0, lag, 2 * lag))
+        known = ((np.abs(time[end] - time[begin] - 2.0 * lag * interval) < interval)
+                 & (time[begin] + delay >= stamps[0]) & (time[end] + delay <= stamps[-1]))
         if np.count_nonzero(known) <= 2 * _BLOCK_SAMPLES:
             return math.nan
-        columns = np.column_stack(motions)[known]
-        left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
-        return float(np.quantile(np.abs(left), 0.9)) ** 2 / float(stats.norm.isf(0.05)) ** 2
+        rows = [each[known] for each in (begin, middle, end)]
+        off, *columns = (first - 2.0 * second + third for first, second, third in (
+            *([each[part] for part in rows] for each in (heading, *crossing)),
+            *([np.interp(time[part] + delay, stamps, each) for part in rows]
+              for each in signals)))
+        values = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)[0]
+        left = off - np.column_stack(columns) @ values
+        # the noise of the output, and that of its slope, in what a delay and a lag explain
+        by_output = 6.0 * (values[-2] ** 2 + 0.5 * (values[-1] / sample) ** 2) * white ** 2
+        return max(float(np.quantile(np.abs(left), 0.9)) ** 2 / float(stats.norm.isf(0.05)) ** 2
+                   - by_output, 0.0)
 
-    at_delays = {delay: find_variance(longest, delay) for delay in _TRIAL_DELAYS}
     # a delay that explains less than half is chance
-    delay = min((0.0, *at_delays), key=lambda each: at_delays[each] * (2.0 if each else 1.0))
+    usual, delay = find_variance(longest, 0.0), 0.0
+    if tried := [each for each in (
+            (find_variance(longest, delay, max(len(time) // _TRIAL_ROWS, 1)), delay)
+            for delay in _TRIAL_DELAYS) if each[0] < 0.5 * usual]:
+        delay = min(tried)[1]
+        delay = min((find_variance(longest, near, max(len(time) // _TRIAL_ROWS, 1)), near)
+                    for near in (delay + _FINE_DELAYS).tolist())[1]
     variance = {lag / longest: find_variance(lag, delay) for lag in (
         *(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest)}
     variance = {part: each for part, each in variance.items() if not math.isnan(each)}

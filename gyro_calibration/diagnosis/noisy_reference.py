@@ -54,6 +54,7 @@ from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
@@ -309,7 +310,7 @@ def _step_parameters(fit: SpanFit, term: CauseTerm, size: Estimate) -> dict[str,
         last = outside[after] if after < len(outside) else len(times) - 1
         interval = float(times[first]), float(times[last])
         inside = slice(first, last + 1)
-        weights = np.exp(-lack[inside]) / np.sum(np.exp(-lack[inside]))
+        weights = softmax(-lack[inside])
         of_time = float(weights @ (sizes[inside] - weights @ sizes[inside]) ** 2)
         times = np.linspace(*interval, 100)
     half = 0.5 * (size.interval[1] - size.interval[0])

@@ -574,12 +574,16 @@ def _heading_rates(time: Array, heading: Array) -> tuple[Array, Array]:
     return np.where(near, np.nan, rate), rate
 
 
+def find_delay(time: Array, output: Array, rate: Array) -> float:
+    """Return the delay of the output behind a rate by which they agree best, to 0.05 s."""
+    known = np.isfinite(output)
+    return fit_profile(split_run(time[known], output[known]), motion_from_rates(time, rate),
+                       COURSE_TREATMENT.largest_delay)[2]
+
+
 def _residual_without_delay(time: Array, output: Array, rate: Array) -> Array:
     """Return what the rate at the best delay leaves of the output, rad/s."""
-    known = np.isfinite(output)
-    _, _, delay = fit_profile(split_run(time[known], output[known]),
-                              motion_from_rates(time, rate), COURSE_TREATMENT.largest_delay)
-    left = output
+    known, delay, left = np.isfinite(output), find_delay(time, output, rate), output
     for _ in range(3):  # the slope, in which noise has no part, shows what the delay lacks
         late = np.interp(time - delay, time, rate)
         columns = np.column_stack([np.ones(len(time)), late, np.gradient(late, time)])
