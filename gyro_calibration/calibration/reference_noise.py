@@ -162,21 +162,20 @@ def heading_difference(log: Log) -> HeadingDifference:
             *([each[part] for part in rows] for each in (heading, *crossing)),
             *([np.interp(time[part] + delay, stamps, each) for part in rows]
               for each in signals)))
-        values = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)[0]
-        left = off - np.column_stack(columns) @ values
+        design = np.column_stack(columns)
+        values = np.linalg.lstsq(design, off, rcond=None)[0]
+        left = off - design @ values
         # the noise of the output, and that of its slope, in what a delay and a lag explain
         by_output = 6.0 * (values[-2] ** 2 + 0.5 * (values[-1] / sample) ** 2) * white ** 2
         return max(float(np.quantile(np.abs(left), 0.9)) ** 2 / float(stats.norm.isf(0.05)) ** 2
                    - by_output, 0.0)
 
     # a delay that explains less than half is chance
-    usual, delay = find_variance(longest, 0.0), 0.0
-    if tried := [each for each in (
-            (find_variance(longest, delay, max(len(time) // _TRIAL_ROWS, 1)), delay)
-            for delay in _TRIAL_DELAYS) if each[0] < 0.5 * usual]:
-        delay = min(tried)[1]
-        delay = min((find_variance(longest, near, max(len(time) // _TRIAL_ROWS, 1)), near)
-                    for near in (delay + _FINE_DELAYS).tolist())[1]
+    usual, delay, every = find_variance(longest, 0.0), 0.0, max(len(time) // _TRIAL_ROWS, 1)
+    if tried := [each for each in ((find_variance(longest, trial, every), trial)
+                                   for trial in _TRIAL_DELAYS) if each[0] < 0.5 * usual]:
+        delay = min((find_variance(longest, near, every), near)
+                    for near in (min(tried)[1] + _FINE_DELAYS).tolist())[1]
     variance = {lag / longest: find_variance(lag, delay) for lag in (
         *(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest)}
     variance = {part: each for part, each in variance.items() if not math.isnan(each)}

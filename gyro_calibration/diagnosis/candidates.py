@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 import math
 
-from gyro_calibration.diagnosis.replay import find_delay, Replay
+from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.effects import CATALOGUE
@@ -238,14 +238,13 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     # At a lower step rate the quantization of the encoder passes for a dead zone.
     slowest = max(1e-5 * fastest,
                   _MIN_ENCODER_STEP_RATE * max(each.heading_step for each in replays))
-    delays = {find_delay(each.channels.time, each.channels.output, each.channels.rate)
-              for each in replays}
     distortions = {
         'sine_response': [angle / fastest for angle in (0.5, 1.0, 1.5, 2.0)],
         'dead_zone': np.geomspace(slowest, 0.5 * fastest, 14).tolist(),
         'saturation': [limit * fastest for limit in (0.5, 0.65, 0.8, 0.9, 0.97)],
         'time_offset': [*(sign * offset for offset in (0.2 * interval, 0.02, 0.1, 0.3)
-                          for sign in (1.0, -1.0)), *filter(None, delays)],
+                          for sign in (1.0, -1.0)),
+                        *filter(None, {each.delay for each in replays})],
         'bandwidth': [0.2 * interval, 0.01, 0.03, 0.1, 0.3], 'clock_rate': [1e-6]}
     for name, sizes in distortions.items():
         yield from (effect_candidate(name, size) for size in sizes)

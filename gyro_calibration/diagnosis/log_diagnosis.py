@@ -47,7 +47,7 @@ from gyro_calibration.diagnosis.reference_lag import (
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise, build_problem, fit_causes, forget_fits, is_single_event, RegressionFit,
     SMOOTHED_RATIO, Value)
-from gyro_calibration.diagnosis.replay import find_delay, Replay, replay
+from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, heading_error_curve, model_residuals,
     NOISE_NAMES, residual_curves)
@@ -312,11 +312,10 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
 def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
     """Return the logs of a fit without samples of which a delay or lag hides the motion."""
     replays = plain.problem.replays
-    delays = {find_delay(each.channels.time, each.channels.output, each.channels.rate)
-              for each in replays}
+    delays = {0.1, -0.1, *filter(None, (each.delay for each in replays))}
     late, likelihood = max((refine_shape(plain, effect_candidate(name, first)) for name, first in (
-        *(('time_offset', each) for each in {0.1, -0.1, *filter(None, delays)}),
-        ('bandwidth', 0.1))), key=lambda each: each[1])
+        *(('time_offset', each) for each in delays), ('bandwidth', 0.1))),
+        key=lambda each: each[1])
     size = late.shapes[0]
     if p_value(late.cause, likelihood - plain.log_likelihood) > rate:
         return replays

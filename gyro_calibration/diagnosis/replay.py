@@ -208,6 +208,11 @@ class Replay:
         """Return the length of the log, s."""
         return self.point_count * self.point_interval
 
+    @cached_property
+    def delay(self) -> float:
+        """Return the delay of the output behind the reference, s, by which they agree best."""
+        return find_delay(self.channels.time, self.channels.output, self.channels.rate)
+
     def lagged(self, channel: str, time_constant: float) -> Array:
         """Return a channel through a first-order lag, shape (n,)."""
         assert self.channels.lagged is not None
