@@ -63,7 +63,7 @@ from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import expit
@@ -92,7 +92,7 @@ _MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
 #: which has no wheels. A scale of odometry is wrong as probably as it is right.
 _WIDE_PRIOR, _WIDE_ODDS_OF_COURSE = (0.3, 10.0 * DEGREE), 1e-3
 #: Prior standard deviation of the smoothing of a course, s².
-_SMOOTHING_DEVIATION = 0.1
+SMOOTHING_DEVIATION = 0.1
 #: Correlations of the errors of a course over a span that are possible.
 _COURSE_CORRELATIONS = (0.0, 0.2, 0.4, 0.6, 0.8)
 #: Names of the values that are always fitted.
@@ -219,10 +219,11 @@ class Spans:
 
     @property
     def time_outside(self) -> Array:
-        """Return the time of each point before the log of the gyro, or after it, s, (n + 1,)."""
+        """Return the mean time of each point before the log of the gyro, or after it, (n + 1,)."""
         assert self.log.time is not None
-        at = self.gyro_stamps(self.time)
-        return at - np.clip(at, self.log.time[0], self.log.time[-1])
+        at = self.gyro_stamps(self.value_times)
+        outside = at - np.clip(at, self.log.time[0], self.log.time[-1])
+        return np.bincount(self.point_index, outside) / np.bincount(self.point_index)
 
     @property
     def stretch_numbers(self) -> NDArray[np.intp]:
@@ -322,19 +323,31 @@ class Spans:
         """Return the stamps of the gyro at times of the reference, s."""
         return (time + self.delay) / (1.0 + self.clock_rate)
 
-    def point_means(self, values: Array) -> Array:
-        """Return the means of a signal at the points, corrected for the delay, shape (n + 1,)."""
+    def point_means(self, values: Array, slopes: Array | None = None) -> Array:
+        """
+        Return the means of a signal at the points, corrected for the delay, shape (n + 1,).
+
+        Between samples it is a line, or a cubic with its slopes, if these are given.
+        """
         assert self.log.time is not None
-        delayed_values = np.interp(self.gyro_stamps(self.value_times), self.log.time, values)
-        return np.bincount(self.point_index, delayed_values) / np.bincount(self.point_index)
+        time = self.log.time
+        # a change of code is the mean of two samples, between which the signal may be curved
+        half = 0.5 * self.uses_code_changes * float(np.median(np.diff(time)))
+        total: Array = np.zeros(len(self.time))
+        for shift in sorted({-half, half}):
+            at = np.clip(self.gyro_stamps(self.value_times + shift), time[0], time[-1])
+            total += np.bincount(self.point_index, np.interp(at, time, values) if slopes is None
+                                 else CubicHermiteSpline(time, values, slopes)(at))
+        return total / len({-half, half}) / np.bincount(self.point_index)
 
     def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
         rate = np.broadcast_to(rate, self.log.time.shape)
+        moving: Array = rate * self.is_in_motion
         whole, in_motion = (integrate_with_curvature(self.log.time, each)
-                            for each in (rate, rate * self.is_in_motion))
-        return self.is_measured * np.append(np.diff(self.point_means(in_motion)),
+                            for each in (rate, moving))
+        return self.is_measured * np.append(np.diff(self.point_means(in_motion, moving)),
                                             np.diff(whole[self.rests])[:, 0])
 
     def span_changes(self, values: Array) -> Array:
@@ -351,6 +364,17 @@ class Spans:
             self.log.output)
 
     @cached_property
+    def _motion_share(self) -> Array:
+        """Return the share of the motion in the power of each cosine of the rate, shape (m,)."""
+        rate = np.asarray(self.channels.rate)
+        power = uniform_filter1d(dct(rate, norm='ortho') ** 2, _SPECTRUM_BINS)
+        return np.maximum(1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300), 0.0)
+
+    def _smooth(self, rate: Array) -> Array:
+        """Return a rate by a Wiener filter, rad/s, shape (m,)."""
+        return np.asarray(idct(self._motion_share * dct(rate, norm='ortho'), norm='ortho'))
+
+    @cached_property
     def smooth_rate(self) -> Array:
         """
         Return the rate by a Wiener filter of its cosines, rad/s, shape (m,).
@@ -358,11 +382,7 @@ class Spans:
         The changes of the rate from point to point, in which a delay shows, are mostly white noise
         in a slow motion; as a column it would pass for information.
         """
-        rate = np.asarray(self.channels.rate)
-        cosines = dct(rate, norm='ortho')
-        power = uniform_filter1d(cosines ** 2, _SPECTRUM_BINS)
-        share = 1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300)
-        return np.asarray(idct(np.maximum(share, 0.0) * cosines, norm='ortho'))
+        return self._smooth(np.asarray(self.channels.rate))
 
     def rate_columns(self) -> Array:
         """Return the columns of scale factor error and bias, shape (n + r, 2)."""
@@ -439,7 +459,7 @@ class Spans:
         turned = integrate_with_curvature(self.log.time, rate)
         # the heading of the reference, between its points that of the gyro
         at = (1.0 + moved.clock_rate) * self.log.time - moved.delay
-        heading_change: Array = self.heading - moved.point_means(turned)
+        heading_change: Array = self.heading - moved.point_means(turned, rate)
         if self.treatment.is_fine:
             heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
@@ -491,18 +511,40 @@ class Spans:
         if self.rest_rounding:
             single.append(('rounding', np.append(np.zeros(len(self.time) - 1),
                                                  self.rest_durations), self.rest_rounding))
-        # a smoothed course errs in proportion to the acceleration, by less than this, s²; the
-        # variance of the times by which a motion is late is seldom above their mean squared
-        smoothing = (0.5 * self.delay ** 2 * self.treatment.is_followed if self.treatment.is_fine
-                     else _SMOOTHING_DEVIATION)
+        # a smoothed reference errs in proportion to the acceleration, by less than this, s²; the
+        # variance of the times by which one of both is late is seldom above their mean squared
+        smoothing, changes = SMOOTHING_DEVIATION, self.acceleration_changes
+        if self.treatment.is_fine:
+            smoothing, changes = min(0.5 * self.delay ** 2, smoothing), self._likely_lag_column
         if smoothing:
-            single.append(('smoothing', self.acceleration_changes(), smoothing))
+            single.append(('smoothing', changes(), smoothing))
         for name, column, size in single:
             waves = np.column_stack([waves, column])
             parts = [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
                      SharedNoise(name, np.append(np.zeros(waves.shape[1] - 1), 1.0),
                                  (size, size))]
         return waves, parts
+
+    def _likely_lag_column(self) -> Array:
+        """
+        Return the column of a lag without its noise, shape (n + r,).
+
+        What scale factor error, bias and delay do not explain of it may be noise of the gyro,
+        which would pass for information about the lag. It is left out unless the reference shows
+        most of it too, less two standard deviations.
+        """
+        assert self.log.time is not None and self.log.output is not None
+        time, columns = self.log.time, self.base_columns()
+        column = self.cause_columns(CauseTerm('bandwidth'))[:, 0]
+        turned = np.column_stack([self.point_means(integrate_with_curvature(
+            time, self.log.output), self.log.output), self.heading])
+        rates = CubicSpline(self.time, turned)((1.0 + self.clock_rate) * time - self.delay, 1).T
+        both = np.column_stack([column, *(
+            -self.span_changes(np.gradient(self._smooth(each), time)) for each in rates)])
+        left = both - columns @ np.linalg.lstsq(columns, both, rcond=None)[0]
+        own, common, other = (left[:, one] @ left[:, two] for one, two in ((1, 1), (1, 2), (2, 2)))
+        chance = 2.0 * math.sqrt(own * other / max(float(self._motion_share.sum()), 1.0))
+        return np.asarray(column if common - chance > 0.5 * own else column - left[:, 0])
 
     def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""

@@ -235,9 +235,11 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
                                    half_width=1.5 * spacing)
     if not moves:
         return
-    # At a lower step rate the quantization of the encoder passes for a dead zone.
-    slowest = max(1e-5 * fastest,
-                  _MIN_ENCODER_STEP_RATE * max(each.heading_step for each in replays))
+    # At lower rates the quantization of the encoder, or the largest noise of a heading in a log,
+    # passes for a dead zone.
+    slowest = max(1e-5 * fastest, *(
+        max(_MIN_ENCODER_STEP_RATE * each.heading_step, each.heading_noise / each.interval
+            * math.sqrt(2.0 * math.log(each.point_count))) for each in replays))
     distortions = {
         'sine_response': [angle / fastest for angle in (0.5, 1.0, 1.5, 2.0)],
         'dead_zone': np.geomspace(slowest, 0.5 * fastest, 14).tolist(),

@@ -174,6 +174,10 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     searched = _search_logs(logs, replays, rate, on_progress, is_command)
     search = searched.search
     selection = confirm_causes(search, searched.causes)
+    delays = [each.shapes[0] for each in selection.named if each.cause == 'time_offset']
+    if delays and 'bandwidth' not in {each.cause for each in selection.named}:
+        search = replace(search, problem=build_problem(
+            [each.with_possible_lag(delays[0]) for each in search.problem.replays]))
     if searched.followed is not None and selection.unnamed and len(logs) == 1:
         return _diagnose_by_spans(logs[0], searched, replays[0], references[0], model, rate,
                                   on_progress)
@@ -359,7 +363,7 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
     replay = fit.problem.replays[0]
-    if not follows and len(replay.rounding):  # it rests where the rate does
+    if not follows and len(replay.shared_errors):  # it rests where the rate does
         return None
     if follows:  # whitening would spread what is between dwells
         left, inside = fit.unbiased_residuals[0][replay.valid], within[replay.valid]
@@ -370,7 +374,7 @@ def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
     squares = np.add.reduceat(left ** 2, begin) / np.diff(np.append(begin, len(left)))
     steady, between = squares[inside[begin]], squares[~inside[begin]]
-    if len(replay.rounding):
+    if len(replay.shared_errors):
         steady = np.maximum(steady, replay.output_step ** 2 / 12.0)
     if (min(len(steady), len(between)) < MIN_STRETCHES
             or not follows and np.median(between) < 2.0 * np.median(steady)):

@@ -318,9 +318,12 @@ class RegressionFit:
                       else [one.value for one in self.coefficients(place)])
             for value, column in zip(values, known.columns(new)):
                 found[known.cause] = found.get(known.cause, 0.0) + value * column
-        if replay.command is not None or len(replay.rounding):
+        if replay.command is not None or len(replay.shared_errors):
             fitted = self.problem.replays[log_index]
-            found['quantization' if replay.command is None else 'reference'] = fitted.response(
+            # errors by quantization are several; one alone is that of a lag
+            name = ('quantization' if replay.command is None and len(replay.shared_errors) > 1
+                    else 'reference')
+            found[name] = fitted.response(
                 replay.channels.output - replay.reference - np.asarray(sum(found.values())))
         return found
 
@@ -359,8 +362,8 @@ class RegressionFit:
                 continue
             means[rank] = np.mean([(part - each.response(part))[each.valid].mean()
                                    for part, each in zip(parts, self.distorted)])
-        rounding = [each.rounding_bias_variance for each in self.problem.replays]
-        return float(means @ self.estimates[1] @ means + np.mean(rounding) / len(rounding))
+        shared = [each.shared_bias_variance for each in self.problem.replays]
+        return float(means @ self.estimates[1] @ means + np.mean(shared) / len(shared))
 
 
 def is_single_event(cause: Candidate) -> bool:

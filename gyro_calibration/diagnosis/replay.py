@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 import math
 
-from gyro_calibration.calibration.heading_regression import COURSE_TREATMENT
+from gyro_calibration.calibration.heading_regression import COURSE_TREATMENT, SMOOTHING_DEVIATION
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.diagnosis.gates import (
     heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
@@ -35,7 +35,7 @@ from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
 from gyro_calibration.logs.quality import find_runs, white_noise_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.channels import channels_from_log
-from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.effects import CATALOGUE, Channels
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
@@ -183,12 +183,13 @@ class Replay:
     # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
     output_step: float = 0.0  # quantization step of the output, rad/s; 0 if it does not matter
-    # independent errors by quantization of the output, shape (m, n); commanded rate, shape (n,),
-    # and independent responses to it, shape (k, lags), if the motion follows the command. Each is
-    # of one standard deviation of its prior, in units of the noise; what they explain is taken out
-    # of the residual and all columns
-    rounding: Array = field(default_factory=lambda: np.empty((0, 0)))
-    rounding_scale: float = 0.0  # deviation of the noise of a point, rad/s
+    # independent errors by quantization of the output, and that by a lag that is not found, shape
+    # (m, n); commanded rate, shape (n,), and independent responses to it, shape (k, lags), if the
+    # motion follows the command. Each is of one standard deviation of its prior, in units of the
+    # noise; what they explain is taken out of the residual and all columns
+    shared_errors: Array = field(default_factory=lambda: np.empty((0, 0)))
+    error_scale: float = 0.0  # deviation of the noise of a point, rad/s
+    rounding_variance: float = 0.0  # that of a sample by quantization that is noise, (rad/s)²
     command: Array | None = None
     responses: Array = field(default_factory=lambda: np.empty((0, 0)))
     response_noise: NoiseShape = NoiseShape()  # noise under which the response is fitted
@@ -305,7 +306,7 @@ class Replay:
     @cached_property
     def _response_basis(self) -> tuple[Array, Array, Array, Array]:
         """
-        Return responses to the command, and errors by quantization, with independent transforms.
+        Return responses to the command, and shared errors, with independent transforms.
 
         Their transforms, weighted by the noise and not, shape (k + m, points - 1), with products
         1; the sizes of those of this log in each, (k + m, k + m); and their variance by the prior
@@ -313,7 +314,7 @@ class Replay:
         """
         columns = np.array([self._transform(each) for each in (
             *(self.delayed_commands(self.responses) if len(self.responses) else ()),
-            *self.rounding)])
+            *self.shared_errors)])
         weighted = columns / self.response_variance()
         ratios, vectors = np.linalg.eigh(weighted @ columns.T)
         ratios = np.maximum(ratios, np.finfo(float).eps * ratios[-1] + np.finfo(float).tiny)
@@ -322,37 +323,48 @@ class Replay:
 
     def _without_response(self, transform: Array) -> Array:
         """Return a transform that has the same variance whether along responses or not."""
-        if not len(self.responses) + len(self.rounding):
+        if not len(self.responses) + len(self.shared_errors):
             return transform
         weighted, basis, _, ratios = self._response_basis
         return transform - (weighted @ transform) * (1.0 - (1.0 + ratios) ** -0.5) @ basis
 
     def response(self, values: Array) -> Array:
-        """Return the likeliest response, and error by quantization, in samples, rad/s, (n,)."""
-        if not len(self.responses) + len(self.rounding):
+        """Return the likeliest response, and shared error, in samples, rad/s, (n,)."""
+        if not len(self.responses) + len(self.shared_errors):
             return np.zeros(len(values))
         weighted, _, scaled, ratios = self._response_basis
         sizes = (weighted @ self._transform(values) * ratios / (1.0 + ratios)) @ scaled
         late, rounded = np.split(sizes, [len(self.responses)])
-        total = rounded @ self.rounding if len(rounded) else np.zeros(len(values))
+        total = rounded @ self.shared_errors if len(rounded) else np.zeros(len(values))
         return (total + next(self.delayed_commands((late @ self.responses)[None])) if len(late)
                 else total)
 
     @property
-    def rounding_variance(self) -> float:
-        """Return the variance of a sample by quantization that is noise, (rad/s)²."""
-        errors = self.rounding_scale * self.rounding
-        return max(self.output_step ** 2 / 12.0 - float(np.sum(errors ** 2))
-                   / len(self.channels.time), 0.0)
-
-    @property
-    def rounding_bias_variance(self) -> float:
-        """Return the variance of the bias by quantization of the output, (rad/s)²."""
-        if not len(self.rounding):
+    def shared_bias_variance(self) -> float:
+        """Return the variance of the bias by the shared errors, (rad/s)²."""
+        if not len(self.shared_errors):
             return 0.0
         _, _, scaled, ratios = self._response_basis
-        means = scaled[:, len(self.responses):] @ self.rounding[:, self.valid].mean(axis=1)
-        return self.rounding_scale ** 2 * float(means ** 2 @ (ratios / (1.0 + ratios)))
+        means = scaled[:, len(self.responses):] @ self.shared_errors[:, self.valid].mean(axis=1)
+        return self.error_scale ** 2 * float(means ** 2 @ (ratios / (1.0 + ratios)))
+
+    def with_possible_lag(self, delay: float) -> Replay:
+        """
+        Return the log with the error that a lag has beside a delay, s, in its shared errors.
+
+        The variance of the times by which gyro or reference is late is from 0 to the square of
+        their mean, of a lag of first order. It is a standard deviation of its prior.
+        """
+        time = self.channels.time
+        distort = CATALOGUE['time_offset'].distortion
+        assert distort is not None
+        late = distort(self.channels.rate, time, delay)
+        error = min(0.5 * delay ** 2, SMOOTHING_DEVIATION) * np.gradient(
+            np.gradient(late, time), time)
+        left = self.resample(self.channels.output - self.reference + self.channels.rate - late)
+        scale = self.error_scale or max(white_noise_deviation(left), np.finfo(float).tiny)
+        return replace(self, error_scale=scale, shared_errors=np.concatenate(
+            [self.shared_errors.reshape(-1, len(time)), error[None] / scale]))
 
     def with_motion(self, added: Array) -> Replay:
         """Return the log with more motion, rad/s, shape (n,), in the reference and for effects."""
@@ -430,6 +442,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
         heading = integrate_trapezoidal(time, np.nan_to_num(smooth))
     rounding, scale = (_rounding_errors(log.output, smooth, kept, output_step) if output_step
                        else (np.empty((0, 0)), 0.0))
+    rounding_noise = output_step ** 2 / 12.0 - float(np.sum((scale * rounding) ** 2)) / len(time)
     channels = replace(channels_from_log(prepared_log), rate=smooth, time=time, heading=heading,
                        output=log.output)
     has = frozenset(name for name, known in (
@@ -438,7 +451,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     filling = generator.standard_normal(place[-1] + 1)
     plain = Replay(channels, reference, kept, place, interval, every, filling,
                    heading_step if is_heading else 0.0, noise, has, np.zeros(len(time)),
-                   output_step, rounding * math.sqrt(every), scale / math.sqrt(every))
+                   output_step, rounding * math.sqrt(every), scale / math.sqrt(every),
+                   max(rounding_noise, 0.0))
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate

@@ -453,7 +453,7 @@ _SIGNAL_EFFECTS = (
     Effect(
         'time_offset', 'The stamps of the samples are late by a constant time.',
         nonlinear_parameters=(Parameter('time_offset', 's',
-                                        bounds=(-1.0, 1.0)),), experiment=_FAST_REVERSALS,
+                                        bounds=(-2.0, 2.0)),), experiment=_FAST_REVERSALS,
         distortion=lambda signal, time, offset: _interpolate(time - offset, time, signal),
         stage='rate', correct_stamps=lambda time, offset: time - offset, along='rate_change',
         not_compensated='It is compensated by shifting the stamps; the delay for a controller '

@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.noisy_reference import select_causes
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
-from gyro_calibration.model.effects import BIAS
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
 import numpy as np
@@ -87,6 +87,44 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
     assert {'given', 'plain', 'extended'} <= set(told['gain'])
     assert ('course over ground' in ' '.join(terminal_lines(found))
             and 'course over ground' in render_report(found))
+
+
+@pytest.mark.parametrize('hertz, frequencies, late, lag, noise, step', (
+    (20.0, (0.012, 0.03, 0.05, 0.09), 0.169, 0.0, 0.0, 0.01),
+    (20.0, (0.22,), -0.96, 0.1, 0.0, 0.0),
+    (10.0, (0.25, 0.6, 0.95), -0.04, 0.015, 0.0, 0.1),
+    (20.0, (0.015, 0.04, 0.085), 1.42, 0.0, 0.0015, 0.0)))
+def test_what_a_delay_and_samples_hide_is_in_the_interval_of_the_scale(
+        hertz, frequencies, late, lag, noise, step):
+    """The gyro is late by a delay, and by a lag; motions are sums of sines, at few samples."""
+    generator = np.random.default_rng(5)
+    time, omega = np.arange(0.0, 200.0, 1.0 / hertz), 2.0 * np.pi * np.array(frequencies)
+    waves = np.exp(1j * generator.uniform(0.0, 2.0 * np.pi, len(omega)))
+    seen = waves / (1.0 + 1j * omega * lag)
+    output = ((1.0 + SCALE) * (np.exp(1j * np.outer(time, omega)) @ seen).imag + BIAS_TRUE
+              + 0.02 * DEGREE * generator.standard_normal(len(time)))
+    heading = (np.exp(1j * np.outer(time + late, omega)) @ (waves / (1j * omega))).imag
+    heading = heading + noise * DEGREE * generator.standard_normal(len(time))
+    if step:
+        heading = step * DEGREE * np.rint(heading / (step * DEGREE))
+    found = diagnosed(Log(output=output, time=time, reference_heading=heading))
+    assert {each.effect for each in found.findings if each.status == 'established'} <= {
+        'time_offset', 'reference_quantization'}, terminal_lines(found)
+    scale, deviation = next(each[2:4] for each in found.model.estimates()
+                            if each[0] == SCALE_FACTOR_ERROR.name)
+    assert abs(scale - SCALE) < 3.0 * deviation
+
+
+def test_the_noise_of_a_fine_heading_is_no_dead_zone():
+    generator = np.random.default_rng(6)
+    time = np.arange(0.0, 150.0, 0.02)
+    rate = np.where(time % 10.0 < 4.0, 40.0 * DEGREE * np.sin(np.pi * time / 4.0) ** 2, 0.0)
+    rate *= np.where(time % 20.0 < 10.0, 1.0, -1.0)
+    heading = (np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]))) * 0.02
+               + 0.001 * DEGREE * generator.standard_normal(len(time)))
+    output = rate + BIAS_TRUE + 0.05 * DEGREE * generator.standard_normal(len(time))
+    found = diagnosed(Log(output=output, time=time, reference_heading=heading))
+    assert not found.findings, terminal_lines(found)
 
 
 def test_nothing_is_compared_across_a_hole_in_the_samples():
