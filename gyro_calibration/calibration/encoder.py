@@ -29,6 +29,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
     Dwells, extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
@@ -58,7 +59,7 @@ from gyro_calibration.logs.log import (
     Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_holes, quantization_step, refuse_dead,
-    white_noise_deviation)
+    robust_deviation, white_noise_deviation)
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -177,7 +178,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
                 chosen.append(f'{hole}, over which they are not compared')
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
-        log, jumps = _bridge_jumps(log)
+        log, jumps, _ = bridge_jumps(log)
         if jumps:
             time, output, motion, crossing = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
@@ -268,9 +269,20 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
-def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
+class HeadingJumps(NamedTuple):
+    """Jumps of a reference heading that the gyro does not show."""
+
+    rows: NDArray[np.intp]  # first rows after them
+    sizes: Array  # rad, of each
+    deviation: float  # standard deviation of a size, rad
+    p_value: float  # chance of the largest in noise
+
+
+def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
     """
     Return a log whose reference heading continues over its jumps as the gyro does, and a remark.
+
+    Also the jumps, if there are any.
 
     A jump is a change from one value to the next beyond all rates of the gyro around it, and
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
@@ -278,40 +290,58 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     motion that the gyro does not measure.
     """
     if log.time is None or log.output is None or log.reference_heading is None:
-        return log, []
+        return log, [], None
     time, output = log.time, bridge_gaps(log.output)
     heading = np.asarray(keep_own_instants(log)[0].reference_heading)
     known = np.flatnonzero(np.isfinite(heading))
+    if len(known) < 2:
+        return log, [], None
     apart, turned = np.diff(time[known]), np.diff(heading[known])
+    since = time - time[known[0]]
+    possible = np.clip(turned, output.min() * apart, output.max() * apart)
+    delay = fit_profile(split_run(since, output), motion_from_headings(
+        since[known], np.append(0.0, np.cumsum(possible))), COURSE_TREATMENT.largest_delay)[2]
+    output = np.interp(since + delay, since, output)
     difference = turned - np.diff(integrate(time, output)[known])
-    late = COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))
+    late = MAX_ENCODER_OFFSET / float(np.median(np.diff(time)))
     around = 2 * math.ceil(min(late, len(time))) + 1
     slowest, fastest = (find(output, around)[known[1:]] * apart
                         for find in (minimum_filter1d, maximum_filter1d))
-    beyond = np.maximum(turned - fastest, slowest - turned) - quantization_step(heading[known])
-    usual = apart < 1.5 * np.median(apart)
+    # a turn that the gyro shows late, or not at first, has such turns before and after it
+    padded = np.pad(turned, 1, mode='edge')
+    alone = turned - 0.5 * (padded[2:] + padded[:-2])
+    beyond = np.minimum(np.maximum(turned - fastest, slowest - turned),
+                        alone * np.sign(difference)) - quantization_step(heading[known])
+    usual = (apart < 1.5 * np.median(apart)) & (np.abs(
+        since[known[1:]] + delay - 0.5 * since[-1]) < 0.5 * since[-1])
     low, high = np.quantile(np.abs(difference[usual]), 1.0 - _TAIL_SHARE * np.array([2.0, 1.0]))
     noise = high + (high - low) * math.log2(
         max(_TAIL_SHARE * len(known) / FALSE_ALARM_RATE, 1.0))
     above = usual & (beyond > noise)
-    alone = np.convolve(above, np.ones(3), 'same') == 1.0
-    jumps = known[1:][above & alone]
+    once = above & (np.convolve(above, np.ones(3), 'same') == 1.0)
+    jumps = known[1:][once]
     back = above[:-1] & above[1:] & (np.abs(difference[:-1] + difference[1:]) <= noise)
     wrong = known[1:-1][back]
     sizes, heading, remarks = np.zeros(len(time)), log.reference_heading.copy(), []
+    found: HeadingJumps | None = None
     if len(wrong):
         heading[wrong] = np.nan
         remarks.append('the reference is off in single values, which are left out, by up to '
                        f'{np.abs(difference[:-1][back]).max() / DEGREE:.1f} deg: '
                        + format_list([f'{time[row]:.2f} s' for row in wrong]))
     if len(jumps):
-        sizes[jumps] = difference[above & alone]
+        # against the gyro, or where its delay matters, against the turns before and after
+        change = min((difference, alone), key=lambda each: robust_deviation(each[usual]))
+        sizes[jumps] = change[once]
+        halvings = (beyond[once].max() - high) / max(high - low, 1e-300)
+        found = HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
+                             _TAIL_SHARE * len(known) * 2.0 ** -min(halvings, 1000.0))
         remarks.append(
             f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
             f'to the next, at {format_list([f"{time[row]:.2f} s" for row in jumps])}, where the '
             'gyro does not turn so fast, as after a lost reference or where rows are missing; the '
             'heading is compared before and after, not over, each jump')
-    return replace(log, reference_heading=heading - np.cumsum(sizes)), remarks
+    return replace(log, reference_heading=heading - np.cumsum(sizes)), remarks, found
 
 
 def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str]]:

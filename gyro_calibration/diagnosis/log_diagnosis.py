@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
-from gyro_calibration.calibration.encoder import choose_reference
+from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings
@@ -123,6 +123,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                              logs=tuple(names[place:place + 1]), gates=passed)
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
+    logs, slips = zip(*(_bridge_jumps(log, each.kind, remarks)
+                        for log, each in zip(logs, references)))
     limiting_logs = [place for place, log in enumerate(logs)
                      if not is_at_rest(log) and is_reference_limiting(log, references[place])]
     if limiting_logs and len(logs) > 1:
@@ -144,8 +146,27 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     if given_model is not None and found.model is model:
         # with its self-calibration separate
         found = replace(found, before=given_model, model=given_model)
-    return replace(found, logs=tuple(names), gates=tuple(all_gates),
+    findings = (*found.findings, *add_remedies(
+        [each for each in slips if each is not None], found.heading_shares, found.model))
+    return replace(found, logs=tuple(names), gates=tuple(all_gates), findings=findings,
                    remarks=(*dict.fromkeys(remarks), *found.remarks))
+
+
+def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding | None]:
+    """Return a log without jumps of its heading, unless it errs so; their finding; add remarks."""
+    if kind in ('course', 'odometry'):
+        return log, None
+    log, bridged, jumps = bridge_jumps(log)
+    remarks += [f'{each[:1].upper()}{each[1:]}.' for each in bridged]
+    if jumps is None:
+        return log, None
+    assert log.time is not None
+    name, largest = 'reference_slip', int(np.abs(jumps.sizes).argmax())
+    times = {f'slip_time_{place}': Estimate(at, (at, at), 's')
+             for place, at in enumerate((log.time[jumps.rows] - log.time[0]).tolist())}
+    size = Estimate.from_half_width(float(jumps.sizes[largest]),
+                                    NORMAL_QUANTILE_975 * jumps.deviation, CAUSES[name].unit)
+    return log, make_finding(name, {name: size, **times}, max(jumps.p_value, MIN_PROBABILITY))
 
 
 def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | None]:

@@ -115,6 +115,25 @@ def test_what_a_delay_and_samples_hide_is_in_the_interval_of_the_scale(
     assert abs(scale - SCALE) < 3.0 * deviation
 
 
+@pytest.mark.parametrize('late', (0.0, 1.2))
+@pytest.mark.parametrize('noise', (0.0, 0.02))
+def test_a_jump_of_the_heading_is_a_slip_of_the_reference_and_changes_nothing_else(noise, late):
+    generator = np.random.default_rng(7)
+    time = np.arange(0.0, 150.0, 0.02)
+    heading = 2.0 * np.sin(0.6 * (time + late)) + 1.5 * np.cos(1.1 * (time + late))
+    output = ((1.0 + SCALE) * (1.2 * np.cos(0.6 * time) - 1.65 * np.sin(1.1 * time)) + BIAS_TRUE
+              + 0.05 * DEGREE * generator.standard_normal(len(time)))
+    heading += (noise * DEGREE * generator.standard_normal(len(time))
+                - 3.0 * DEGREE * (time >= 80.0))
+    found = diagnosed(Log(output=output, time=time, reference_heading=heading))
+    named = {each.effect: each for each in found.findings if each.status == 'established'}
+    assert set(named) - {'time_offset'} == {'reference_slip'}, terminal_lines(found)
+    slip = named['reference_slip'].parameters
+    assert slip['reference_slip'].estimate == pytest.approx(-3.0 * DEGREE, abs=0.2 * DEGREE)
+    assert slip['slip_time_0'].estimate == pytest.approx(80.0)
+    assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.003 * DEGREE)
+
+
 def test_the_noise_of_a_fine_heading_is_no_dead_zone():
     generator = np.random.default_rng(6)
     time = np.arange(0.0, 150.0, 0.02)
