@@ -122,6 +122,17 @@ def test_of_several_logs_the_one_without_a_reference_is_named(run, table, tmp_pa
     assert code == 1 and 'rest.csv: the log has no time or no reference' in error
 
 
+def test_a_gyro_that_counts_clockwise_is_not_fitted(run, tmp_path):
+    time = np.arange(0.0, 60.0, 0.05)
+    rows = zip(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600), np.cos(0.3 * time) / -0.3)
+    path = tmp_path / 'log.csv'
+    path.write_text('time_s,gyro_rad_s,reference_heading_rad\n'
+                    + ''.join(','.join(map(repr, map(float, row))) + '\n' for row in rows))
+    code, text, error = run('fit', path)
+    assert code == 1 and not text and 'give or omit --invert' in error
+    assert run('fit', path, '--invert')[0] == 0
+
+
 def test_an_outlying_dwell_is_named(run, tmp_path):
     dwells = Table().measure(GyroModel(SINE), np.random.default_rng(1))
     dwells.output[30] += 1.0 * DEGREE

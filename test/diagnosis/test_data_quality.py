@@ -19,6 +19,7 @@ from diagnosed import log_of
 from gyro_calibration.diagnosis.data_quality import FALSE_ALARM_CHANCE, inspect_record
 from gyro_calibration.diagnosis.gates import identify_unit_factor, refuse_unusable, UNIT_FACTORS
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.quality import encoder_step
 from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -235,6 +236,18 @@ def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
     assert (list(found(log)) == ['unit_error']
             and found(log)['unit_error'].ambiguous_with == ('scale_factor_error',))
     assert not found(log, GyroModel((Term(SCALE_FACTOR_ERROR, (0.024,)),)))
+
+
+def test_a_calculated_motion_has_no_encoder():
+    """Stretches of constant rate and ramps have headings on a lattice, and rests one value."""
+    time = np.arange(6000) * INTERVAL
+    rate = np.repeat([0.0, 0.5, 0.0, -0.25, 0.0, 0.3], 1000)
+    ramps = np.convolve(np.repeat([0.0, 20.0, -40.0, 0.0, 40.0, -20.0], 100) * DEGREE,
+                        np.full(20, 0.05))
+    assert (not encoder_step(np.cumsum(rate) * INTERVAL) and not encoder_step(np.sin(time))
+            and not encoder_step(np.cumsum(ramps) * 0.05))
+    read = np.round(np.cumsum(ramps) * 0.05 / (0.03 * DEGREE)) * 0.03 * DEGREE
+    assert encoder_step(read) == pytest.approx(0.03 * DEGREE)
 
 
 GOOD = swing(np.random.default_rng(1))

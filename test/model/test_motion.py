@@ -15,7 +15,7 @@ from pathlib import Path
 
 from chance import mean_bound
 from gyro_calibration.allan.deviation import allan_deviation
-from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import read_model
@@ -126,6 +126,16 @@ def test_a_log_holds_the_motion_and_what_equation_1_of_hong_and_park_makes_of_it
     assert log.output == pytest.approx(0.9 * log.reference_rate + 0.01, abs=1e-12)
     noise = simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0)).output - log.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
+
+
+def test_the_verb_simulates_what_a_gyro_makes_of_time_and_heading(tmp_path, run):
+    (tmp_path / 'model.yaml').write_text('effects: {warm_up: {warm_up: 0.01, time_constant: 5}, '
+                                         'quantization: {quantization: 1e-3}}')
+    code, *_ = run('simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest',
+                   '--out', tmp_path / 'log.csv')
+    log = read_log(tmp_path / 'log.csv')
+    assert code == 0 and log.output == pytest.approx(
+        1e-3 * np.round(10.0 * np.exp(-log.time / 5.0)), abs=1e-12)
 
 
 # Simulated noise has the Allan deviation of IEEE Std 952: N/sqrt(tau), 0.664 B, K sqrt(tau/3)
