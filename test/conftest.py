@@ -16,6 +16,7 @@ import copy
 import fcntl
 from functools import cache
 from importlib import metadata
+import json
 import os
 from pathlib import Path
 import random
@@ -102,17 +103,13 @@ _TIMED = 'test_connection', 'test_fuzz', 'test_launch'
 # processes may have to itself, are then short ones.
 _LONG = ('test_diagnosis', 'test_record_verb', 'test_selection', 'test_self_calibration',
          'test_motion_design', 'test_findings', 'test_extended_model', 'test_reproduction',
-         'test_run_faults', 'test_encoder', 'test_followed_recordings',
+         'test_run_faults', 'test_encoder', 'test_followed_logs',
          'test_rate_table_diagnosis', 'test_diagnose_verb', 'test_allan', 'test_package',
          'test_search', 'test_hidden')
 
 
 def pytest_collection_modifyitems(config, items):
-    """
-    Mark the tests with ROS nodes and all that have to keep time; leave out what takes minutes.
-
-    Long evidence runs where it is asked for, ``-m evidence``.
-    """
+    """Mark what has to keep time, and leave out evidence, which takes minutes, unless asked."""
     for item in items:
         # the item of a launch test has no fixtures
         if 'ros_domain' in getattr(item, 'fixturenames', ()):
@@ -133,14 +130,7 @@ def pytest_unconfigure(config):
 
 
 def wait_until(predicate, timeout=30.0, what=None):
-    """
-    Poll a condition until it is true and return its value.
-
-    Raises
-    ------
-    AssertionError : it was not true within the timeout, in seconds
-
-    """
+    """Poll a condition until it is true and return its value; fail after a timeout, s."""
     deadline = time.monotonic() + timeout
     while not (value := predicate()):
         assert time.monotonic() < deadline, f'not within {timeout} s: {what or predicate}'
@@ -155,10 +145,9 @@ def _wait_until():
 
 def operations(work):
     """
-    Return how many lines of Python are run and how many functions are called by a function.
+    Return how many lines of Python a function runs and how many functions it calls.
 
-    They are counted and not timed, so that a busy machine changes nothing. Loops over samples are
-    seen however they are written; what a function of C does is one.
+    A busy machine changes nothing. What a function of C does is one.
     """
     count, before = 0, (sys.gettrace(), sys.getprofile())
 
@@ -178,6 +167,13 @@ def operations(work):
         sys.settrace(before[0])
         sys.setprofile(before[1])
     return count
+
+
+def strict(text):
+    """Read JSON that knows neither NaN nor Infinity."""
+    def refuse(word):
+        raise ValueError(word)
+    return json.loads(text, parse_constant=refuse)
 
 
 @pytest.fixture
@@ -207,10 +203,9 @@ def run(capsys):
 @pytest.fixture
 def compensate(run, tmp_path):
     """
-    Return a function that compensates a log by a model, which are paths or are written to files.
+    Return a function that compensates a log by a model, given as paths or as such.
 
-    It gives ``code``, ``text`` and ``error`` of the program, and of the log that it wrote ``log``
-    and the columns that are new in it as numbers, ``columns``.
+    It gives ``code``, ``text``, ``error``, the written ``log``, and its new ``columns``.
     """
     from gyro_calibration.logs.log import read_log, write_log
     from gyro_calibration.model.model_file import write_model
@@ -258,8 +253,7 @@ def _is_empty(domain):
     """
     Remove the ports that killed nodes left in shared memory; return whether nobody listens.
 
-    Fast DDS would use such a port of the domain again as it is, with less room than `_PATIENT`
-    says. Who listens holds a lock.
+    Fast DDS would use such a port again, with less room than `_PATIENT` says.
     """
     ports = {int(re.findall(r'[0-9]+', path.name)[0])
              for path in _SHARED_MEMORY.glob('fastrtps_port*')}
@@ -295,12 +289,10 @@ def _free_domain():
 @pytest.fixture
 def by_udp(monkeypatch):
     """
-    Have the nodes of a test, which kills or stops them, hear by UDP.
+    Have the nodes of a test, which kills them, hear by UDP.
 
     Fast DDS 2.14 may go on sending to the shared memory of a process that was killed; then the
-    one that comes in its place hears nothing (issues 5053 and 5469 of Fast DDS). A process that
-    is stopped while it holds a lock of its shared memory (5 of 226 were) stops the sender too,
-    and all samples sent to it are lost.
+    one that comes in its place hears nothing (issues 5053 and 5469 of Fast DDS).
     """
     for name, value in _profile('udp.xml', _BY_UDP).items():
         monkeypatch.setenv(name, value)
@@ -323,7 +315,6 @@ class NodeProcess:
 
     @property
     def output(self):
-        """Return what it has printed so far, standard error included."""
         return Path(self._output).read_text(errors='replace')
 
     def wait(self, timeout=30.0):
@@ -331,7 +322,6 @@ class NodeProcess:
         return self.process.wait(timeout)
 
     def stop(self, number=signal.SIGINT, timeout=30.0):
-        """Send a signal to its process group, wait, and return its exit code."""
         self.interrupt(number)
         return self.wait(timeout)
 
@@ -357,12 +347,10 @@ class NodeProcess:
 @pytest.fixture
 def start_node(ros_domain, request):
     """
-    Return a function that starts ``python -m gyro_calibration.<module>``, ended after the test.
+    Return a function that starts a `NodeProcess` by module, parameters and remappings.
 
-    ``start_node('driver_node', {'port': '/dev/x'}, {'imu/data_raw': 'raw'})``, with parameters and
-    remappings, gives a `NodeProcess` with ``output``, ``wait()``, ``stop()`` and ``process``. A
-    node that a test did not itself wait for must still run at the end, end on SIGINT with code 0,
-    and never print a traceback.
+    A node that a test did not itself wait for must still run at the end, end on SIGINT with code
+    0, and never print a traceback.
     """
     nodes = []
 
@@ -386,10 +374,9 @@ def start_node(ros_domain, request):
 
 class HeldNode:
     """
-    A node in the process of a test, which nobody spins: the test calls what an executor would.
+    A node that nobody spins, in the process of a test, which calls what an executor would.
 
-    Messages go in and out without DDS, in milliseconds; each topic seems to have two subscribers.
-    ``sent`` has a list of messages for each topic.
+    Each topic seems to have two subscribers; ``sent`` has a list of messages for each.
     """
 
     def __init__(self, node_class, monkeypatch, parameters, remappings):
@@ -438,12 +425,7 @@ class HeldNode:
 
 @pytest.fixture
 def hold_node(ros_domain, monkeypatch):
-    """
-    Return a function that makes a `HeldNode` here; the one before ends.
-
-    ``hold_node(DriverNode, {'port': '/dev/x'}, {'__ns': '/robot'})``, by class, parameters and
-    remappings.
-    """
+    """Return a function that makes a `HeldNode` by class, parameters and remappings."""
     with contextlib.ExitStack() as stack:
         def hold(node_class, parameters=None, remappings=None):
             stack.close()
@@ -458,8 +440,10 @@ class Ros:
 
     def __init__(self, domain=None):
         import rclpy
+        from gyro_calibration.ros.runner import SENSOR_QOS
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
+        self._quality = SENSOR_QOS
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain,
                    signal_handler_options=SignalHandlerOptions.NO)
@@ -477,15 +461,13 @@ class Ros:
     def collect(self, message_type, topic, quality=None):
         messages = []
         self.node.create_subscription(message_type, topic, messages.append,
-                                      quality or _sensor_quality())
+                                      quality or self._quality)
         return messages
 
     def publisher(self, message_type, topic, quality=None):
-        """Return a publisher with the quality of a sensor, if nothing else is said."""
-        return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
+        return self.node.create_publisher(message_type, topic, quality or self._quality)
 
     def call(self, service_type, name, **request):
-        """Call a service, and return the future of its response."""
         client = self.node.create_client(service_type, name)
         assert client.wait_for_service(30.0), f'no service {name} within 30 s'
         return client.call_async(service_type.Request(**request))
@@ -510,19 +492,9 @@ class Ros:
             time.sleep(0.01)
 
 
-def _sensor_quality():
-    from gyro_calibration.ros.runner import SENSOR_QOS
-    return SENSOR_QOS
-
-
 @pytest.fixture
 def ros(ros_domain):
-    """
-    Return a `Ros`, whose node is in the domain of the nodes that `start_node` started.
-
-    It has ``node``, ``collect(type, topic)``, ``publisher(type, topic)`` and
-    ``call(service_type, name)``.
-    """
+    """Return a `Ros`, whose node is in the domain of the nodes that `start_node` started."""
     client = Ros()
     yield client
     client.close()

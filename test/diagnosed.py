@@ -51,14 +51,12 @@ def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator,
 
 def judge_findings(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str] = (),
                    allowed: Collection[str] = ()) -> Judgement:
-    """Compare findings with the truth."""
     return judge_answer(hidden.truth.gyro.causes, [answer_of_finding(each) for each in findings],
                         beyond, allowed)
 
 
 def judge_diagnosis(hidden: HiddenLog, found: Diagnosis,
                     allowed: Collection[str] = ()) -> Judgement:
-    """Compare a diagnosis with the truth."""
     return judge_findings(hidden, found.findings, [each.along for each in found.unexplained],
                           allowed)
 
@@ -68,6 +66,24 @@ def held(causes: Iterable[Cause], findings: Sequence[Finding],
     """Return for each cause named with a number whether its interval holds the truth."""
     return scores.interval_holds(causes, [answer_of_finding(each) for each in findings],
                                  deviations)
+
+
+def limited(command: np.ndarray, most: float) -> np.ndarray:
+    """Return what follows a command, from rest, and changes by no more than so much at a time."""
+    rates = [0.0]
+    for wanted in command[1:].tolist():
+        rates.append(rates[-1] + min(max(wanted - rates[-1], -most), most))
+    return np.array(rates)
+
+
+def established(found: Diagnosis) -> dict[str, Finding]:
+    """Return the established findings by their effects."""
+    return {each.effect: each for each in found.findings if each.status == 'established'}
+
+
+def estimates(found: Diagnosis) -> dict[str, tuple[float, float]]:
+    """Return the values of the model of a diagnosis and their deviations, by name."""
+    return {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
 
 
 def won(hidden: HiddenLog, found: Diagnosis) -> dict[str, tuple[float, float]]:

@@ -22,7 +22,6 @@ KILLS, TAKES_ALL_MEMORY = 3, 5
 
 
 def task(number):
-    """Return the number, but for those that kill the worker or take all memory."""
     if number == KILLS:
         os.kill(os.getpid(), signal.SIGKILL)
     if number == TAKES_ALL_MEMORY:
@@ -34,7 +33,6 @@ def task(number):
 
 
 def begun(folder):
-    """Leave the number of the process, and take forever."""
     (Path(folder) / str(os.getpid())).touch()
     time.sleep(3600.0)
 

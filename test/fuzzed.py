@@ -84,7 +84,6 @@ def _file(data: bytes, suffix: str) -> Path:
 
 
 def _check_message(error: Exception | str, path: object = '') -> None:
-    """Check that an error is one line and names its file."""
     text = str(error)
     assert text.startswith(str(path)), text
     assert len(text.splitlines()) == 1 and len(text.replace(str(path), '')) <= MESSAGE, (
@@ -92,7 +91,6 @@ def _check_message(error: Exception | str, path: object = '') -> None:
 
 
 def _read(read: Callable[[Path], Any], error: type[Exception], path: Path) -> Any:
-    """Return what is read, or None where it is refused in a line."""
     try:
         return read(path)
     except error as refused:
@@ -101,7 +99,6 @@ def _read(read: Callable[[Path], Any], error: type[Exception], path: Path) -> An
 
 
 # Decoders
-
 
 @dataclass(frozen=True)
 class _Wire:
@@ -366,7 +363,6 @@ def check_recording(suffix: str, data: bytes) -> bool:
 
 
 def _messages() -> list[tuple[str, str, int, bytes]]:
-    """Return topic, kind, time and bytes of some messages."""
     found = []
     for number in range(5):
         stamp = 1_700_000_000_000_000_000 + 10_000_000 * number

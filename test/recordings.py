@@ -25,7 +25,6 @@ KINDS = {'sqlite3': {}, 'sqlite3-file': {'mode': 'FILE'}, 'sqlite3-message': {'m
 
 
 def rosbags():
-    """Return the modules of the library; skip where it is missing."""
     import pytest  # not where a fuzzer takes the builders below
     pytest.importorskip('rosbags',
                         reason='rosbags, which writes recordings for tests, is not installed')
@@ -135,12 +134,10 @@ def of_log(log):
 
 
 def file_of(path):
-    """Return the one file of messages in the folder of a recording."""
     return next(file for file in path.iterdir() if file.name != 'metadata.yaml')
 
 
 # By hand: odd, torn and hostile ones
-
 
 MCAP = b'\x89MCAP0\r\n'
 
@@ -161,7 +158,6 @@ def chunk(content, compression='', size=None, checksum=0):
 
 
 def channel(number, topic, kind):
-    """Return schema and channel of a topic of MCAP."""
     return (record(3, struct.pack('<H', number) + text(kind) + text('ros2msg') + text(''))
             + record(4, struct.pack('<HH', number, number) + text(topic) + text('cdr') + text('')))
 

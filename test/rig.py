@@ -19,6 +19,7 @@ angles are counter-clockwise positive.
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import repeat
 import math
 import random
 
@@ -31,8 +32,6 @@ INTERVAL = 0.01  # s between samples
 
 @dataclass(frozen=True)
 class Reading:
-    """What the robot reports after a step."""
-
     stamp: float  # of sample and odometry, s
     output: float | None  # rate that the gyro reports, rad/s; None while it is unplugged
     heading: float  # by odometry, rad, not wrapped
@@ -43,11 +42,9 @@ class Robot:
     """
     A base that follows commands late, and a gyro on it.
 
-    Errors of the gyro are in 1 and rad/s; the noise is the standard deviation of a sample. A
-    command acts after the latency, with the time constant `lag` of the drives, s; the base stops
-    when it has heard none for the timeout, s. A test sets that the gyro is `unplugged`, that
-    `stamps_stand`, or that the base is `deaf`: it goes on with what it did last. `distort` makes
-    of the output what the gyro reports.
+    The noise is that of a sample, rad/s. A command acts after the latency, with the time constant
+    `lag`, s; without one for the timeout, s, the base stops, unless it is `deaf`: then it goes on
+    with what it did last. `distort` makes of the output what the gyro reports.
     """
 
     def __init__(self, *, scale_factor_error=0.0373, bias=0.01, noise=1e-3, latency=0.15, lag=0.2,
@@ -228,29 +225,21 @@ class Rig:
         return until()
 
     def turn(self, rate, seconds):
-        """Command the robot to turn, rad/s, and step for a time."""
         self.robot.command(rate)
         self.go(seconds)
 
     def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None):
-        """
-        Play outputs of a gyro, rad/s, without the robot; return what came out for each.
-
-        The temperature, degC, may be one or one a sample; `moving` is the rate that odometry
-        shows, rad/s.
-        """
-        found = []
-        for number, output in enumerate(outputs):
+        """Play outputs, rad/s, without the robot; `moving` is what odometry shows, rad/s."""
+        found, is_one = [], temperature is None or isinstance(temperature, float)
+        for output, degc in zip(outputs, repeat(temperature) if is_one else temperature):
             self._steps += 1
             self.clock.now += interval
             self.fed += round(1e9 * interval)
-            stamp = self.fed
-            if temperature is not None:
-                each = temperature if isinstance(temperature, float) else temperature[number]
-                self.pipeline.add_temperature(stamp, float(each))
+            if degc is not None:
+                self.pipeline.add_temperature(self.fed, float(degc))
             if moving is not None:
-                self.pipeline.add_odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
-            found.append(self.pipeline.add_sample(stamp, float(output), None, self.receivers))
+                self.pipeline.add_odometry(self.fed, 0.0, Velocity(angular=(0.0, 0.0, moving)))
+            found.append(self.pipeline.add_sample(self.fed, float(output), None, self.receivers))
             self.outputs += [found[-1]] if found[-1] else []
             self.guards()
         return found
@@ -261,7 +250,6 @@ class Rig:
         self.clock.now += seconds if steady is None else steady
 
     def begin(self, kind=PROFILE):
-        """Call a calibration; return '' or why it was refused."""
         drive = self.pipeline.values.calibration_drive and kind == PROFILE
         obstacle = self.pipeline.find_obstacle() if drive else ''
         return self.session.begin(kind, self.pipeline.values, obstacle)
@@ -273,18 +261,15 @@ class Rig:
         return run is None or run.end_reason is not None
 
     def calibrate(self, kind=PROFILE, seconds=60.0):
-        """Calibrate while the robot goes on, and return success and message."""
         if refusal := self.begin(kind):
             return False, refusal
         return self.end(seconds)
 
     def end(self, seconds=60.0):
-        """Go on until the run has ended, and return success and message."""
         assert self.go(seconds, lambda: self.ended), 'no end of the run'
         return self.session.conclude()
 
     def stop(self):
-        """Cancel the run, and return success and message."""
         assert self.session.cancel()[0]
         return self.session.conclude()
 
@@ -309,7 +294,6 @@ class Rig:
 
 
 def rested(*arguments, seconds=3.0, **parameters):
-    """Return a rig whose robot has rested for a while."""
     rig = Rig(*arguments, **parameters)
     rig.go(seconds)
     return rig

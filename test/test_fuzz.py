@@ -48,7 +48,6 @@ FOUND = {
 
 @pytest.fixture
 def target(name):
-    """Return a target; those of the nodes are skipped without ROS 2."""
     if name not in TARGETS:
         pytest.skip('ROS 2 (rclpy) is not installed')
     return TARGETS[name]

@@ -50,7 +50,6 @@ def calls(path):
 
 
 def own(names):
-    """Return the modules of this package among imported names."""
     parts = [name.split('.') for name in names if name.startswith('gyro_calibration.')]
     return {part[1] for part in parts
             if (PACKAGE / part[1]).is_dir() or (PACKAGE / f'{part[1]}.py').exists()}

@@ -192,7 +192,6 @@ def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
 
 # Who moves the robot, and who chooses files
 
-
 def test_only_the_calibration_and_the_demonstration_can_command_a_robot():
     makers = {path.name for path in FILES
               if re.search(r"(create_publisher|publish_on)\([^)]*'cmd_vel'", path.read_text())}

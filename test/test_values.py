@@ -43,7 +43,6 @@ DEGC = st.one_of(st.floats(-20.0, 60.0), FINITE, st.none())
 
 
 def tries(examples):
-    """Return the settings of a test that tries so many examples."""
     return hypothesis.settings(
         max_examples=examples * MORE, derandomize=MORE == 1, deadline=None, database=None,
         suppress_health_check=[hypothesis.HealthCheck.too_slow,
@@ -97,7 +96,6 @@ def test_every_output_gives_a_finite_rate(model, samples):
 # streams
 
 def rest_for_a_minute(add, begin):
-    """Give a minute at rest, and return the time of its end."""
     for index, rate in enumerate(REST.tolist()):
         add(begin + INTERVAL * (index + 1), rate)
     return begin + INTERVAL * len(REST)

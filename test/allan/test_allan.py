@@ -125,7 +125,6 @@ def test_a_gauss_markov_process_is_found_and_a_flicker_or_random_walk_is_not_tak
 
 
 def test_white_noise_alone_shows_nothing_else():
-    """At most 5 % of records show what is not there."""
     found = figures(WHITE, 25, 5, samples=3000)
     false = np.any([[figure.value > 0.0 for figure in found[symbol]] for symbol in 'BKQR'], axis=0)
     assert false.sum() <= most(25, 0.05)

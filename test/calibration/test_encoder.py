@@ -33,11 +33,7 @@ INTERVAL = 0.01
 
 
 def swing(duration, speed=60.0, period=8.0):
-    """
-    Return the motion that turns to and fro at a speed, deg/s.
-
-    With ramps of 0.3 s and a rest of 0.4 s at each end.
-    """
+    """Return turns to and fro at a speed, deg/s, with ramps of 0.3 s and rests of 0.4 s."""
     half = np.cumsum([0.0, 0.3, period / 2 - 1.0, 0.3])
     knots = np.concatenate([half + start for start in np.arange(0.0, duration, period / 2)])
     rates = np.concatenate([np.array([0.0, 1.0, 1.0, 0.0]) * sign * speed * DEGREE
@@ -212,11 +208,7 @@ def test_single_wrong_values_of_the_reference_are_left_out(size):
 
 
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
-    """
-    A firmware that takes 351 for 360 deg makes a perfect gyro look 2.56 % too large.
-
-    The remark says 351.
-    """
+    """A firmware that takes 351 for 360 deg makes a perfect gyro look 2.56 % too large."""
     log = replace(CLEAN, output=(CLEAN.output - B) / (1 + S),
                   reference_heading=CLEAN.reference_heading * 351 / 360)
     found = calibrate_encoder(log)
@@ -235,29 +227,22 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
             < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
-@pytest.mark.parametrize('reference', ['fine', 'encoder'])
-@pytest.mark.parametrize('smoothing', ['none', 'delay, 0.1 s', 'mean, 0.2 s', 'mean, 0.4 s',
-                                       'first order, 0.1 s'])
-def test_a_swing_of_one_frequency_does_not_take_a_smoothing_for_a_scale(smoothing, reference):
-    """Without a smoothing, s is found better than its interval says, which allows for one."""
-    error, stated = np.array([run_smoothing(('swing', smoothing, reference, seed))
+@pytest.mark.parametrize('motion, smoothing, reference', [
+    *(('swing', smoothing, reference) for reference in ('fine', 'encoder') for smoothing in (
+        'none', 'delay, 0.1 s', 'mean, 0.2 s', 'mean, 0.4 s', 'first order, 0.1 s')),
+    *(('robot', smoothing, 'fine') for smoothing in (
+        'mean, 0.2 s', 'mean, 0.2 s, no delay', 'Gaussian, 0.1 s, no delay'))])
+def test_a_smoothing_is_not_taken_for_a_scale_and_turns_and_stops_show_it(
+        motion, smoothing, reference):
+    """A swing of one frequency does not: its interval allows for a smoothing, if there is none."""
+    error, stated = np.array([run_smoothing((motion, smoothing, reference, seed))
                               for seed in range(3)]).T
-    assert (np.abs(error) < 2.5 * stated).all()
-    if smoothing in ('none', 'delay, 0.1 s'):
-        assert np.abs(error).max() < 2e-4
+    assert (np.abs(error) < (2.5 if motion == 'swing' else 3.5) * stated).all()
+    assert motion == 'swing' or stated.max() < 3e-4
+    assert smoothing not in ('none', 'delay, 0.1 s') or np.abs(error).max() < 2e-4
 
 
-@pytest.mark.parametrize('smoothing', ['mean, 0.2 s', 'mean, 0.2 s, no delay',
-                                       'Gaussian, 0.1 s, no delay'])
-def test_turns_and_stops_show_a_smoothing(smoothing):
-    error, stated = np.array([run_smoothing(('robot', smoothing, 'fine', seed))
-                              for seed in range(3)]).T
-    assert (np.abs(error) < 3.5 * stated).all()
-    assert stated.max() < 3e-4
-
-
-@pytest.mark.parametrize('kind, size', [('swing', 1.0), ('steps', 0.05),
-                                        ('small sine', 1.0)])
+@pytest.mark.parametrize('kind, size', [('swing', 1.0), ('steps', 0.05), ('small sine', 1.0)])
 def test_an_eccentric_encoder_leaves_the_intervals_true(kind, size):
     found = np.array([run_eccentric((kind, size, seed)) for seed in range(6)])
     assert (np.abs(found[:, 0]) < 3.0 * found[:, 1]).all()
@@ -385,11 +370,7 @@ def test_measured_gyros_are_12_ms_late_and_that_is_not_taken_for_scale(data, nam
 
 
 def shaken(bias, generator):
-    """
-    Return 20 s of a fast swing whose heading is off by 3 deg again and again.
-
-    As one that wobbles on its mount.
-    """
+    """Return 20 s of a fast swing whose heading is off by 3 deg, as of a mount that wobbles."""
     motion = swing(20.0, 300.0, 2.5)
     log = log_of(motion, 20.0, Noise(0.02 * DEGREE), generator)
     wobble = 3.0 * DEGREE * np.interp(log.time, np.arange(0.0, 21.0, 0.5),

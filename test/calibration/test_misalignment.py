@@ -9,18 +9,58 @@
 # under the License.
 
 
+"""A sensor that is turned about three axes beside a motion capture: an oblique axis is found."""
+
 from dataclasses import replace
 import re
 
-from attitudes import attitude_log, BIAS, SCALE, tumbling
 from chance import fewest, seeded
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import fit_spans, lay_out_spans
 from gyro_calibration.calibration.reference_noise import heading_difference
-from gyro_calibration.logs.log import DEGREE, log_from_table
+from gyro_calibration.diagnosis.log_diagnosis import diagnose
+from gyro_calibration.diagnosis.words import terminal_lines
+from gyro_calibration.logs.log import DEGREE, Log, log_from_table
 from gyro_calibration.logs.quality import cross_rotation
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
+SCALE, BIAS = 0.004, 0.2 * DEGREE
+
+
+def tumbling(seed, misalignment=(0.0, 0.0), sizes=(70.0, 40.0, 40.0), noise=0.03):
+    """
+    Return the table of a log of 120 s at 100 Hz, and the rates of the sensor, rad/s, (n, 3).
+
+    Yaw, pitch and roll are sums of sines of `sizes`, deg. The gyro is along z and has the
+    misalignment, rad, of the rates about x and y. The attitude has noise, deg, and is lost twice.
+    """
+    generator = np.random.default_rng(seed)
+    time = 0.01 * np.arange(12000)
+    still = np.clip(np.minimum(time - 5.0, 115.0 - time), 0.0, 1.0)
+    omega = 2.0 * np.pi * generator.uniform(0.05, 0.6, (3, 4))
+    phase = np.cumsum(still)[:, None, None] * 0.01 * omega
+    shift = generator.uniform(0.0, 2.0 * np.pi, omega.shape)
+    yaw, pitch, roll = (angles := np.sin(phase + shift).sum(axis=2) * 0.5 * DEGREE * sizes).T
+    slopes = (omega * np.cos(phase + shift)).sum(axis=2) * 0.5 * DEGREE * sizes
+    by_yaw, by_pitch, by_roll = (slopes * still[:, None]).T
+    rates = np.column_stack([
+        by_roll - by_yaw * np.sin(pitch),
+        by_pitch * np.cos(roll) + by_yaw * np.sin(roll) * np.cos(pitch),
+        by_yaw * np.cos(roll) * np.cos(pitch) - by_pitch * np.sin(roll)])
+    attitude = Rotation.from_euler('ZYX', angles) * Rotation.from_rotvec(
+        noise * DEGREE * generator.standard_normal((len(time), 3)))
+    quaternion = attitude.as_quat()
+    quaternion[[*range(3000, 3020), *range(8000, 8010)]] = np.nan
+    white = 0.05 * DEGREE * generator.standard_normal(len(time))
+    output = (1.0 + SCALE) * rates[:, 2] + rates[:, :2] @ misalignment + BIAS + white
+    return {'time_s': time, 'gyro_rad_s': output,
+            **dict(zip(('qx', 'qy', 'qz', 'qw'), quaternion.T))}, rates
+
+
+def attitude_log(*given, **options):
+    return log_from_table(tumbling(*given, **options)[0], {'attitude': 'qw/qx/qy/qz'})
 
 
 def test_scale_and_bias_hold_beside_an_oblique_axis():
@@ -72,3 +112,26 @@ def test_a_planar_attitude_gives_the_answers_of_its_heading():
         assert (fit.covariance == other.covariance).all() and fit.bias == other.bias
         assert (spans.values == others.values).all()
         assert (spans.covariance == others.covariance).all()
+
+
+def test_an_oblique_axis_is_named_as_such_and_nothing_else_is():
+    log = attitude_log(11, (0.4 * DEGREE, 0.3 * DEGREE))
+    found = diagnose([log], np.random.default_rng(0))
+    (finding,) = found.findings
+    size = finding.parameters['axis_misalignment']
+    assert finding.status == 'established' and 'one axis' in finding.remedy
+    assert size.interval[0] < 0.5 * DEGREE < size.interval[1] < 0.55 * DEGREE, size
+    assert 'axis_misalignment' not in {each.effect.name for each in found.model.terms}
+    assert found.reference.kind == 'motion_capture'
+    assert 'oblique' in '\n'.join(terminal_lines(found))
+
+
+def test_a_parallel_axis_is_not_named():
+    assert not diagnose([attitude_log(12)], np.random.default_rng(0)).findings
+
+
+def test_a_reference_without_an_attitude_cannot_show_an_oblique_axis():
+    log = attitude_log(13, (0.2 * DEGREE, 0.0))
+    alone = Log(time=log.time, output=log.output, reference_heading=log.reference_heading)
+    found = diagnose([alone], np.random.default_rng(0))
+    assert 'axis_misalignment' in found.cannot_show

@@ -46,11 +46,7 @@ def measured(terms=LINEAR, seed=1, **table):
 
 @pytest.mark.parametrize('noise', [0.0, 0.1, 0.5])
 def test_the_steps_of_a_coarse_output_are_in_the_intervals_of_bias_and_scale(noise):
-    """
-    Of steps of 0.5 deg/s, with noise in steps; the reference is exact.
-
-    All rests are on one step, with one error, and no turn that is rounded is outlying.
-    """
+    """Of 0.5 deg/s, with noise in steps: all rests have one error, and no turn is outlying."""
     step = 0.5 * DEGREE
     for seed in range(6):
         generator = np.random.default_rng([seed, round(10 * noise)])
@@ -127,7 +123,6 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
 
 
 # scatter
-
 
 @pytest.mark.parametrize('rates', [[0.0, 0.2], np.zeros(30), np.linspace(-0.3, 0.3, 41)])
 def test_a_table_without_any_error_is_fitted(rates):

@@ -199,9 +199,8 @@ def calibrated(seed):
 
 
 def rested(seed, change=0.0):
-    time = 20.0 + np.arange(201) / 100.0
-    return time, (
-        B + change + simulate_noise(XV3500.noise, 201, 0.01, np.random.default_rng([seed, 1])))
+    noise = simulate_noise(XV3500.noise, 201, 0.01, np.random.default_rng([seed, 1]))
+    return 20.0 + np.arange(201) / 100.0, B + change + noise
 
 
 def test_a_rest_after_the_run_refuses_no_more_good_calibrations_than_it_says():
@@ -258,36 +257,23 @@ PROFILES = {each.duration: each for each in (CALIBRATION_MOTION, constant_rate_m
     [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]))}
 
 
-def ended(seed, yaw, rest, motion=CALIBRATION_MOTION, lasts=0.0):
-    """Return a fit of a run with a steady turn until s after its end, whose log ends soon."""
+@pytest.mark.parametrize('motion, degrees, rest, lasts, words', [
+    *((PROFILES[name], degrees, 0.4, 0.0, 'the robot turned throughout the run')
+      for name in PROFILES for degrees in (0.05, -0.1, 0.2, 0.3, -0.5)),
+    *((CALIBRATION_MOTION, degrees, 0.9, lasts, 'still turned after it')
+      for degrees in (0.5, -1.0) for lasts in (0.2, 0.4, 0.6))])
+def test_a_steady_turn_in_a_log_that_ends_soon_is_refused_or_in_the_interval(
+        motion, degrees, rest, lasts, words):
+    """Without a rest, or so many s of the turn within it; what the whole log has is a bias."""
     time = np.arange(0.0, motion.duration + rest, 0.01)
-    rate = (output(seed, motion=motion, time=time)
-            + np.where(time < motion.duration + lasts, yaw, 0.0))
-    fit = self_calibrate(time, rate, motion, noise=XV3500.noise)
-    return check_end(time, rate, fit, motion, XV3500.noise)
-
-
-@pytest.mark.parametrize('motion', PROFILES.values(), ids=PROFILES)
-@pytest.mark.parametrize('degrees', [0.05, -0.1, 0.2, 0.3, -0.5])
-def test_a_steady_turn_in_a_log_without_a_rest_is_refused_or_in_the_interval(degrees, motion):
+    turn = np.where(time < motion.duration + lasts, degrees * DEGREE, 0.0)
     for seed in range(4):
+        rate = output(seed, motion=motion, time=time) + turn
+        fit = self_calibrate(time, rate, motion, noise=XV3500.noise)
         try:
-            fit = ended(seed, degrees * DEGREE, 0.4, motion)
+            fit = check_end(time, rate, fit, motion, XV3500.noise)
         except DataRefused as refused:
-            assert 'the robot turned throughout the run' in str(refused)
-        else:
-            assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
-
-
-@pytest.mark.parametrize('lasts', [0.2, 0.4, 0.6])
-@pytest.mark.parametrize('degrees', [0.5, -1.0])
-def test_a_steady_turn_that_ends_within_the_rest_is_refused_or_in_the_interval(degrees, lasts):
-    """By the built-in profile; what the whole log has is a bias."""
-    for seed in range(3):
-        try:
-            fit = ended(seed, degrees * DEGREE, 0.9, lasts=lasts)
-        except DataRefused as refused:
-            assert 'still turned after it' in str(refused)
+            assert words in str(refused)
         else:
             assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
 

@@ -111,18 +111,6 @@ def test_a_simulated_turn_integrated_at_10_hz_is_off_by_as_much(rate):
         assert abs(expected) > 5.0 * deviation, 'the claim would be lost in the noise'
 
 
-# predictions
-
-def sweeps(seed=0, deviation=1e-5):
-    """Return four sweeps with a bias and a scale factor error, deg/s."""
-    rates = np.tile(np.arange(-60.0, 61.0, 10.0), 4)
-    errors = 0.2 + 0.01 * rates
-    return table(rates, errors + np.random.default_rng(seed).normal(0.0, deviation, len(rates)),
-                 sweep=np.repeat(np.arange(4), 13))
-
-
-# the program
-
 def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
     found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
                   [0, 0, 1, 1, 2])
@@ -133,6 +121,15 @@ def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_res
     assert '1 turns are left out' in errors.remarks[1]
 
 
+# the program
+
+def sweeps(deviation=0.0):
+    """Return four sweeps with a bias of 0.2 deg/s and a scale factor error of 0.01."""
+    rates = np.tile(np.arange(-60.0, 61.0, 10.0), 4)
+    scatter = np.random.default_rng(5).normal(0.0, deviation, len(rates))
+    return table(rates, 0.2 + 0.01 * rates + scatter, sweep=np.repeat(np.arange(4), 13))
+
+
 @pytest.fixture
 def run(run):
     return partial(run, 'turn')
@@ -141,7 +138,7 @@ def run(run):
 @pytest.fixture
 def log(tmp_path):
     """Return a file of four sweeps at 20 to 50 degC, with b = 0.2 deg/s and s = 0.01."""
-    found = sweeps(deviation=0.0)
+    found = sweeps()
     write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate,
                                           temperature=20.0 + 10.0 * found.sweep))
     return tmp_path / 'table.csv'
@@ -195,7 +192,7 @@ def test_the_table_gives_degrees_and_per_cent_and_what_is_beyond_the_range_of_th
 
 
 def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(run, tmp_path):
-    found = sweeps(5, 0.01)
+    found = sweeps(0.01)
     write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate))
     code, text, _ = run(tmp_path / 'table.csv', '--json')
     answer = json.loads(text)

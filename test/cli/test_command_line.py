@@ -20,7 +20,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.main import find_verbs
@@ -279,20 +278,18 @@ def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
 # progress, which is shown on a terminal, with the elapsed time, and nowhere else
 
 class Terminal(io.StringIO):
-    """Text that was written to a terminal."""
 
     def isatty(self):
         return True
 
 
-def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypatch):
-    terminal, until = Terminal(), time.monotonic() + 20.0
+def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypatch, wait_until):
+    terminal = Terminal()
     monkeypatch.setattr(sys, 'stderr', terminal)
     monkeypatch.setattr(verb, 'PROGRESS_DELAY', 0.01)
     with verb.show_progress('fit') as on_progress:
         on_progress(0.5, 'search')
-        while 'search' not in terminal.getvalue() and time.monotonic() < until:
-            time.sleep(0.01)
+        wait_until(lambda: 'search' in terminal.getvalue())
     assert re.search(r' 50 %  search \.\.\.  \d+ s', terminal.getvalue())
     assert re.search(r'\r +\r$', terminal.getvalue())
 
@@ -307,7 +304,6 @@ def test_a_short_step_and_a_file_show_nothing(monkeypatch):
 
 
 # Logs of any length, which compensate reads in blocks
-
 
 POLYNOMIAL = (
     '\neffects:\n  rate_temperature_polynomial:\n'
@@ -363,7 +359,6 @@ def test_the_memory_does_not_grow_with_the_log(polynomial, tmp_path):
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    """Let logs be read in blocks of 300 rows."""
     monkeypatch.setattr('gyro_calibration.cli.verb.BLOCK_ROWS', 300)
     monkeypatch.setattr('gyro_calibration.cli.verb.read_log_blocks',
                         lambda *given, **more: read_log_blocks(*given, rows=300, **more))

@@ -63,7 +63,6 @@ def diagnose(run, tmp_path):
 
 
 def answer_of(answer):
-    """Return what the program printed with --json, as data."""
     code, text, errors = answer
     assert code == 0, errors
     return json.loads(text)
@@ -122,7 +121,6 @@ def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
 # data that allow no answer
 
 def one_sentence(errors):
-    """Tell whether the program printed one message, in one line, and no traceback."""
     return (len(errors.strip().splitlines()) == 1 and 'Traceback' not in errors
             and len(errors.strip()) > 20)
 

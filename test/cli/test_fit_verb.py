@@ -10,8 +10,7 @@
 
 """The verb fit, as people and other programs call it."""
 
-import json
-
+from conftest import strict
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
@@ -21,7 +20,6 @@ from recovery import SINE, Table
 
 
 def write(path, dwells):
-    """Write dwells as a rate table."""
     columns = (values.tolist() for values in (dwells.sweep, dwells.rate / DEGREE,
                                               dwells.output / DEGREE, dwells.temperature))
     lines = ['sweep,reference_rate_dps,gyro_dps,temperature_degc',
@@ -32,16 +30,8 @@ def write(path, dwells):
 
 @pytest.fixture
 def table(tmp_path):
-    """Return the file of a simulated rate table."""
     return write(tmp_path / 'table.csv',
                  Table().measure(GyroModel(SINE), np.random.default_rng(1)))
-
-
-def strict(text):
-    """Read JSON that knows neither NaN nor Infinity."""
-    def refuse(word):
-        raise ValueError(word)
-    return json.loads(text, parse_constant=refuse)
 
 
 def test_the_default_gives_a_model_that_compensates(run, table, tmp_path):
@@ -159,23 +149,14 @@ def test_as_many_values_as_dwells_are_fitted_but_nothing_says_how_sure_they_are(
     assert strict(run('fit', path, '--polynomial', '3,2', '--json')[1])['covariance'] is None
 
 
-@pytest.mark.parametrize('rows, words, code, said', [
-    ('0.5,0.51\n-0.5,-0.49\n0.5,0.511\n-0.5,-0.491\n',
-     ['--effects', 'bias,scale_factor_error,scale_factor_asymmetry'], 1, 'scale_factor_asymmetry'),
-    ('0,0.1\n10,10\n20,20.1\n', ['--effects', 'bias,bias_temperature'], 1, 'holds no temperature; '
-     'record '
-     'temperature_degc'),
-    ('0,0.1\n10,10\n', ['--polynomial', '3,0'], 1, '2 dwells do not determine 4 values'),
-    ('0,0.1\n10,10\n', ['--effects', 'bias,charm'], 2, "'charm' is no effect that dwells"),
-    ('0,0.1\n10,10\n', ['--polynomial', '3'], 2, 'is not two orders'),
-    ('0,0.1\n10,10\n', ['--polynomial', '3,2', '--effects', 'bias'], 2, 'not allowed with'),
-    ('0,0.1\n10,10\n', ['--method', 'likelihood'], 1, 'no reference over time'),
-    ('0,0\n10,573\n-10,-573\n', [], 1,
-     'the gyro is in deg/s and read as rad/s, or the reference in'),
-    ('0,0.1\n10,ten\n', [], 2, "line 3, column gyro_dps: 'ten' is not a number"),
-])
-def test_what_does_not_work_ends_with_one_sentence(run, tmp_path, rows, words, code, said):
-    (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n' + rows)
+@pytest.mark.parametrize('words, code, said', [
+    (['--polynomial', '3,0'], 1, '2 dwells do not determine 4 values'),
+    (['--effects', 'bias,charm'], 2, "'charm' is no effect that dwells"),
+    (['--polynomial', '3'], 2, 'is not two orders'),
+    (['--polynomial', '3,2', '--effects', 'bias'], 2, 'not allowed with'),
+    (['--method', 'likelihood'], 1, 'no reference over time')])
+def test_what_does_not_work_ends_with_one_sentence(run, tmp_path, words, code, said):
+    (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n0,0.1\n10,10\n')
     ended, text, error = run('fit', tmp_path / 'table.csv', *words, '--out', tmp_path / 'a.yaml')
     assert ended == code and not text and said in error and 'Traceback' not in error
     assert not (tmp_path / 'a.yaml').exists()

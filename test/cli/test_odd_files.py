@@ -24,6 +24,7 @@ import stat
 import struct
 import tracemalloc
 
+from conftest import strict
 from gyro_calibration.files import to_printable, write_atomically
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.cdr import IMU
@@ -44,7 +45,6 @@ LONG = 300 * 'x'
 
 @pytest.fixture(autouse=True)
 def _within_seconds():
-    """Let a test that blocks fail after a timeout."""
     def fail(*_):
         raise TimeoutError('it waits')
     before = signal.signal(signal.SIGALRM, fail)
@@ -72,7 +72,6 @@ each_kind = pytest.mark.parametrize('kind', KINDS)
 
 
 # Paths that are no files
-
 
 @each_kind
 @pytest.mark.parametrize('read, error, name', [
@@ -113,7 +112,6 @@ def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, fol
 
 
 # Files that cannot be opened
-
 
 @pytest.mark.parametrize('path, words', [
     (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
@@ -162,7 +160,6 @@ def test_the_longest_name_that_there_may_be_is_written(folder):
 
 # Failed writes
 
-
 @pytest.mark.parametrize('step', ['fsync', 'replace'])
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, step):
     path = tmp_path / 'model.yaml'
@@ -183,7 +180,6 @@ def test_a_folder_that_takes_no_file_is_reported_by_the_name_that_was_given():
 
 
 # Links and modes
-
 
 WRITERS = {
     'compensate': ('compensate log.csv --model model.yaml --out {}', 'a.csv'),
@@ -237,7 +233,6 @@ def test_a_file_keeps_its_owner(tmp_path):
 
 # Control characters
 
-
 ESCAPES = '\x1b[31m\x9b2J\u202e\u2066\x07\r'
 
 
@@ -270,9 +265,7 @@ def test_nothing_that_a_terminal_obeys_is_printed(folder, run):
 
 # Files that need much memory
 
-
 def mcap(content, compression, times):
-    """Return an MCAP file of so many equal chunks."""
     compress = {'zstd': lambda data:
                 pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
                 'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
@@ -301,7 +294,6 @@ def test_messages_that_unfold_once_more_are_counted_too(tmp_path):
 
 
 def refused(path, words, megabytes=60):
-    """Check that a recording is refused, and that this takes little memory."""
     tracemalloc.start()
     try:
         with pytest.raises(LogError, match=words):
@@ -348,7 +340,6 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
 
 
 # Damaged numbers and text
-
 
 ODD = {
     'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n',
@@ -403,10 +394,6 @@ VERBS = {'compensate': 'compensate {log} --model {model} --out {out}',
          'as a model': 'compensate {log} --model {log} --out {out}'}
 
 
-def no_constant(name):
-    raise AssertionError(f'{name} is no JSON')
-
-
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 @pytest.mark.parametrize('verb', VERBS)
 def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
@@ -425,7 +412,7 @@ def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
         said = [line for line in error.splitlines() if line.startswith('gyro_calibration: ')]
         assert (code in (0, 1, 2) and len(said) == (code > 0)
                 and bool(answer) == (code == 0)), (name, error)
-        assert not answer or json.loads(answer, parse_constant=no_constant)
+        assert not answer or strict(answer)
         assert code == 0 or not out.exists(), name
         out.unlink(missing_ok=True)
 

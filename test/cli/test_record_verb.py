@@ -87,7 +87,6 @@ class Recording:
         self.process.start()
 
     def end(self, number=None, timeout=60.0):
-        """Send a signal, if given, and return exit code, standard output and standard error."""
         if number is not None:
             os.kill(self.process.pid, number)
         self.process.join(timeout)
@@ -97,7 +96,6 @@ class Recording:
 
     @property
     def error(self):
-        """Return what it has printed on standard error so far."""
         return self._files[1].read_text()
 
 
@@ -135,7 +133,6 @@ def is_unbroken(log):
 
 
 # What is written
-
 
 def notes():
     return {'port': '/dev/ttyUSB0', 'protocol': 'csv'}
@@ -245,7 +242,6 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
 
 
 # From the port
-
 
 @pytest.mark.parametrize(('name', 'number'),
                          [('a.csv.gz', signal.SIGTERM), ('a.mcap', signal.SIGINT)])
@@ -396,7 +392,6 @@ def test_where_nothing_can_be_written_no_file_is_left(record, tmp_path, name):
 
 # From topics
 
-
 class Robot:
     """Publishes the topics of a robot, with stamps of its own, many times faster than them."""
 
@@ -426,7 +421,6 @@ class Robot:
                    for each in self._publishers.values())
 
     def send(self, time, rate, heading):
-        """Publish one sample on all topics."""
         for topic, publisher in self._publishers.items():
             message = self.kinds[topic]()
             message.header.stamp.sec = 1_700_000_000 + int(time)
@@ -456,7 +450,6 @@ class Robot:
 
 
 def reliable(**how):
-    """Return a reliable quality of service."""
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     return QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, **how)
 

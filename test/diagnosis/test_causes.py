@@ -76,7 +76,6 @@ def test_the_remedy_of_a_suspected_cause_says_once_that_it_is_to_be_recorded_aga
 
 # Effects of the user's own: a file that the command line names adds them to the catalogue
 
-
 OWN = """
 import numpy as np
 

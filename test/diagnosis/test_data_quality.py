@@ -36,7 +36,6 @@ SIGMA = 1e-4 / math.sqrt(INTERVAL)
 
 @pytest.fixture
 def generator(request):
-    """Return the same random numbers in each run."""
     return seeded(request.node.name)
 
 
@@ -56,7 +55,6 @@ def swing(generator, count=6000, noise=WHITE, scale=1.01, offset=2e-3):
 
 
 def found(log, model=None):
-    """Return the findings by name."""
     return {finding.effect: finding for finding in inspect_record(log, model).findings}
 
 
@@ -123,7 +121,6 @@ FAULTS = ['outliers', 'stuck_samples', 'dropped_samples', 'quantization', 'refer
 @pytest.mark.parametrize('multiple', [1.2, 5.0])
 @pytest.mark.parametrize('name', FAULTS)
 def test_a_hidden_fault_is_found_alone(name, multiple, any_generator):
-    """Of 100 logs each, all were."""
     hidden = [hide([name], multiple, any_generator, reference=reference, duration=200.0)[0]
               for reference in ('rate', 'heading') * 3]
     assert sum(list(found(log_of(each))) == [name] for each in hidden) >= fewest(6, 1.0 - STATED)

@@ -222,7 +222,6 @@ def test_a_log_of_a_gyro_at_rest_needs_no_reference():
 
 # several logs of one gyro
 
-
 def recorded(names, steps, seed, given=None, multiple=8.0):
     """Record a gyro once for each moment of a temperature step of 10 K up, 15 K down later."""
     generator = np.random.default_rng(seed)
@@ -420,7 +419,6 @@ def test_noise_is_found_against_a_model_only():
 
 
 # Noise that a filter or rounding shaped passes for no cause, and hides none
-
 
 #: Numerator and denominator.
 FILTERS = {'exponential smoothing': ([0.5], [1.0, -0.5]), 'mean of two': ([0.5, 0.5], [1.0]),

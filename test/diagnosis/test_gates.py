@@ -14,11 +14,16 @@ from dataclasses import replace
 import re
 
 from chance import seeds
+from diagnosed import limited
 from gyro_calibration import fit
-from gyro_calibration.diagnosis.gates import check_gates
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.diagnosis.data_quality import inspect_record
+from gyro_calibration.diagnosis.gates import (
+    check_gates, is_at_rest, refuse_unusable, select_reference)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, log_from_table, unwrap_heading
+from gyro_calibration.logs.log import (
+    DataRefused, DEGREE, Log, log_from_table, refuse_wrapped, unwrap_heading)
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -29,7 +34,6 @@ HEADING = np.cumsum(MOTION) * 0.01
 
 
 def drive(seed=0, heading_noise=0.0):
-    """Return a log of a gyro with a bias and a heading as its reference."""
     generator = np.random.default_rng(seed)
     output = 1.01 * MOTION + 0.005 + 2e-3 * generator.standard_normal(len(TIME))
     return Log(output=output, time=TIME,
@@ -181,17 +185,9 @@ def test_a_commanded_rate_that_hardly_changes_shows_no_unit():
     assert all(gate.passed is not False for gate in check_gates(log))
 
 
-def followed(command, most):
-    """Return a rate that follows a command by at most so many rad/s²."""
-    rates = [0.0]
-    for wanted in command[1:].tolist():
-        rates.append(rates[-1] + np.clip(wanted - rates[-1], -0.01 * most, 0.01 * most))
-    return np.array(rates)
-
-
 def test_a_robot_that_follows_a_swing_in_part_is_no_unit_error():
     command = np.sin(2.0 * np.pi * 0.3 * TIME)
-    output = followed(command, 0.5) + 1e-3 * np.random.default_rng(1).standard_normal(len(TIME))
+    output = limited(command, 0.005) + 1e-3 * np.random.default_rng(1).standard_normal(len(TIME))
     log = Log(output=output, time=TIME, reference_rate=command)
     gate = check_gates(log)[-1]
     assert gate.name == 'motion' and not gate.passed and 'rate_command' in gate.remedy, gate
@@ -202,7 +198,7 @@ def test_a_robot_that_follows_a_swing_in_part_is_no_unit_error():
 def test_a_robot_that_follows_steps_late_shows_its_unit(factor, name):
     generator = np.random.default_rng(2)
     command = np.repeat(generator.uniform(-1.0, 1.0, 40), 300)
-    output = factor * (followed(command, 0.5) + 1e-3 * generator.standard_normal(len(TIME)))
+    output = factor * (limited(command, 0.005) + 1e-3 * generator.standard_normal(len(TIME)))
     gate = check_gates(Log(output=output, time=TIME, reference_rate=command), is_command=True)[-1]
     assert gate.name == name and gate.passed is False, gate
 
@@ -230,3 +226,133 @@ def test_the_unit_and_sense_of_a_rate_table_are_checked(factor, refused):
     else:
         with pytest.raises(DataRefused, match=refused):
             fit(table)
+
+
+# Which reference is taken, what is rest, and what is refused
+
+COUNT = len(TIME)
+RATE = np.sin(0.9 * TIME) * np.clip(3.0 * np.sin(0.11 * TIME), 0.0, 1.0)
+ANGLE = np.concatenate([[0.0], np.cumsum(0.005 * (RATE[1:] + RATE[:-1]))])
+TURNED = np.cumsum(np.abs(RATE)) * 0.01
+
+
+def gyro(rate, seed=1):
+    """Return the output of a gyro with noise of 0.057 deg/s and a scale factor error of 1 %."""
+    return 1.01 * rate + 2e-3 + 1e-3 * np.random.default_rng(seed).standard_normal(len(rate))
+
+
+LOG = Log(output=gyro(RATE), time=TIME, reference_rate=RATE)
+STILL = Log(output=gyro(np.zeros(COUNT)), time=TIME)
+
+
+# a reference that says nothing
+
+def test_a_reference_of_nan_alone_is_none():
+    """Beside a heading that says all, and at rest."""
+    nothing = np.full(COUNT, np.nan)
+    by_heading, by_none = (select_reference(replace(log, reference_rate=nothing))[0]
+                           for log in (replace(LOG, reference_heading=ANGLE), STILL))
+    assert by_heading.reference_rate is None and by_heading.reference_heading is ANGLE
+    assert by_none.reference_rate is None and is_at_rest(by_none)
+    assert not diagnose([replace(STILL, reference_heading=nothing)],
+                        np.random.default_rng(1)).findings
+
+
+def test_a_rate_that_is_known_at_times_gives_way_to_the_heading():
+    some = np.where(np.arange(COUNT) < 50, RATE, np.nan)
+    log = replace(LOG, reference_rate=some, reference_heading=np.round(ANGLE / 1e-3) * 1e-3)
+    quality = inspect_record(log)
+    assert quality.heading_step == pytest.approx(1e-3)
+    assert select_reference(log)[0].reference_rate is None
+
+
+# noise is no motion
+
+def noisy(kind):
+    """Return a reference at rest: odometry, motion capture, a simulator, or an encoder."""
+    generator = np.random.default_rng(7)
+    noise = generator.standard_normal(COUNT)
+    if kind == 'odometry':
+        return {'reference_rate': 0.01 * noise}
+    if kind == 'simulator':
+        return {'reference_rate': 1e-8 * noise}
+    if kind == 'motion capture':
+        return {'reference_heading': 1e-3 * noise + 2e-3 * np.sin(0.05 * TIME)}
+    return {'reference_heading': 0.088 * DEGREE * (np.sin(0.07 * TIME) + 0.3 * noise > 0.0)}
+
+
+@pytest.mark.parametrize('kind', ['odometry', 'simulator', 'motion capture', 'encoder'])
+def test_the_noise_of_a_reference_at_rest_is_no_motion(kind):
+    log = replace(STILL, **noisy(kind))
+    refuse_unusable(log)
+    assert is_at_rest(log) and not np.nan_to_num(select_reference(log)[0].reference_rate).any()
+    assert 'taken to be at rest' in ' '.join(inspect_record(log).remarks)
+
+
+def test_a_gyro_at_rest_beside_a_noisy_reference_has_no_findings():
+    found = diagnose([replace(STILL, **noisy('motion capture'))], np.random.default_rng(1))
+    assert not found.findings and 'scale_factor_error' in found.cannot_show
+
+
+@pytest.mark.parametrize('size', [0.05, 0.5])
+def test_a_small_motion_that_the_gyro_sees_stays_motion(size):
+    """Swings of so many deg, beside the noise of the references above."""
+    swing = size * DEGREE * np.sin(0.5 * TIME)
+    for kind in ('odometry', 'motion capture'):
+        noise = next(iter(noisy(kind).values()))
+        motion = {'odometry': {'reference_rate': 0.1 * noise + np.gradient(swing, TIME)},
+                  'motion capture': {'reference_heading': 0.1 * noise + swing}}[kind]
+        assert not is_at_rest(replace(STILL, output=gyro(np.gradient(swing, TIME)), **motion))
+
+
+# what is refused
+
+def jumped(seconds):
+    """Return a log in the middle of which a clock was set."""
+    return replace(LOG, time=TIME + np.where(np.arange(COUNT) < COUNT // 2, 0.0, seconds))
+
+
+@pytest.mark.parametrize('log', [jumped(12.0 * 86400.0), jumped(1500.0),
+                                 replace(jumped(12.0 * 86400.0), output=LOG.output - RATE,
+                                         reference_rate=0.0 * RATE)],
+                         ids=['a clock that was set', 'two drives', 'at rest'])
+def test_a_log_that_is_a_gap_for_the_most_part_is_refused_with_where_it_is(log):
+    with pytest.raises(
+            DataRefused,
+            match=r'12000 of .* samples can be used.*begins at 59\.990 s: cut the log there'):
+        diagnose([log], np.random.default_rng(1))
+
+
+@pytest.mark.parametrize('first', [0.0, -np.pi])
+@pytest.mark.parametrize('use', [refuse_unusable, calibrate_encoder])
+def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
+    heading = np.where(TIME % 7.0 < 0.1, np.nan, (TURNED - first) % (2.0 * np.pi) + first)
+    with pytest.raises(DataRefused,
+                       match='heading jumps by a full turn, first at .* s: use --unwrap'):
+        use(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=heading))
+
+
+@pytest.mark.parametrize('use', [refuse_unusable, calibrate_encoder])
+def test_a_full_turn_in_a_gap_that_the_gyro_does_not_show_is_refused(use):
+    heading = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + 2.0 * np.pi * (TIME > 32.0))
+    log = Log(output=1.03 * np.abs(RATE) + 0.01, time=TIME, reference_heading=heading)
+    with pytest.raises(DataRefused, match='full turn that the gyro does not show, first in the '
+                                          r'gap that ends at 37\..* use --unwrap'):
+        use(log)
+    restored, _ = unwrap_heading(TIME, heading, TIME, log.output)
+    refuse_wrapped(replace(log, reference_heading=restored))
+
+
+def test_turns_in_gaps_or_between_slow_samples_are_no_wrapped_heading():
+    turn = 2.0 * np.pi * np.clip(TIME - 32.0, 0.0, 1.0)
+    lost = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + turn)
+    measured = gyro(np.abs(RATE) + np.gradient(turn, TIME))
+    refuse_unusable(Log(output=measured, time=TIME, reference_heading=lost))
+    # nor where the gyro was lost too, or has another unit
+    either = np.where(np.isnan(lost), np.nan, gyro(np.abs(RATE)))
+    refuse_unusable(Log(output=either, time=TIME, reference_heading=lost))
+    refuse_wrapped(Log(output=57.3 * measured, time=TIME, reference_heading=lost))
+    slow = np.arange(1000) * 1.0
+    turned = np.cumsum(2.0 * np.pi * (np.sin(0.05 * slow) > 0.0))
+    rate = np.gradient(turned, slow)
+    refuse_unusable(Log(output=gyro(rate), time=slow, reference_heading=turned))

@@ -11,10 +11,14 @@
 """The generator of hidden effects: its noise, physics, sizes, and independence of the package."""
 
 import ast
+import json
 import math
 from pathlib import Path
 
 from chance import evidence, seeded
+from gyro_calibration.allan.deviation import allan_deviation
+from gyro_calibration_bench.__main__ import main
+from gyro_calibration_bench.cases import make_logs, part_cases, PARTS, random_source
 import gyro_calibration_bench.hidden
 from gyro_calibration_bench.hidden import (
     draw_gyro, FORMS, hide, hide_look_alike, KINDS, LOOK_ALIKES, NoiseFigures, record_separating,
@@ -24,6 +28,8 @@ from gyro_calibration_bench.hidden.log import ALL
 from gyro_calibration_bench.hidden.noise import (
     draw_figures, generate_noise, markov_processes, Whitening)
 from gyro_calibration_bench.hidden.size import InformationMetric
+from gyro_calibration_bench.methods import METHODS
+from gyro_calibration_bench.scores import score_case, wilson_interval
 import numpy as np
 import pytest
 
@@ -47,25 +53,16 @@ def test_nothing_of_the_package_is_imported():
                          'gyro_calibration_bench', 'numpy', 'pathlib', 'scipy', 'typing'}, path
 
 
-def allan_variance(rate, interval, size):
-    """Return the Allan variance of a record over so many samples, over all overlapping means."""
-    angle = np.concatenate([[0.0], np.cumsum(rate)]) * interval
-    second = angle[2 * size:] - 2.0 * angle[size:-size] + angle[:-2 * size]
-    return float(np.mean(second ** 2) / (2.0 * (size * interval) ** 2))
-
-
 @pytest.mark.parametrize('figures, expected, tolerance', [
     (NoiseFigures(1e-3), lambda tau: 1e-6 / tau, 0.08),
     (NoiseFigures(1e-9, rate_random_walk=1e-3), lambda tau: 1e-6 * tau / 3.0, 0.1),
     (NoiseFigures(1e-9, 1e-3), lambda tau: 2.0 * math.log(2.0) / math.pi * 1e-6, 0.1)],
                          ids=['white', 'walk', 'flicker'])
 def test_the_noise_has_the_allan_variance_of_ieee_952(generator, figures, expected, tolerance):
-    interval = 0.1
-    records = [np.sum(generate_noise(figures, 20_000, interval, generator), axis=0)
-               for _ in range(40)]
-    for size in (16, 64, 128):
-        found = np.mean([allan_variance(each, interval, size) for each in records])
-        assert found == pytest.approx(expected(size * interval), rel=tolerance)
+    times = np.array([1.6, 6.4, 12.8])
+    records = [np.sum(generate_noise(figures, 20_000, 0.1, generator), axis=0) for _ in range(40)]
+    found = np.mean([allan_deviation(each, 0.1, times).deviation ** 2 for each in records], axis=0)
+    assert found == pytest.approx(expected(times) + 0.0 * times, rel=tolerance)
 
 
 @pytest.mark.parametrize('encoder_step', [0.0, 1e-3])
@@ -162,3 +159,76 @@ def test_twins_are_alike_and_then_distinguished(generator, pair, first):
     again = record_separating(pair, log, generator)
     assert again.truth.gyro == log.truth.gyro
     assert left_over(name, other, log, [log.session, again.session], LOOK_ALIKES[pair]) > 4.2
+
+
+# The benchmark: its cases, and how answers are scored
+
+TRUTH = {'part': 'sets', 'look_alikes': ['bias_temperature', 'rate_ramp'], 'allowed': [],
+         'causes': [{'name': 'rate_ramp', 'size': 2e-6, 'shapes': {}, 'unit': 'rad/s²',
+                     'minimum_detectable': 5e-7, 'multiple': 4.0}]}
+BOTH = {'effect': 'bias_temperature', 'ambiguous_with': ['rate_ramp']}
+ALONE = {'effect': 'rate_ramp', 'size': 2.1e-6, 'interval': [1.9e-6, 2.3e-6]}
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    made = tmp_path_factory.mktemp('bench')
+    assert main(['make', str(made), '--seed', '3', '--cases', '1', '--part', 'separated']) == 0
+    return made
+
+
+def test_cases_do_not_tell_what_is_hidden_and_both_logs_are_there(made):
+    public = json.loads((made / 'cases.json').read_text())
+    truth = json.loads((made / 'truth.json').read_text())
+    assert [*public['cases']] == [*truth['cases']] == ['0000']
+    assert public['cases']['0000']['logs'] == ['0000a.csv.gz', '0000b.csv.gz']
+    assert set(public['cases']['0000']) == {'logs', 'model'}
+    assert all((made / log).exists() for log in public['cases']['0000']['logs'])
+
+
+def test_an_answer_is_scored_from_its_file(made, tmp_path, capsys):
+    truth = json.loads((made / 'truth.json').read_text())['cases']['0000']
+    answers = tmp_path / 'answers.json'
+    right = {'causes': [{'effect': truth['causes'][0]['name']}]}
+    for given, expected in ({'0000': right}, 1), ({}, 0):
+        answers.write_text(
+            json.dumps({'schema': 'gyro_calibration_bench/answers/1', 'answers': given}))
+        capsys.readouterr()
+        assert main(['score', str(made), str(answers), '--json']) == 0
+        counts = json.loads(capsys.readouterr().out)['separated']['right']
+        assert (counts['good'], counts['of']) == (expected, 1)
+    answers.write_text('{"answers": {}}')
+    assert main(['score', str(made), str(answers)]) == 2
+    assert 'schema' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('part, causes, right', [
+    ('sets', [BOTH], True), ('sets', [ALONE], False), ('sets', [BOTH, ALONE], False),
+    ('separated', [ALONE], True), ('separated', [BOTH], False), ('separated', [], False)])
+def test_look_alikes_are_both_named_until_a_log_separates_them(part, causes, right):
+    assert score_case({**TRUTH, 'part': part}, {'causes': causes}).is_right == right
+
+
+def test_intervals_are_those_of_wilson():
+    # (k + z²/2 -+ z sqrt(k (n - k) / n + z²/4)) / (n + z²), by hand for 9 of 10
+    assert wilson_interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
+
+
+@pytest.mark.parametrize('method', ['greedy', 'lasso'])
+def test_a_baseline_names_a_large_effect_with_its_size(method, tmp_path):
+    log, = hide(['scale_factor_asymmetry'], 20.0, np.random.default_rng(0), noise='white',
+                duration=300.0, sample_rate=25.0)
+    causes, unexplained = METHODS[method]([log.write(tmp_path / 'log.csv')], None)
+    cause, = (each for each in causes if each.effect == 'scale_factor_asymmetry')
+    truth = log.truth['scale_factor_asymmetry']
+    assert causes[0] == cause and not unexplained
+    assert cause.size == pytest.approx(truth.size, abs=4.0 * truth.standard_deviation)
+
+
+def test_a_case_is_random_by_its_name_and_the_seed():
+    case = next(part_cases('nothing', 1))
+    first, again, other = (make_logs(case, random_source(case, seed))[0].columns['gyro_rad_s']
+                           for seed in (1, 1, 2))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    assert all(len({str(each) for each in part_cases(part, 2)}) == len([*part_cases(part, 2)])
+               for part in PARTS)

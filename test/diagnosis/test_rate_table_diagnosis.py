@@ -128,7 +128,6 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
 
 # models that are put to the test
 
-
 def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
     table = replace(Table(), fastest=300.0 * DEGREE)
     found = diagnosed(table, gyro('cubic_nonlinearity', -0.01), np.random.default_rng(9),

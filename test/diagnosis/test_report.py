@@ -115,7 +115,6 @@ def trace():
 
 
 def unexplained():
-    """Return a diagnosis where something along the heading has no name."""
     return replace(
         adequate(),
         unexplained=(Unexplained('heading', 0.12, 1e-7), Unexplained('rate', 0.03, 2e-4)),
@@ -123,7 +122,6 @@ def unexplained():
 
 
 def bare():
-    """Return a diagnosis without a gain, and with nothing to draw."""
     return replace(extended(), gain=None, curves=[], heading=None, noise_curve=None, trace=None)
 
 
@@ -167,7 +165,6 @@ def hostile():
 
 
 def holes():
-    """Return a diagnosis whose numbers are lacking in places."""
     whole, missing = extended(), np.full(24, np.nan)
     found = replace(temperature_finding(), p_value=np.nan, minimum_detectable=None,
                     parameters={'bias_temperature': Estimate(1e-4, (-np.inf, np.inf), 'rad/s/K'),
@@ -186,7 +183,6 @@ MADE = {each.__name__: each
 
 @pytest.fixture(params=MADE, scope='module')
 def made(request):
-    """Return one diagnosis after the other."""
     return MADE[request.param]()
 
 
@@ -219,7 +215,6 @@ class Page(HTMLParser):
 
     @property
     def text(self):
-        """Return what a person can read."""
         return ' '.join(' '.join(self.texts).split())
 
 
@@ -384,7 +379,6 @@ onload = () => { document.body.textContent = JSON.stringify(
 
 
 def browse(folder, *words):
-    """Run a browser without a window; return what it prints."""
     if not CHROMIUM.exists():
         pytest.skip(f'{CHROMIUM} is missing: install the package chromium')
     command = [CHROMIUM, '--headless', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage',

@@ -13,7 +13,7 @@
 from dataclasses import replace
 import math
 
-from diagnosed import diagnosis_of, held
+from diagnosed import diagnosis_of, established, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate, effect_candidate, generic_terms, is_named, propose_candidates)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
@@ -33,7 +33,6 @@ TIME = np.arange(8000) / 20.0
 
 
 def resting(added=0.0, time=TIME, seed=0, **columns):
-    """Return a log at rest of a gyro with white noise."""
     output = added + NOISE * np.random.default_rng(seed).standard_normal(len(time))
     return Log(output=output, time=time, moving=np.zeros(len(time)), **columns)
 
@@ -47,7 +46,6 @@ def tone(size, frequency, time=TIME, phase=0.3):
 
 
 def found_in(replays):
-    """Return a search, and what it names."""
     search = start_search(replays)
     return search, search_causes(search)
 
@@ -158,7 +156,6 @@ def test_what_is_established_is_significant_given_all_that_is():
 
 # contradictions
 
-
 def test_a_scale_factor_of_a_part_of_a_log_is_not_blamed_on_the_temperature():
     generator, time = np.random.default_rng(4), np.arange(6000) * 0.05
     rate = np.sin(0.9 * time) * np.sin(0.11 * time)
@@ -167,7 +164,7 @@ def test_a_scale_factor_of_a_part_of_a_log_is_not_blamed_on_the_temperature():
               time=time, reference_rate=rate,
               temperature=30.0 + 12.0 * np.sin(2.0 * math.pi * time / 180.0 + 3.0))
     found = diagnose([log], generator)
-    assert not [each for each in found.findings if each.status == 'established']
+    assert not established(found)
     assert 'rate and time' in [each.along for each in found.unexplained]
     assert any('an effect of a part of the log' in remark for remark in found.remarks)
 

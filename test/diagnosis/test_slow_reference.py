@@ -8,18 +8,21 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A reference that is slow, was smoothed, or repeats its last value causes no false names."""
+"""A reference that is slow, repeats its value, or is a command causes no false names."""
 
 from dataclasses import replace
+import re
 
 from chance import seeds
+from diagnosed import established, estimates, limited
 from gyro_calibration.calibration.encoder import calibrate_encoder, choose_reference
-from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
-from gyro_calibration.calibration.reference_noise import drop_repeated_headings
+from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.reference_noise import drop_repeated_headings, rate_noise_share
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 RATE, BIAS, SCALE = 50.0, 0.4 * DEGREE, 0.006
 TIME = np.arange(0.0, 90.0, 1.0 / RATE)
@@ -55,34 +58,6 @@ def linear(true, interval):
     return np.interp(TIME, at, true(at))
 
 
-@pytest.mark.parametrize('given', [held, linear])
-@pytest.mark.parametrize('interval', [0.05, 0.1, 0.2])
-def test_the_own_instants_of_a_slow_reference_are_found(given, interval):
-    for true in turning(1)[1:]:
-        found = find_own_instants(TIME, given(true, interval))
-        assert found.interval == pytest.approx(interval, rel=0.01)
-        assert found.is_held == (given is held)
-        assert find_own_instants(TIME, true(TIME)) is None
-    log = replace(turning(1)[0], reference_heading=given(true, interval))
-    own, instants = keep_own_instants(log)
-    known = np.isfinite(own.reference_heading)
-    assert instants.interval == found.interval
-    assert (np.isfinite(instants.time) == known).all()
-    if given is linear:  # where a held heading stands, it may be lost
-        assert known.sum() == pytest.approx(TIME[-1] / interval, rel=0.01)
-    # held values were taken since the sample before, those on lines are as exact as the splines
-    error = np.abs(own.reference_heading - true(TIME))[known]
-    fastest = np.abs(np.diff(true(TIME))).max()
-    assert error.max() < (fastest if given is held else 0.1 * interval * RATE * fastest)
-
-
-def test_a_table_that_holds_each_rate_for_seconds_is_not_slow():
-    rate = np.repeat(np.random.default_rng(2).uniform(-1.0, 1.0, 36), 125)
-    log = Log(time=TIME, output=rate, reference_rate=rate,
-              reference_heading=np.cumsum(rate) / RATE)
-    assert keep_own_instants(log)[1] is None
-
-
 SLOW = {'rate held': ('reference_rate', held, 0.1), 'rate linear': ('reference_rate', linear, 0.2),
         'heading held': ('reference_heading', held, 0.1),
         'heading linear': ('reference_heading', linear, 0.2)}
@@ -98,12 +73,10 @@ def test_a_slow_reference_shows_the_gyro_and_nothing_else(name, asymmetry, seed)
     found = diagnose([log], np.random.default_rng(0))
     assert found.remarks[0].startswith('The reference has a value of its own every '
                                        f'{1000.0 * interval:.3g} ms')
-    names = {each.effect for each in found.findings if each.status == 'established'}
-    assert names - {'time_offset'} == ({'scale_factor_asymmetry'} if asymmetry else set())
+    assert {*established(found)} - {'time_offset'} == {*['scale_factor_asymmetry'][:asymmetry > 0]}
     assert not found.unexplained
-    values = {term.effect.name: term.values[0] for term in found.model.terms}
-    assert values['scale_factor_error'] == pytest.approx(SCALE, abs=2e-3)
-    assert values['bias'] == pytest.approx(BIAS, abs=0.03 * DEGREE)
+    assert estimates(found)['scale_factor_error'][0] == pytest.approx(SCALE, abs=2e-3)
+    assert estimates(found)['bias'][0] == pytest.approx(BIAS, abs=0.03 * DEGREE)
 
 
 def test_all_verbs_take_the_heading_where_a_rate_is_late_and_state_that_once():
@@ -181,3 +154,196 @@ def test_the_instants_of_a_held_rate_are_found_beside_a_gap():
             output=(motion + 0.01 * generator.standard_normal(6000))[kept]))
         known = instants.time[np.isfinite(instants.time)]
         assert (np.diff(known) > 0.0).all() and len(known) == pytest.approx(len(kept) / 5, rel=0.1)
+
+
+# A commanded rate, which the motion follows late, by a response of its own
+
+INTERVAL, SUBSTEPS, COUNT = 0.05, 20, 3000
+S, B = 0.012, 0.3 * DEGREE
+
+
+def commanded(kind, generator):
+    """Return a commanded rate in steps, trapezoids or a swing, at fine steps, rad/s."""
+    time = np.arange(COUNT * SUBSTEPS) * INTERVAL / SUBSTEPS
+    if kind == 'swing':
+        ends = np.linspace(0.0, time[-1], 12)
+        size, frequency = (np.interp(time, ends, generator.uniform(*between, 12))
+                           for between in ((0.5, 1.5), (0.05, 0.3)))
+        return size * np.sin(2.0 * np.pi * np.cumsum(frequency) * INTERVAL / SUBSTEPS)
+    ramp = 0.01 if kind == 'steps' else 0.8
+    stops, rates = [0.0, 4.0], [0.0, 0.0]
+    while stops[-1] < time[-1]:
+        rate = generator.choice([-1, 1]) * generator.uniform(0.2, 1.5)
+        hold, rest = generator.uniform((2.0, 1.0), (6.0, 4.0))
+        stops += np.add(stops[-1], np.cumsum([ramp, hold, ramp, rest])).tolist()
+        rates += [rate, rate, 0.0, 0.0]
+    return np.interp(time, stops, rates)
+
+
+def followed(command, delay, frequency, damping):
+    """Return the rate of a robot that follows a command late, as a system of second order."""
+    late = np.append(np.zeros(round(delay * SUBSTEPS / INTERVAL)), command)[:len(command)]
+    pace = frequency * INTERVAL / SUBSTEPS
+    kept = 1.0 - 2.0 * damping * pace
+    return lfilter([pace ** 2], [1.0, pace ** 2 - kept - 1.0, kept], late)
+
+
+def commanded_log(kind, noise, seed, added=lambda rate, time: 0.0, period=0.0, jitter=0.0,
+                  robot=(0.08, 8.0, 0.7), limit=None):
+    """
+    Return a log of a robot with its command, which may be held, as the reference rate.
+
+    The robot may limit the acceleration of what it is commanded, in rad/s².
+    """
+    generator = np.random.default_rng(seed)
+    command = commanded(kind, generator)
+    if period:
+        every = round(period / INTERVAL * SUBSTEPS)
+        sent = np.arange(0, len(command), every)
+        sent[1:] += np.rint(jitter * every * generator.standard_normal(len(sent) - 1)).astype(int)
+        command = command[np.repeat(sent, np.diff(sent, append=len(command)))]
+    wanted = limited(command, limit * INTERVAL / SUBSTEPS) if limit else command
+    rate = followed(wanted, *robot)[::SUBSTEPS]
+    time = np.arange(COUNT) * INTERVAL
+    output = ((1.0 + S) * rate + B + added(rate, time)
+              + noise / np.sqrt(INTERVAL) * generator.standard_normal(COUNT))
+    return Log(output=output, time=time, reference_rate=command[::SUBSTEPS])
+
+
+TRUE = {'bias': B, 'scale_factor_error': S}
+
+
+def check_lag_alone(log, lag=None, largest=np.inf, kind=None, known=(*TRUE,)):
+    """Diagnose a log whose lag, s, and values are known; 4 deviations of the scale are limited."""
+    found = diagnose([log], np.random.default_rng(0), reference_kind=kind)
+    assert {*established(found)} == {'reference_lag'} and not found.unexplained
+    assert {term.effect.name for term in found.model.terms} == {*TRUE}
+    assert 'lag of its own' in found.cannot_show['time_offset']
+    if lag is not None:
+        size = established(found)['reference_lag'].parameters['reference_lag']
+        assert size.estimate == pytest.approx(lag, abs=0.03)
+    for name in known:
+        value, deviation = estimates(found)[name]
+        assert abs(value - TRUE[name]) < 4.0 * deviation
+    assert 4.0 * estimates(found)['scale_factor_error'][1] < largest
+    return found
+
+
+@pytest.mark.parametrize('kind, noise', [('steps', 3e-4), ('trapezoids', 3e-4), ('swing', 3e-4),
+                                         ('trapezoids', 3e-5)])
+def test_the_lag_of_a_robot_is_no_effect_of_its_gyro(kind, noise):
+    check_lag_alone(commanded_log(kind, noise, 1), 0.08 + 2.0 * 0.7 / 8.0)
+
+
+def test_a_command_may_be_recorded_ten_times_a_second():
+    check_lag_alone(select_rows(commanded_log('trapezoids', 3e-4, 1), slice(None, None, 2)))
+
+
+def turns_between_samples(seed):
+    """Return a log at 50 Hz of a robot 0.4 s late, whose command is sent at 20 Hz."""
+    generator = np.random.default_rng(seed)
+    sizes = np.ravel([[0.0, each] for each in generator.choice([-0.8, 0.8], 16)])
+    command = np.repeat(sizes, 50 * generator.integers(40, 160, len(sizes)))  # at 1000 Hz
+    rate = lfilter([0.0025], [1.0, -0.9975], command)[::20]
+    time = 0.02 * np.arange(len(rate))
+    return Log(output=(1.0 + S) * rate + B + 2e-3 * generator.standard_normal(len(rate)),
+               time=time, reference_rate=command[::20])
+
+
+@pytest.mark.parametrize('seed', seeds(2))
+def test_a_command_may_change_between_the_samples_of_a_log(seed):
+    """Each change is seen up to a sample late; not the dwells alone show the gyro, all does."""
+    assert not check_lag_alone(turns_between_samples(seed), kind='rate_command').remarks
+
+
+def test_a_late_motion_is_compared_with_its_command_however_that_jitters():
+    log = commanded_log('swing', 3e-4, 1, period=0.1, jitter=0.1, robot=(0.2, 8.0, 0.7))
+    assert rate_noise_share(log, True) == 0.0
+    sample = replace(log, reference_rate=log.reference_rate + 0.01 * np.random.default_rng(
+        1).standard_normal(len(log)))
+    assert rate_noise_share(sample, True) == 0.0
+    # which a rate that was measured is not
+    prompt = commanded_log('swing', 3e-4, 1, robot=(0.0, 40.0, 1.0))
+    assert rate_noise_share(replace(sample, output=prompt.output), True) > 0.1
+
+
+@pytest.mark.parametrize('robot', [(0.0, 1.6, 0.4), (0.1, 4.0, 1.0)])
+@pytest.mark.parametrize('kind, walk', [('trapezoids', 0.0), ('trapezoids', 0.3), ('swing', 0.0)])
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_slow_or_ringing_robot_leaves_the_scale_as_it_is(kind, walk, robot, seed):
+    """In a walk of the bias, too, which is as large as the white noise after 3 s."""
+    wander = 3e-4 * walk * np.sqrt(3.0 * INTERVAL) * np.cumsum(
+        np.random.default_rng(900 + seed).standard_normal(COUNT))
+    delay, frequency, damping = robot
+    check_lag_alone(
+        commanded_log(kind, 3e-4, 70 + seed, lambda rate, time: wander, robot=robot),
+        delay + 2.0 * damping / frequency, 0.008, 'rate_command', ('scale_factor_error',))
+
+
+@pytest.mark.parametrize('kind, effect, added', [
+    ('trapezoids', 'cubic_nonlinearity', lambda rate, time: 0.006 * rate ** 3),
+    ('swing', 'bias_step', lambda rate, time: 4e-3 * (time > 80.0)),
+    ('steps', 'bias_step', lambda rate, time: 4e-3 * (time > 80.0))])
+def test_an_effect_of_the_gyro_is_found_beside_the_lag(kind, effect, added):
+    found = diagnose([commanded_log(kind, 2e-4, 2, added)], np.random.default_rng(0))
+    assert {*established(found)} == {'reference_lag', effect}
+
+
+@pytest.mark.parametrize('asymmetry', [0.0, 0.02])
+@pytest.mark.parametrize('kind, jitter', [('steps', 0.0), ('steps', 0.1), ('trapezoids', 0.0),
+                                          ('trapezoids', 0.1), ('swing', 0.0)])
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_command_at_5_hz_shows_the_gyro_and_the_lag_alone(kind, jitter, asymmetry, seed):
+    log = commanded_log(kind, 1e-4, 40 + seed, lambda rate, time: asymmetry * np.abs(rate), 0.2,
+                        jitter)
+    found = diagnose([log], np.random.default_rng(0))
+    assert {*established(found)} == {
+        'reference_lag', *['scale_factor_asymmetry'] * bool(asymmetry)} and not found.unexplained
+    assert estimates(found)['scale_factor_error'][0] == pytest.approx(S, abs=2e-3)
+    assert estimates(found)['bias'][0] == pytest.approx(B, abs=0.03 * DEGREE)
+
+
+@pytest.mark.parametrize('kind', ['steps', 'trapezoids'])
+@pytest.mark.parametrize('limit, period', [(0.5, 0.2), (1.0, 0.2), (1.0, 0.0)])
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_limit_of_acceleration_leaves_the_gyro_known(kind, limit, period, seed):
+    log = commanded_log(kind, 1e-4, 51 + seed, period=period, limit=limit)
+    found = check_lag_alone(log, largest=2e-3, known=('scale_factor_error',))
+    stated = re.search('at most (.*) rad/s² and slows down by at most (.*) rad/s²',
+                       found.findings[0].evidence)
+    assert [float(each) for each in stated.groups()] == pytest.approx([limit, limit], rel=0.05)
+
+
+@pytest.mark.parametrize('kind', ['trapezoids', 'swing'])
+def test_what_follows_a_hole_in_the_command_is_left_out(kind):
+    """The motion follows commands that are not known, by an unknown lag."""
+    log = commanded_log(kind, 3e-5, 4)
+    log.reference_rate[1400:1460] = np.nan
+    check_lag_alone(log, 0.08 + 2.0 * 0.7 / 8.0, 4e-3, 'rate_command', ('scale_factor_error',))
+
+
+def test_a_swing_that_a_slow_robot_repeats_is_refused():
+    """Any waveform is a response to it, of any scale."""
+    step = INTERVAL / SUBSTEPS
+    command = 0.8 * np.sign(np.sin(2.0 * np.pi / 8.0 * step * np.arange(COUNT * SUBSTEPS)))
+    rate = followed(limited(command, 0.6 * step), 0.08, 20.0, 0.7)[::SUBSTEPS]
+    generator = np.random.default_rng(0)
+    log = Log(time=INTERVAL * np.arange(COUNT), reference_rate=command[::SUBSTEPS],
+              output=(1.0 + S) * rate + B + 1e-3 * generator.standard_normal(COUNT))
+    with pytest.raises(DataRefused, match='in a swing that repeats: turn at several rates'):
+        diagnose([log], generator, reference_kind='rate_command')
+
+
+def test_a_command_that_is_held_between_updates_has_no_noise():
+    log = commanded_log('swing', 3e-4, 3)
+    held = log.reference_rate[np.arange(COUNT) // 4 * 4]
+    assert rate_noise_share(Log(output=log.output, time=log.time, reference_rate=held)) == 0.0
+
+
+def test_a_scale_is_fitted_beside_the_lag_of_a_swing():
+    """A lag attenuates a swing, by 2 % at 0.2 Hz here."""
+    errors = []
+    for seed in range(4):
+        fit = calibrate_encoder(commanded_log('swing', 3e-4, seed)).fit
+        errors.append((fit.scale_factor_error - S) / np.sqrt(fit.covariance[0, 0]))
+    assert np.abs(errors).max() < 4.0

@@ -38,7 +38,6 @@ def turning(rate=0.5, frequency=100.0):
 
 # With real ports
 
-
 def held():
     """Return how many threads and file descriptors this process has."""
     return threading.active_count(), len(os.listdir('/proc/self/fd'))
@@ -62,7 +61,6 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
 
 # Recognizing
 
-
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_auto_finds_the_protocol_and_reports_it(name):
     world = World(15.0, baud=find_protocol(name).baud)
@@ -83,7 +81,6 @@ def test_auto_asks_for_what_the_protocol_needs():
 
 
 # Finding and waiting
-
 
 def test_a_gyro_is_found_again_under_another_name(tmp_path):
     """As in /dev/serial/by-id, where the name holds the serial number of the adapter."""
@@ -130,7 +127,6 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
 
 
 # Silence
-
 
 def test_a_gyro_that_falls_silent_is_opened_again():
     world = World(20.0)
@@ -206,7 +202,6 @@ def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():
 
 # Counts and stamps
 
-
 def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     world = World(5.0)
     world.gyro('csv')
@@ -236,7 +231,6 @@ def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps()
 
 
 # The port alone
-
 
 @pytest.fixture
 def terminal():
@@ -314,7 +308,6 @@ def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
 
 # The mean of several samples in place of each
 
-
 PERIOD = 1e-3
 EPOCH = 1.7e9
 
@@ -355,9 +348,7 @@ def test_a_jump_of_the_stamps_ends_a_group(numbers, sizes):
 
 # The emulated gyro, read through a real pseudo-terminal
 
-
 def samples(count=None, rate=100.0):
-    """Return samples at a fixed rate, endless without a count."""
     indices = itertools.count() if count is None else range(count)
     return (Sample(0.1 * math.sin(k), 25.0, 5.0 + k / rate) for k in indices)
 
@@ -427,8 +418,3 @@ def test_a_file_in_the_place_of_the_link_is_kept(tmp_path):
     with pytest.raises(FileExistsError, match='give another path'):
         Emulator(find_protocol('csv'), samples(), link=tmp_path / 'notes').open()
     assert (tmp_path / 'notes').read_text() == 'precious'
-
-
-def test_an_emulator_without_a_needed_setting_is_refused_before_the_start():
-    with pytest.raises(ValueError, match='sensitivity'):
-        Emulator(find_protocol('csv'), samples(), Settings(columns=('gyro_counts',)))

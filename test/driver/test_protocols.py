@@ -82,7 +82,6 @@ def test_frames_of_the_documented_layout_are_read_by_the_settings(name, settings
 
 
 def sent(name, sample, settings=None):
-    """Return the samples that arrive of one."""
     settings = settings or SETTINGS[name]
     return opened(name, settings).feed(find_protocol(name).encoder(settings)(sample))
 
@@ -248,7 +247,6 @@ def test_settings_that_do_not_fit_are_refused(name, values, message):
 
 # Listening
 
-
 MOTIONS = {
     'rest': lambda k: 1e-4 * math.sin(7.0 * k),
     'stillness': lambda k: 0.0,  # an emulated gyro without noise
@@ -385,7 +383,6 @@ def test_a_frame_of_the_ecore_among_other_bytes_counts_where_another_one_follows
 
 # Fizoptika: values that are spread over two frames
 
-
 ONE_COUNT = Settings(sensitivity=1.0)
 
 
@@ -452,7 +449,6 @@ def test_halves_with_garbage_between_are_not_joined():
 
 # KVH 1750: the frame of interface control document 56-0298, section 5.2.1
 
-
 GOLDEN = bytes.fromhex('FE81FF5537A96A6E38586C1FB75BF862BF803E78BB650D283B0A37AC773D00284BFA34D8')
 ROTATION = {'x': 2.019593e-5, 'y': 5.159911e-5, 'z': -1.3111248e-5}  # rad since the last sample
 FORCE = {'x': -1.00191, 'y': -0.003495, 'z': 0.002109}  # g
@@ -516,7 +512,6 @@ def test_what_the_1750_answers_between_frames_costs_no_sample():
 
 # Razor: axes right and down, negated accelerations, and lines of other kinds
 
-
 @pytest.mark.parametrize('axis, rate, force', [
     ('x', 0.01, -0.05),  # forward in both frames; what is sent is negated
     ('y', -0.02, -0.1),  # right becomes left
@@ -546,7 +541,6 @@ def test_the_angles_that_a_razor_sends_until_it_is_asked_for_more_are_in_order_b
 
 
 # WitMotion: accelerations in frames of their own
-
 
 def witmotion(kind, *numbers):
     data = bytes([0x55, kind]) + struct.pack('<4h', *numbers)

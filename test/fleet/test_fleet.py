@@ -19,7 +19,6 @@ from pathlib import Path
 import struct
 import subprocess
 import sys
-import time
 
 import fatal_tasks
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
@@ -153,19 +152,14 @@ def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
     assert found == {number: number for number in {*range(10)} - {KILLS, TAKES_ALL_MEMORY}}
 
 
-def test_workers_end_with_the_program_that_is_killed(tmp_path):
+def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
     begun = subprocess.Popen([sys.executable, fatal_tasks.__file__, tmp_path])
     try:
-        while not (begun_by := [int(each.name) for each in tmp_path.iterdir()]):
-            assert begun.poll() is None
-            time.sleep(0.01)
+        worker = wait_until(lambda: [each.name for each in tmp_path.iterdir()])[0]
     finally:
         begun.kill()
         begun.wait()
-    deadline = time.monotonic() + 30.0
-    while Path(f'/proc/{begun_by[0]}').exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: not Path(f'/proc/{worker}').exists())
 
 
 # the verb

@@ -152,7 +152,6 @@ def test_what_no_gyro_has_is_not_used(given):
 
 # A stored calibration
 
-
 @pytest.fixture(scope='module', name='carried')
 def _carried():
     """Return error and standard deviation of 120 later calibrations, without and with a table."""
@@ -219,7 +218,6 @@ def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not(
 
 
 # Files
-
 
 def test_a_table_survives_a_restart(tmp_path):
     table, _, history = jumped()

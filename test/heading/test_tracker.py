@@ -116,7 +116,6 @@ def test_the_variance_after_a_calibration_is_that_of_the_noise():
 
 # rest and motion
 
-
 @pytest.mark.parametrize('motion, before, share, runs', [
     (constant_rate_motion([(40, 0)]), BIAS, 0.7, 40),
     (constant_rate_motion([(1.6, 0), (2, 45)] * 10), 0.2 * DEGREE, 1.0 / 3.0, 10)],

@@ -226,7 +226,6 @@ def test_the_reader_says_how_far_it_is(tmp_path, name):
 
 # Logs of other programs
 
-
 @pytest.mark.parametrize(('column', 'attribute', 'value'), [
     ('time=x:ms', 'time', 2e-3), ('time=x:us', 'time', 2e-6), ('time=x:ns', 'time', 2e-9),
     ('time=x:min', 'time', 120.0), ('time=x', 'time', 2.0), ('rate=x:deg/h', 'reference_rate',
@@ -447,7 +446,6 @@ def test_a_data_frame_is_a_log():
 
 
 # Stamps that a host gives on arrival
-
 
 INTERVAL = 0.01
 

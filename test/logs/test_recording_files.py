@@ -49,7 +49,6 @@ def gyro(make, time, rate, **how):
 
 # Storage
 
-
 @pytest.mark.parametrize('kind', KINDS)
 def test_a_recording_holds_what_the_log_held(data, tmp_path, kind):
     log = select_rows(read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz'), slice(800))
@@ -249,7 +248,6 @@ def test_several_files_of_a_folder_are_one_recording(make, tmp_path, turning):
 
 # Torn
 
-
 @pytest.mark.parametrize('kind', ['mcap', 'mcap-chunks'])
 def test_a_torn_mcap_file_is_read_up_to_the_tear(make, tmp_path, kind):
     # Enough for several chunks, the last of which is torn in its middle.
@@ -305,7 +303,6 @@ def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
 
 # Hostile
 
-
 @pytest.mark.parametrize('name', ['zstd', 'lz4'])
 def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
     bomb = {
@@ -348,7 +345,6 @@ def test_only_recordings_are_taken_for_recordings_and_one_that_is_not_there_is_n
 
 
 # Topics
-
 
 def test_of_several_gyros_one_has_to_be_named(make, run, tmp_path, turning):
     time, rate, _ = turning
@@ -395,7 +391,6 @@ def test_what_is_no_log_of_a_gyro_is_refused(make, tmp_path, topics, chosen, wor
 
 
 # Times
-
 
 def test_times_are_those_of_the_headers(make, tmp_path):
     time = np.arange(300) / RATE
@@ -444,7 +439,6 @@ def test_stamps_that_say_nothing_are_refused_unless_the_rate_is_given(make, tmp_
 
 # Temperature
 
-
 def test_temperatures_lie_on_the_line_between_readings_and_long_gaps_are_reported(make, tmp_path):
     time = np.arange(0.0, 100.0, 0.1)
     imu = gyro(make, time, time)
@@ -473,7 +467,6 @@ def test_of_several_temperatures_the_one_named_like_the_gyro_is_taken(make, tmp_
 
 
 # References
-
 
 def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
     time, rate, heading = turning
@@ -523,7 +516,6 @@ def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path,
 
 
 # Verbs
-
 
 @pytest.mark.parametrize('verb, motion', [
     ('fit', 'robot'), ('self-calibrate', 'calibration'), ('allan', 'rest'), ('diagnose', 'rest'),

@@ -13,7 +13,6 @@
 from dataclasses import replace
 import math
 
-from conftest import operations
 from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE, Log
 from gyro_calibration.model.channels import ChannelHistory, channels_from_log
 from gyro_calibration.model.compensation import (
@@ -153,27 +152,9 @@ def test_the_standard_deviation_grows_outside_of_what_was_calibrated():
     assert deviation(known, 0.0, 55.0) == deviation(known, 0.0, 25.0) < deviation(known, 0.0, 60.0)
 
 
-# Channels with memory: as exact responses, and equal for a stream, a log, and its blocks
-
+# Channels with memory: exact responses
 
 UNEVEN = np.cumsum(np.random.default_rng(0).exponential(0.3, 3000))
-LAGS = [('temperature', 0.01), ('temperature', 20.0), ('temperature', 3000.0),
-        ('specific_force', 1.0), ('vibration', 1.0), ('vibration', 30.0)]
-BRANCHES = [(10.0, 1e-3), (3.0, 0.0)]
-
-
-def surroundings(time):
-    """Return temperature, specific force and supply over time."""
-    generator = np.random.default_rng(1)
-    return (25.0 + 8.0 * np.sin(time / 90.0) + 0.01 * generator.standard_normal(len(time)),
-            generator.standard_normal(len(time)), 5.0 + 0.1 * np.cos(time / 50.0))
-
-
-def everything(channels):
-    """Return all that a history says, shape (channels, ...)."""
-    return np.array([channels.time, channels.temperature, channels.specific_force, channels.supply,
-                     *[channels.lagged(*lag) for lag in LAGS],
-                     *[channels.heating(*branch) for branch in BRANCHES]])
 
 
 def ramp_response(time, time_constant):
@@ -199,18 +180,14 @@ def test_ramps_and_their_corners_are_answered_exactly_whatever_the_stamps(time, 
         expected - late, rel=0.0, abs=1e-10)
 
 
-def mean_vibration(time, force):
-    return channels_from_log(Log(output=time, time=time, specific_force=force)).lagged(
-        'vibration', 1.0)[1000:].mean()
-
-
 def test_vibration_is_the_mean_square_about_the_mean_and_tilting_is_none():
     time = np.arange(0.0, 3000.0, 0.01)
-    force = 9.81 + 0.3 * np.random.default_rng(2).standard_normal(len(time))
-    kept = 1.0 - 0.01  # of a white deviation; the two means over 1 s take the rest
-    assert mean_vibration(time, force) == pytest.approx(0.09 * kept, rel=0.01)
+    white = 9.81 + 0.3 * np.random.default_rng(2).standard_normal(len(time))
     tilting = 9.81 * np.sin(time / 8.0)  # a second's mean of it errs by up to 1.2 m/s²
-    assert mean_vibration(time, tilting) < 0.02
+    shaken, tilted = (channels_from_log(Log(output=time, time=time, specific_force=force)).lagged(
+        'vibration', 1.0)[1000:].mean() for force in (white, tilting))
+    kept = 1.0 - 0.01  # of a white deviation; the two means over 1 s take the rest
+    assert shaken == pytest.approx(0.09 * kept, rel=0.01) and tilted < 0.02
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.03])
@@ -230,19 +207,8 @@ def test_the_branch_turns_soon_after_the_temperature_does_and_not_by_noise(noise
     assert not once[time < 200.0].any() and once[time > 210.0].min() == 1.0
 
 
-@pytest.mark.parametrize('cuts', [[1, 2, 500, 501, 2999], list(range(1, 300))],
-                         ids=['blocks', 'sample by sample'])
-def test_blocks_of_a_log_say_what_the_whole_says(cuts):
-    whole = everything(ChannelHistory().update(UNEVEN, *surroundings(UNEVEN)))
-    history, pieces = ChannelHistory(), []
-    for block in np.split(np.arange(len(UNEVEN)), cuts):
-        pieces.append(everything(history.update(UNEVEN[block],
-                                                *(each[block] for each in surroundings(UNEVEN)))))
-    assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
-
-
 def test_a_lag_goes_on_in_blocks_that_do_not_use_it():
-    history, (temperature, *_) = ChannelHistory(), surroundings(UNEVEN)
+    history, temperature = ChannelHistory(), 25.0 + 8.0 * np.sin(UNEVEN / 90.0)
     history.update(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
     history.update(UNEVEN[10:2000], temperature[10:2000])
     last = history.update(UNEVEN[2000:], temperature[2000:]).lagged('temperature', 20.0)
@@ -265,9 +231,3 @@ def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
     assert (channels.supply is None and not channels.time.any()
             and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN))
     assert set(lagged(UNEVEN, np.full(len(UNEVEN), 31.7), 50.0)) == {31.7}
-
-
-def test_a_lag_of_a_log_loops_over_no_samples():
-    time = np.cumsum(np.random.default_rng(4).uniform(0.005, 0.015, 10 ** 5))
-    channels = channels_from_log(Log(output=time, time=time, temperature=time))
-    assert operations(lambda: channels.lagged('temperature', 120.0)) < 0.1 * len(time)

@@ -154,7 +154,6 @@ def test_a_calibration_cut_off_within_a_number_is_refused(tmp_path):
 
 # Settings files, which model files and others are
 
-
 LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n'
                                         for i in range(40))
 

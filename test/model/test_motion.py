@@ -14,6 +14,7 @@ import math
 from pathlib import Path
 
 from chance import mean_bound
+from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -112,7 +113,6 @@ def test_what_is_no_profile_is_refused(tmp_path, text, message):
 
 # A simulated log is what the model says of the motion
 
-
 GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=Noise(7e-4),
                  reference_temperature=33.0)
 
@@ -140,14 +140,7 @@ def test_the_verb_simulates_what_a_gyro_makes_of_time_and_heading(tmp_path, run)
 
 # Simulated noise has the Allan deviation of IEEE Std 952: N/sqrt(tau), 0.664 B, K sqrt(tau/3)
 
-
 INTERVAL = 0.01
-
-
-def allan_variance(rate, size):
-    """Return Allan variance (IEEE Std 952, C.1) of `size` samples, and how many differences."""
-    means = rate[:len(rate) // size * size].reshape(-1, size).mean(axis=1)
-    return np.mean(np.diff(means) ** 2) / 2.0, len(means) - 1
 
 
 #: Noise, samples of the means, and the Allan variance of such means.
@@ -161,21 +154,15 @@ PARTS = {
 
 @pytest.mark.parametrize('noise, sizes, wanted', PARTS.values(), ids=PARTS)
 def test_simulated_noise_has_the_allan_variance_of_ieee_952(noise, sizes, wanted):
-    """
-    Allow four standard errors.
-
-    The n differences of neighbours correlate by -1/2 or less, so that their mean square has a
-    relative variance of at most 3 / n.
-    """
+    """To four standard errors: n differences that correlate by -1/2 have a variance of 3 / n."""
     assert round(ALLAN_FLOOR_RATIO, 3) == 0.664
     generator = np.random.default_rng(952)
     records = [simulate_noise(noise, 2 ** 18, INTERVAL, generator) for _ in range(8)]
     for size in sizes:
-        found = [allan_variance(record, size) for record in records]
-        tolerance = 4.0 * math.sqrt(3.0 / (found[0][1] * len(records)))
-        assert tolerance < 0.25
-        assert (np.mean([variance for variance, _ in found]) / wanted(size)
-                == pytest.approx(1.0, abs=tolerance)), size
+        found = np.mean([allan_deviation(record, INTERVAL, [size * INTERVAL]).deviation ** 2
+                         for record in records])
+        tolerance = 4.0 * math.sqrt(3.0 * size / (len(records) * 2 ** 18))
+        assert found / wanted(size) == pytest.approx(1.0, abs=tolerance) and tolerance < 0.25, size
         assert noise.allan_variance(size * INTERVAL) == pytest.approx(wanted(size), rel=1e-3)
 
 

@@ -36,7 +36,6 @@ def stored(rig):
 
 # A run that drives the robot
 
-
 def test_a_run_drives_the_profile_and_finds_stores_and_uses_scale_and_bias(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     begin, first = rig.clock.now, len(rig.outputs)
@@ -62,7 +61,6 @@ def test_a_run_drives_the_profile_and_finds_stores_and_uses_scale_and_bias(tmp_p
 
 
 # What ends a drive
-
 
 def faults():
     """Return, by name, what happens to a rig in mid-run, and words of the reason."""
@@ -255,7 +253,6 @@ def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path, cancelled):
 
 # What a drive does not begin over
 
-
 OBSTACLES = {
     'teleop': ({}, lambda rig: setattr(rig, 'other', 0.3),
                'odom or cmd_vel shows that the robot moves'),
@@ -311,7 +308,6 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
 
 # After a drive
 
-
 def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_late_is_not(tmp_path):
     rig = driven(tmp_path)
     rig.robot.deaf = True
@@ -335,7 +331,6 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_lat
 
 
 # Load
-
 
 def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     """This computer is busy for 0.3 s of each 0.8 s; what came meanwhile comes then."""
@@ -365,7 +360,6 @@ def test_samples_that_are_held_up_do_not_hold_up_the_motion(tmp_path):
 
 
 # Several services at once
-
 
 def test_a_second_calibration_is_refused_and_leaves_the_first_alone(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
@@ -439,7 +433,6 @@ def test_what_cannot_be_calibrated_by_is_refused_in_one_sentence(
 
 
 # Other references
-
 
 def turn_to_and_fro(rig, rest):
     """Begin a run by odometry, turn each way by somebody's commands, and rest for so many s."""
@@ -546,7 +539,6 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
 
 
 # A run alone: when it is complete
-
 
 def test_turns_that_are_not_finished_are_given_up():
     run = CalibrationRun(TURNS, math.inf, 0.0)

@@ -133,7 +133,6 @@ def test_each_series_of_plotjuggler_exists_on_a_topic_that_it_subscribes_to():
 
 # robot_localization
 
-
 STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw',
          'ax', 'ay', 'az']
 #: Names in the documentation of its state estimation nodes (for a sensor, what follows its name).
@@ -155,7 +154,6 @@ def test_the_example_has_parameters_that_exist_and_fuses_one_thing_of_a_gyro_and
 
 
 # Launch
-
 
 def launch_arguments():
     """Return the tables of gyro.launch.py by name: argument -> parameter or default, text."""

@@ -77,7 +77,6 @@ def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
 
 
 def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12):
-    """Feed a check as the node does."""
     for number, output in enumerate(np.ravel(outputs).tolist()):
         if check.add(begin + number * INTERVAL, output, output):
             check.examine_stretch(bias_variance, 600.0, promised)

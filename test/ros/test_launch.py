@@ -49,7 +49,6 @@ def include(name, arguments):
 
 
 def skip_where_not_installed():
-    """Skip where launch would not find the package."""
     from ament_index_python import get_package_prefix, PackageNotFoundError
     try:
         get_package_prefix('gyro_calibration')
@@ -59,7 +58,6 @@ def skip_where_not_installed():
 
 @needs_launch
 class TestGraph(unittest.TestCase):
-    """While the nodes run."""
 
     def setUp(self):
         self.ros = Ros(DOMAIN)
@@ -104,8 +102,6 @@ class TestGraph(unittest.TestCase):
 
 @needs_launch
 class TestEnd(unittest.TestCase):
-    """After SIGINT."""
-
     __post_shutdown_test__ = True  # as the decorator launch_testing.post_shutdown_test() sets
 
     def test_all_end_with_code_0(self, proc_info):

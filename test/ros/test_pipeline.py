@@ -47,7 +47,6 @@ def headings(found):
 
 # Integration
 
-
 def test_raw_rates_are_integrated_by_the_trapezoid_rule_without_wrapping_until_a_reset(tmp_path):
     rig = Rig(tmp_path, model='', stationary_threshold=0.0)
     rates = 3.0 + 0.5 * np.sin(np.arange(300) * 0.02)
@@ -102,7 +101,6 @@ def test_an_impossible_rate_is_refused_and_leaves_a_gap(tmp_path, value):
 
 
 # Gaps, dead gyros and outliers
-
 
 @pytest.mark.parametrize(('wheels', 'odometry', 'known'), [
     ('none', 0.0, False), ('odom', 0.0, True), ('odom', 0.8, False), ('odom', None, False)],
@@ -235,7 +233,6 @@ def test_a_turn_while_one_value_is_held_for_a_short_time_is_in_the_variance(
 
 # Rest
 
-
 def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp_path):
     rig = Rig(tmp_path, model='')
     assert rig.feed(np.full(50, 0.1 * DEGREE))[-1].heading == 0.0
@@ -321,7 +318,6 @@ def test_turns_that_contradict_odometry_are_a_warning_and_the_heading_claims_not
 
 # What odometry and commands of the last second show of the wheels
 
-
 def wheels(*received):
     """Return wheels of which came: source, velocity ahead, yaw rate, time."""
     made = Wheels()
@@ -358,7 +354,6 @@ def test_velocities_of_the_last_second_show_whether_the_robot_moves(received, no
 
 
 # Several publishers
-
 
 @pytest.mark.parametrize('shift', [-0.3, -0.005, 0.3])
 def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, shift):
@@ -514,7 +509,6 @@ def test_a_stamp_that_is_none_of_ros_time_is_refused(tmp_path, stamp):
 
 # Temperature
 
-
 THERMAL = ('effects: {bias: {bias: 0.01}, bias_temperature: {bias_temperature: 2.0e-3}}\n'
            'reference_temperature: 25.0\nnoise: {angle_random_walk: 5.0e-4}\n')
 
@@ -543,7 +537,6 @@ def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
 
 
 # Clocks
-
 
 @pytest.mark.parametrize(('stamps', 'steady', 'beginnings'), [
     (9.0, 9.0, 1), (12.0, 12.0, 2), (0.0, 15.0, 1), (2.0, 15.0, 1)],
@@ -591,7 +584,6 @@ def test_stamps_that_leap_by_less_than_a_gap_are_in_the_variance(tmp_path):
 
 # The monitor of noise and bias
 
-
 @pytest.mark.parametrize('moved, parameters', [(0.15 * DEGREE, {}), (1.0 * DEGREE, {}),
                                                (0.15 * DEGREE, {'stationary_threshold': 0.0})],
                          ids=['below the threshold', 'above the threshold', 'without a threshold'])
@@ -614,7 +606,6 @@ def test_a_bias_that_moved_raises_an_alarm_which_a_calibration_at_rest_ends(
 
 # Effects with a past
 
-
 PLAIN = {'bias': {'bias': 0.002}, 'scale_factor_error': {'scale_factor_error': 0.02},
          'bias_temperature': {'bias_temperature': 2e-4, 'reference_temperature': 25.0}}
 PAST = {'thermal_lag': {'thermal_lag': -8e-4, 'time_constant': 40.0},
@@ -635,7 +626,6 @@ def test_a_time_offset_moves_the_published_stamps(tmp_path):
 
 
 # What is reported
-
 
 @pytest.fixture
 def reported():
@@ -751,7 +741,6 @@ def test_every_value_has_a_key_in_snake_case_that_the_documents_name(tmp_path, r
 
 
 # Any values
-
 
 finite = st.floats(allow_nan=True, allow_infinity=True)
 event = st.one_of(

@@ -38,7 +38,6 @@ def remember(tmp_path):
 
 
 def taught(memory, temperature=25.0):
-    """Return what the table said to a bias at rest."""
     return memory.table.add(temperature, 0.001, 1e-9, NOW)
 
 
