@@ -9,8 +9,9 @@
 # under the License.
 
 
-"""Logs that begin with an unknown bias: a slow, steady turn differs from a rest by its rate."""
+"""A slow, steady turn differs from a rest by its rate: unknown biases, and ways that bend."""
 
+from dataclasses import replace
 import math
 
 from gyro_calibration import Log, read_model, track
@@ -31,6 +32,12 @@ TURN_FIRST = [(20, 0.8), (20, 0), (4, 30), (10, 0), (4, -30), (10, 0)]
 REST_FIRST = [(20, 0), (20, 0.8), (4, 30), (10, 0), (4, -30), (10, 0)]
 
 
+#: Ways that bend at rates of their own, with turns between.
+BENT = [part for way, bend in zip(
+    np.random.default_rng(5).uniform(20.0, 60.0, 12), np.random.default_rng(6).normal(0.0, 0.1, 12)
+) for part in ((way, bend), (3, 30))]
+
+
 def simulated(parts, seed=0, bias=-0.2):
     """Return time, output, and true heading, deg."""
     rate = np.concatenate([np.full(round(duration * RATE), value) for duration, value in parts])
@@ -40,12 +47,12 @@ def simulated(parts, seed=0, bias=-0.2):
         0.5 * (rate[1:] + rate[:-1]))) / RATE
 
 
-def followed(parts, bias=0.5, hindsight=False, seed=0):
+def followed(parts, bias=0.5, hindsight=False, seed=0, true_bias=-0.2):
     """Return error and stated deviation of the heading, deg, with a prior of the bias, deg/s."""
     model = read_model({
         'effects': {'bias': {'bias': 0.0}}, 'covariance': [[(bias * DEGREE) ** 2]],
         'noise': vars(NOISE)})
-    time, output, true = simulated(parts, seed)
+    time, output, true = simulated(parts, seed, true_bias)
     found = track(Log(time, output), model, hindsight=hindsight)
     return (found.heading - found.heading[0]) / DEGREE - true, found.heading_std / DEGREE
 
@@ -86,14 +93,37 @@ def test_a_turn_at_the_limit_of_the_prior_counts_once():
     assert np.abs(error).max() < 2.0 and (np.abs(error) <= 3.0 * deviation).all()
 
 
-def estimator():
+@pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
+def test_the_deviation_holds_where_a_vehicle_never_rests_and_each_way_bends(hindsight):
+    """A bend within the deviation of the bias passes for a rest; others show that it is none."""
+    inside = []
+    for seed in range(8):
+        generator = np.random.default_rng(seed)
+        parts = [part for _ in range(12) for part in (
+            (generator.uniform(20.0, 60.0), generator.normal(0.0, 0.1)), (3.0, 30.0))]
+        error, deviation = followed(parts, 0.01, hindsight, seed + 100,
+                                    generator.normal(0.0, 0.01))
+        inside.append(np.mean(np.abs(error) <= 1.96 * deviation))
+    assert np.mean(inside) > 0.7, inside  # at most half, without a state of no rests
+
+
+def test_rests_that_agree_show_that_a_vehicle_rests():
+    """After four rests the deviation is that of a vehicle that is known to rest, 0.451 deg."""
+    deviations = [followed([*(rests * [(10.0, 0.0), (4.0, 30.0)]), (60.0, 10.0)], 0.01,
+                           true_bias=0.01)[1][-1] for rests in (0, 1, 4)]
+    assert deviations[0] > deviations[1] > deviations[2] and deviations[2] < 1.05 * 0.451
+
+
+def estimator(bias):
     model = GyroModel(noise=NOISE)
-    return HeadingEstimator(model, BiasTable(model), ASSUMED, TrackerSettings(), 1.7e9)
+    return HeadingEstimator(model, BiasTable(model), replace(ASSUMED, bias=bias * DEGREE),
+                            TrackerSettings(), 1.7e9)
 
 
-def test_blocks_have_the_heading_of_single_samples():
-    time, output, _ = simulated(TURN_FIRST)
-    one, many = estimator(), estimator()
+@pytest.mark.parametrize('bias, parts', [(0.5, TURN_FIRST), (0.01, BENT)])
+def test_blocks_have_the_heading_of_single_samples(bias, parts):
+    time, output, _ = simulated(parts, bias=-0.4 * bias)
+    one, many = estimator(bias), estimator(bias)
     rows = []
     for at, value in zip(time, output):
         one.add(at, value, 1.7e9)
@@ -103,7 +133,7 @@ def test_blocks_have_the_heading_of_single_samples():
 
 
 def test_a_user_is_warned_of_the_ambiguity():
-    one = estimator()
+    one = estimator(0.5)
     time, output, _ = simulated(TURN_FIRST)
     messages = []
     for at, value in zip(time, output):
