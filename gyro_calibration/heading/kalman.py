@@ -126,12 +126,13 @@ class HeadingState:
         return HeadingState(self.noise, mean,
                             matrix @ self.covariance @ matrix.T + step.process_noise)
 
-    def heading_variance(self, rate_integral: RateIntegral) -> float:
-        """Return the variance of the heading after a time in motion, rad²."""
+    def heading(self, rate_integral: RateIntegral) -> tuple[float, float]:
+        """Return the heading after a time in motion, rad, and its variance, rad²."""
         step = self.transition(rate_integral)
         step.observation[HEADING_INDEX] -= 1.0
-        return float(step.observation @ self.covariance @ step.observation
-                     + step.process_noise[HEADING_INDEX, HEADING_INDEX])
+        return (rate_integral.angle - float(step.observation @ self.mean),
+                float(step.observation @ self.covariance @ step.observation
+                      + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
 
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time of constant heading, with its measurement."""
@@ -240,6 +241,8 @@ class TrackStep:
     rate_integral: RateIntegral
     is_resting: bool
     end_time: float
+    #: Heading before it, rad, and its variance, rad², if there was no rest.
+    moving_heading: tuple[float, float] = (0.0, 0.0)
 
 
 def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,

@@ -136,7 +136,7 @@ def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
     ends = np.array([time[0], *(step.end_time for step in steps)])
     heading, variance = np.array(
         [(state.mean[HEADING_INDEX], state.covariance[HEADING_INDEX, HEADING_INDEX])
-         for state in states]).T
+         for state in states]).T + tracker.heading_shifts(states)
     # share of the rates in the heading: 1 in motion, in a rest that of a straight drive
     share = np.array([1.0 if not step.is_resting else step.rate_integral.wander[1] @ (
         step.rate_integral.wander[0] / (

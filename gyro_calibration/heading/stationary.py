@@ -360,6 +360,7 @@ class Epoch:
     pending: float
     ambiguity_variance: float  # of the bias, (rad/s)²
     begin_time: float  # of the heading, s
+    mixture_variance: float  # of the heading, beyond that of the state, rad²
     #: Last samples of its blocks, and integrals of the rates since the state: durations, s, lost
     #: variances, rad², and sensitivities, shape (k, m).
     open_integrals: list[tuple[NDArray[np.intp], Array, Array, Array]]
@@ -439,7 +440,8 @@ class EvenSamples:
                               + state.noise.angle_random_walk ** 2
                               / (WINDOW_DURATION if epoch.is_resting else interval[here]))
             found[here, 4] = epoch.is_resting
-            unknown = epoch.ambiguity_variance * (self.time[here] - epoch.begin_time) ** 2
+            unknown = epoch.mixture_variance + epoch.ambiguity_variance * (
+                self.time[here] - epoch.begin_time) ** 2
             found[here, 3] += epoch.ambiguity_variance
             if epoch.is_resting:
                 variance = float(state.covariance[HEADING_INDEX, HEADING_INDEX])

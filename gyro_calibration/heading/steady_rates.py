@@ -9,23 +9,31 @@
 # under the License.
 
 """
-Steady rates of which one is that of a rest, while the bias is unknown.
+Steady rates, of which each is that of a rest or of a straight way that bends.
 
-To a gyro alone, a rest and a turn at a constant rate differ by the rate only. As long as the prior
-of the bias is wider than a rest of 1 s measures it, each steady rate within this prior may be the
+To a gyro alone, a rest and a turn at a constant rate differ by the rate only. While the prior of
+the bias is wider than a rest of 1 s measures it, each steady rate within this prior may be the
 bias. If it is, each other one is a rest too, which agrees with it, or a turn, with the prior odds
 of a rest and a straight drive. Their product is the probability of each. The bias in use is that
 of the first rest; the uncertainty of the heading contains all others, and the bias is changed when
 one of them is more probable than 95 %. Under another bias the rests until then were turns: the
 heading changes by the difference times the time since its begin.
+
+With a known bias, either some of the steady rates near it are rests, or the vehicle never rests. A
+bend has a rate of normal distribution and an exponential duration, and a rest may last. The share
+of rests, the size of the bends and the mean durations are estimated from all steady rates of the
+drive. Without rests, each of them measures the bias with the variance of the bends. The
+heading is the mean of both hypotheses, and its variance contains both.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import math
 
-from gyro_calibration.heading.kalman import HeadingState, RateIntegral
+from gyro_calibration.heading.integration import TIME_TOLERANCE
+from gyro_calibration.heading.kalman import HEADING_INDEX, HeadingState, RateIntegral
 from gyro_calibration.heading.stationary import (
     chi_squared_quantile, MAX_SCATTER_RATIO, MEAN_LAGS, PRIOR_COUNTS, SCATTER_RATIOS,
     WINDOW_DURATION)
@@ -38,6 +46,16 @@ from scipy.special import logsumexp, ndtr, softmax
 _MAX_RATES = 20
 #: Prior probability that a steady rate is that of a rest.
 _REST_PROBABILITY = PRIOR_COUNTS[0] / (PRIOR_COUNTS[0] + 1.0)
+#: Variances of the rates of bends, relative to that of white noise over 1 s.
+_BENDS = np.unique(SCATTER_RATIOS[1:])
+#: Shares of rests among steady rates near the bias, all of which are as probable.
+_REST_SHARES = (np.arange(5) + 0.5) / 5.0
+#: Logarithms of the prior probabilities: first that the vehicle never rests, which is as probable
+#: as that it does, by size of bends, then by share of rests (row) and size of bends (column).
+_LOG_PRIORS = np.log(np.outer([0.5, *np.full(len(_REST_SHARES), 0.5 / len(_REST_SHARES))],
+                              np.full(len(_BENDS), 1.0 / len(_BENDS))))
+#: Probability below which it is not computed what follows if the vehicle never rests.
+_NEGLIGIBLE = 1e-6
 #: Probability from which on another steady rate is taken for the bias.
 _CHANGE_PROBABILITY = 0.95
 
@@ -50,6 +68,8 @@ class _SteadyRate:
     end_time: float  # s
     step_count: int  # a single step does not tell whether its rate is steady
     is_possible: bool  # within the prior of the bias; else it is certainly a turn
+    #: Mean, rad/s, and variance of the error of the rate before it, with rests and without.
+    errors: tuple[float, float, float, float]
 
     @property
     def is_candidate(self) -> bool:
@@ -58,56 +78,148 @@ class _SteadyRate:
 
 
 class SteadyRates:
-    """Steady rates since the bias was unknown, and the ambiguity of the bias by them."""
+    """Steady rates, the ambiguity of the bias by them, and the state if there was no rest."""
 
-    def __init__(self, covariance: Array):
-        """Begin with the covariance of the calibration, shape (m, m)."""
+    def __init__(self, state: HeadingState, covariance: Array):
+        """Begin with a state and the covariance of the calibration, shape (m, m)."""
         self._covariance = covariance
         self._ended = deque[_SteadyRate](maxlen=_MAX_RATES)
         self._last: _SteadyRate | None = None
         #: Mean square of the difference between the bias in use and the right one, (rad/s)².
         self.variance = 0.0
+        #: Probability that the vehicle never rests; 0 with an unknown bias.
+        self.moving_probability = self._ended_probability = 0.0
+        self._log_weights: Array | None = None  # as `_LOG_PRIORS`; None until the bias is known
+        self._evaluated_duration = 0.0  # of the last rate, s
+        self._repeats = False  # whether the next integral was added before
+        # numbers of bends and rests, and their total durations, s
+        self._counts, self._durations = np.ones(2), np.full(2, MEAN_LAGS[-1])
+        self.restart(state)
 
-    def add(self, turn: RateIntegral, time: float, noise: Noise, sigmas: float,
-            is_rest: bool) -> bool:
-        """
-        Add an integral, which ends at a time, s; tell whether its rate is known to be steady.
+    def restart(self, moving: HeadingState) -> None:
+        """Continue with another state for the case that there was no rest."""
+        self._moving, self._since = moving, RateIntegral(
+            0.0, 0.0, np.zeros(len(self._covariance)))
 
-        A rate that is off by so many standard deviations is another one.
+    def moving_state(self, noise: Noise) -> HeadingState:
+        """Return the state now if there was no rest."""
+        return replace(self._moving, noise=noise).propagate(self._since)
+
+    def add(self, turn: RateIntegral, still: RateIntegral, time: float, before: HeadingState,
+            sigmas: float, is_rest: bool) -> bool:
         """
-        rate, white = turn.angle / turn.duration, noise.angle_random_walk ** 2
-        row = turn.sensitivity / turn.duration
+        Add an integral, which ends at a time, s; tell whether it may be an unknown bias.
+
+        It is given with its sensitivity and with that of a rest, and the state before it. A rate
+        that is off by so many standard deviations is another one.
+        """
+        rate, white = still.angle / still.duration, before.noise.angle_random_walk ** 2
+        row = still.sensitivity / still.duration
         prior = float(row @ self._covariance @ row)
-        last, freedom = self._last, turn.block_count - 1
-        if (prior < white
-                or not is_rest and freedom > 0 and turn.block_square_sum - turn.angle * rate
-                > white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas)))):
-            self.end()
-            return False
-        count = 1 + is_rest
-        if last is not None and (rate - last.turn.angle / last.turn.duration) ** 2 < (
-                sigmas ** 2 * white * (1.0 / turn.duration + 1.0 / last.turn.duration)):
-            turn, count = last.turn + turn, last.step_count + count
+        if self._log_weights is None and prior < white:
+            self._log_weights = _LOG_PRIORS
+            self.moving_probability = self._ended_probability = float(
+                np.exp(_LOG_PRIORS[0]).sum())
+        last, freedom = self._last, still.block_count - 1
+        is_steady = is_rest or freedom <= 0 or still.block_square_sum - still.angle * rate <= (
+            white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas))))
+        if is_steady and last is not None and (
+                rate - last.turn.angle / last.turn.duration) ** 2 < (
+                sigmas ** 2 * white * (1.0 / still.duration + 1.0 / last.turn.duration)):
+            still, count, errors = last.turn + still, last.step_count + 1 + is_rest, last.errors
         else:
-            self.end()
+            self.end(before.noise)
+            count = 1 + is_rest
+            errors = (*before.rate_error(row), *self.moving_state(before.noise).rate_error(row)
+                      ) if is_steady else (0.0, 0.0, 0.0, 0.0)
+        if not self._repeats:
+            self._since += turn
+        self._repeats = False
+        if not is_steady:
+            return False
         # of the whole: parts of one rate at the limit would confirm each other
-        self._last = _SteadyRate(turn, time, count, turn.angle ** 2 < sigmas ** 2 * turn.duration
-                                 * (prior * turn.duration + white))
-        return self._last.is_candidate
+        self._last = _SteadyRate(
+            still, time, count,
+            still.angle ** 2 < sigmas ** 2 * still.duration * (prior * still.duration + white),
+            errors)
+        if count > 1 and still.duration >= 2.0 * self._evaluated_duration:
+            self._evaluate(before.noise)
+        return self._log_weights is None and self._last.is_candidate
+
+    def _evaluate(self, noise: Noise, has_ended: bool = False) -> None:
+        """Update the probability that the vehicle never rests with the last rate."""
+        if self._last is None or self._last.step_count < 2 or self._log_weights is None:
+            return
+        turn, (error, variance, moving_error, moving_variance) = self._last.turn, self._last.errors
+        white, duration = noise.angle_random_walk ** 2, turn.duration
+        rate = turn.angle / duration
+        # of faster ones it is known that they are turns
+        fastest = math.sqrt(MAX_SCATTER_RATIO * max(white, variance))
+        self._evaluated_duration = duration
+        if not abs(rate - error) < fastest:
+            return
+
+        # logarithms of normal densities among rates below the fastest: of bends without rests and
+        # with them, by size, and of a rest
+        bends = _BENDS * white
+        mean = np.repeat([moving_error, error], [len(bends), len(bends) + 1])
+        size = np.sqrt(np.concatenate([moving_variance + bends, variance + bends, [variance]])
+                       + white / duration)
+        slower = ndtr((error + fastest - mean) / size) - ndtr((error - fastest - mean) / size)
+        densities = -0.5 * ((rate - mean) / size) ** 2 - np.log(
+            size * np.maximum(slower, np.finfo(float).tiny))
+        ratios = duration * self._counts / self._durations  # a rest may last, a way may not
+        as_bend = densities[:-1].reshape(2, -1) - ratios[0]
+        as_rest = densities[-1] - np.log1p(ratios[1]) + np.log(_REST_SHARES)[:, None]
+        either = np.vstack([as_bend[0], np.logaddexp(
+            as_bend[1] + np.log1p(-_REST_SHARES)[:, None], as_rest)])
+        weights = self._log_weights + either
+        weights -= weights.max()
+        chances = np.exp(weights)
+        chances /= chances.sum()
+        self.moving_probability = float(chances[0].sum())
+        if has_ended:
+            self._log_weights, self._ended_probability = weights, self.moving_probability
+            rests = float((chances[1:] * np.exp(as_rest - either[1:])).sum())
+            self._counts = self._counts + [1.0 - rests, rests]
+            self._durations = self._durations + duration * np.array([1.0 - rests, rests])
+            if self.moving_probability > _NEGLIGIBLE and (
+                    duration < self._since.duration + TIME_TOLERANCE):
+                self._since -= turn
+                bent = np.array([bends * duration ** 2, chances[0] / chances[0].sum()])
+                self.restart(self.moving_state(noise).advance_at_rest(replace(turn, wander=bent)))
+
+    def moving_heading(self, noise: Noise) -> tuple[float, float]:
+        """Return the heading now if there was no rest, rad, and its variance, rad²."""
+        return replace(self._moving, noise=noise).heading(self._since)
+
+    def heading_shift(self, state: HeadingState, moving: tuple[float, float] | None = None
+                      ) -> tuple[float, float]:
+        """Return the way from a heading to the mean, rad, and the change of variance, rad²."""
+        chance = self.moving_probability
+        if chance < _NEGLIGIBLE:
+            return 0.0, 0.0
+        heading, variance = moving or self.moving_heading(state.noise)
+        off = heading - float(state.mean[HEADING_INDEX])
+        return chance * off, chance * ((1.0 - chance) * off ** 2 + variance - float(
+            state.covariance[HEADING_INDEX, HEADING_INDEX]))
 
     def remove(self, turn: RateIntegral) -> None:
-        """Remove the end of the last steady rate, which was no rest."""
+        """Remove the end of the last steady rate, which was no rest and is added again."""
+        self._repeats = turn.duration > TIME_TOLERANCE
         if self._last is not None:
             self._last.turn -= turn
             self._last.end_time -= turn.duration
             if self._last.turn.duration < WINDOW_DURATION:
                 self._last = None
 
-    def end(self) -> None:
+    def end(self, noise: Noise) -> None:
         """End the last steady rate."""
+        self._evaluate(noise, has_ended=True)
+        self.moving_probability = self._ended_probability
         if self._last is not None and self._last.is_candidate:
             self._ended.append(self._last)
-        self._last = None
+        self._last, self._evaluated_duration = None, 0.0
 
     def compare(self, state: HeadingState, sigmas: float) -> tuple[float, float] | None:
         """Update `variance`; return the change to a likelier bias, rad/s, and its variance."""

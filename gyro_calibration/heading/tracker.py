@@ -142,7 +142,9 @@ class HeadingTracker:
         self._open_variance: float | None = None
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         # None with wheels, which tell of rests
-        self._steady_rates: SteadyRates | None = SteadyRates(covariance)
+        self._steady_rates: SteadyRates | None = SteadyRates(self._state, covariance)
+        self._mixture_variance = 0.0  # of the heading, beyond that of the state, rad²
+        self._moving_heading = 0.0, 0.0  # before the last step, as in `TrackStep`
         self._heading_begin_time = self._last_time
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
         self._open_integral = self._zero_integral
@@ -205,6 +207,9 @@ class HeadingTracker:
         self.heading, self._suspected_turn = heading, None
         self._heading_begin_time = self._last_time
         self._filtered_turn = self._erroneous_turn = 0.0
+        if self._steady_rates is not None:
+            self._steady_rates.restart(self._steady_rates.moving_state(
+                self._state.noise).with_heading(heading, variance))
         self._state = self._state.with_heading(heading, variance)
         self._begin_anew()
 
@@ -219,12 +224,12 @@ class HeadingTracker:
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
         unknown = (self._pending_correction ** 2 + self._erroneous_turn ** 2
-                   + self.ambiguity_variance(self._last_time))
+                   + self._mixture_variance + self.ambiguity_variance(self._last_time))
         if self.is_resting:
             return float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]) + unknown
         if self._open_variance is None:
-            self._open_variance = self._state.heading_variance(
-                self._with_unbiased_sensitivity(self._open_integral))
+            self._open_variance = self._state.heading(
+                self._with_unbiased_sensitivity(self._open_integral))[1]
         part = self._block_integral
         return (self._open_variance + self._filtered_turn ** 2
                 + self._state.noise.angle_random_walk ** 2 * part.duration
@@ -431,7 +436,7 @@ class HeadingTracker:
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
                      self._pending_correction, self.bias_ambiguity ** 2, self._heading_begin_time,
-                     [self._open_row(place)])
+                     self._mixture_variance, [self._open_row(place)])
 
     def _open_row(self, place: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
         """Return the open integral after a sample as that of an `Epoch`."""
@@ -710,10 +715,13 @@ class HeadingTracker:
             return False
         if self._keeps_steps:
             assert self._last_sample is not None
+            moving = next((step.moving_heading for step in self.steps[
+                suspected.snapshot.step_count:]), self._moving_heading)
             self._restore_steps(suspected.snapshot)
             self.steps.append(
                 TrackStep(start, self._with_still_sensitivity(suspected.rate_integral), True,
-                          self._last_sample[0] - self._block_integral.duration - held.duration))
+                          self._last_sample[0] - self._block_integral.duration - held.duration,
+                          moving))
         self._state, self._open_integral, self._suspected_turn = moved, self._held_integral, None
         self._enter_rest()
         return True
@@ -857,9 +865,13 @@ class HeadingTracker:
         """Add a turn, rad, that was not measured in a time, s, after the last sample."""
         self._erroneous_turn = 0.0
         if variance or duration:  # else a measurement at rest without variance
-            self._propagate_state(replace(self._zero_integral, duration=duration, angle=angle,
-                                          lost_variance=variance, is_unobserved=True),
-                                  self._last_time)
+            turn = replace(self._zero_integral, duration=duration, angle=angle,
+                           lost_variance=variance, is_unobserved=True)
+            if self._steady_rates is not None:
+                self._moving_heading = self._steady_rates.moving_heading(self._state.noise)
+                self._steady_rates.restart(self._steady_rates.moving_state(
+                    self._state.noise).propagate(turn))
+            self._propagate_state(turn, self._last_time)
         self._adopt_state()
 
     def _advance_to_last_sample(self) -> None:
@@ -875,14 +887,16 @@ class HeadingTracker:
         turn, self._open_integral = self._open_integral - remaining, remaining
         if turn.duration > TIME_TOLERANCE:
             end = self._last_time - self._block_integral.duration - remaining.duration
-            still = self._with_still_sensitivity(turn)
+            still, before = self._with_still_sensitivity(turn), self._state
+            if self._keeps_steps and self._steady_rates is not None:
+                self._moving_heading = self._steady_rates.moving_heading(before.noise)
             if self.is_resting:
                 self._advance_at_rest(still, remaining)
             else:
                 self._propagate_state(turn, end)
             rates, sigmas = self._steady_rates, self._sigmas.get(MEAN_LAGS[0], 0.0)
-            if (self._detects_rest and rates is not None
-                    and rates.add(still, end, self._state.noise, sigmas, self.is_resting)
+            if (rates is not None
+                    and rates.add(turn, still, end, before, sigmas, self.is_resting)
                     and (not self.is_resting or rates.variance)
                     and (change := rates.compare(self._state, sigmas)) and not self.is_resting):
                 self._state = self._state.with_bias_change(
@@ -894,7 +908,7 @@ class HeadingTracker:
                     state = state.with_bias_change(
                         change[0] + self._state.wander_rate[0], change[1], 0.0)
                 for place, step in enumerate(self.steps[first:], first):
-                    self.steps[place] = TrackStep(state, step.rate_integral, False, step.end_time)
+                    self.steps[place] = replace(step, state_before=state, is_resting=False)
                     state = state.propagate(step.rate_integral)
         self._adopt_state()
 
@@ -927,16 +941,17 @@ class HeadingTracker:
             (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
             - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS)) - ENDING_RATES * turn.duration
         start, part, count, last = self._state, turn, len(self.steps), before.step
+        moving = self._moving_heading
         if (last is not None and last.rate_integral.duration < MEAN_LAGS[-1] - TIME_TOLERANCE
                 and self._wheels_stand == (last.rate_integral.wander is STANDSTILL)):
             start, part = replace(last.state_before, noise=noise), last.rate_integral + turn
-            count = before.step_count - 1
+            count, moving = before.step_count - 1, last.moving_heading
         chances = self._rest_scatter.probabilities(likelihood)
         if not self._wheels_stand:
             part.wander = np.array([
                 sum_ratios(max(part.duration, 1.0)) * (white * part.duration), chances])
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
-                         - remaining.duration)
+                         - remaining.duration, moving)
         self._state = start.advance_at_rest(part)
         self._rest_integral += turn
         self._snapshots.append(Snapshot(
@@ -956,7 +971,8 @@ class HeadingTracker:
         """Propagate the state over an integral that ends at a time, s."""
         turn = turn if self.is_resting else self._with_unbiased_sensitivity(turn)
         if self._keeps_steps:
-            self.steps.append(TrackStep(self._state, turn, self.is_resting, end))
+            self.steps.append(TrackStep(
+                self._state, turn, self.is_resting, end, self._moving_heading))
         self._state = (self._state.advance_at_rest(turn) if self.is_resting
                        else self._state.propagate(turn))
 
@@ -999,6 +1015,9 @@ class HeadingTracker:
         estimate = (float(self._state.mean[HEADING_INDEX])
                     + (0.0 if self.is_resting
                        else self._corrected_angle(self._open_integral + self._block_integral)))
+        if self._steady_rates is not None:
+            shift, self._mixture_variance = self._steady_rates.heading_shift(self._state)
+            estimate += shift
         self._pending_correction = estimate - self.heading
         self._last_finite_heading = (self.heading,
                                      float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]))
@@ -1020,6 +1039,22 @@ class HeadingTracker:
                 + float(part.sensitivity @ self._calibration_errors))
 
     # What is known
+
+    def heading_shifts(self, states: Sequence[HeadingState]) -> Array:
+        """
+        Return what smoothed states are to be changed by, if the vehicle may never rest.
+
+        The states, shape (k,), are those before the last steps and that at the end. The result,
+        shape (2, k), has angles, rad, and variances, rad²; it is zero before another calibration.
+        """
+        first, rates = self.recalibrations[-1][0] if self.recalibrations else 0, self._steady_rates
+        if rates is None:
+            return np.zeros((2, len(states)))
+        moving = [*(step.moving_heading for step in self.steps[first:]),
+                  rates.moving_heading(self._state.noise)]
+        return np.array([(0.0, 0.0)] * (len(states) - len(moving)) + [
+            rates.heading_shift(state, each)
+            for state, each in zip(states[len(states) - len(moving):], moving)]).T
 
     def finish(self) -> HeadingState:
         """Propagate the state to the last sample, and return it."""

@@ -18,14 +18,13 @@ from dataclasses import replace
 from datetime import datetime, timezone
 import math
 
-from gyro_calibration import Log, read_model, track
 from gyro_calibration.heading.bias_table import BiasTable, Entry
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration.ros.health_monitor import describe_change
 import numpy as np
@@ -274,80 +273,3 @@ def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():
     assert (len(entries) == 1
             and table.entries[0].bias == pytest.approx(0.1 * DEGREE, abs=0.03 * DEGREE))
     assert all(abs(each.bias - 0.1 * DEGREE) < 0.05 * DEGREE for each in table.entries)
-
-
-# An unknown bias: a slow, steady turn differs from a rest by its rate
-
-RATE, WALK = 50.0, 0.03 * DEGREE
-STEADY_NOISE = Noise(WALK, WALK / 20.0, WALK / 300.0)
-#: Durations, s, and rates, deg/s; the bias is far within its prior of 0.5 deg/s.
-TURN_FIRST = [(20, 0.8), (20, 0), (4, 30), (10, 0), (4, -30), (10, 0)]
-REST_FIRST = [(20, 0), (20, 0.8), (4, 30), (10, 0), (4, -30), (10, 0)]
-
-
-def simulated(parts, seed=0, bias=-0.2):
-    """Return time, output, and true heading, deg."""
-    rate = np.concatenate([np.full(round(duration * RATE), value) for duration, value in parts])
-    noise = WALK * math.sqrt(RATE) * np.random.default_rng(seed).standard_normal(len(rate))
-    time = np.arange(len(rate)) / RATE
-    return time, (rate + bias) * DEGREE + noise, np.append(0.0, np.cumsum(
-        0.5 * (rate[1:] + rate[:-1]))) / RATE
-
-
-def followed(parts, bias=0.5, hindsight=False, seed=0):
-    """Return error and stated deviation of the heading, deg, with a prior of the bias, deg/s."""
-    model = read_model({
-        'effects': {'bias': {'bias': 0.0}}, 'covariance': [[(bias * DEGREE) ** 2]],
-        'noise': vars(STEADY_NOISE)})
-    time, output, true = simulated(parts, seed)
-    found = track(Log(time, output), model, hindsight=hindsight)
-    return (found.heading - found.heading[0]) / DEGREE - true, found.heading_std / DEGREE
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_a_log_that_begins_with_a_slow_turn_ends_with_the_right_heading(seed):
-    error, deviation = followed(TURN_FIRST, seed=seed)
-    # at the end of the second steady rate either may be the bias
-    assert abs(error[round(39 * RATE)]) < 3.0 * deviation[round(39 * RATE)]
-    assert abs(error[-1]) < 3.0 * deviation[-1] < 10.0
-
-
-def test_with_hindsight_the_turn_is_in_the_heading_from_the_begin_on():
-    error, deviation = followed(TURN_FIRST, hindsight=True)
-    assert (np.abs(error) <= 3.0 * deviation).all()
-    assert np.abs(error).max() < 2.0
-
-
-@pytest.mark.parametrize('bias', [0.5, 0.003], ids=['unknown', 'known'])
-def test_a_slow_turn_after_a_rest_is_a_turn(bias):
-    """Where the bias was not known before, the uncertainty allows for the opposite until later."""
-    error, deviation = followed(REST_FIRST, bias)
-    if bias == 0.5:
-        assert abs(error[round(39 * RATE)]) < 1.0 < 4.0 < deviation[round(39 * RATE)]
-        assert (np.abs(error) <= 3.0 * deviation).all()
-        assert np.abs(error).max() < 2.0 and deviation[-1] < 2.0
-
-
-def test_rests_alone_leave_no_ambiguity():
-    error, deviation = followed([(20, 0), (4, 30), (3, 0), (4, 30), (10, 0)])
-    assert (np.abs(error) <= 3.0 * deviation).all()
-    assert deviation.max() < 1.0
-
-
-def test_a_turn_at_the_limit_of_the_prior_counts_once():
-    """With the bias it is at 6.1 sigma, which its steps cross: parts would confirm each other."""
-    error, deviation = followed([(10, 0), (60, -2.854), (20, 9.0), (20, -7.0)])
-    assert np.abs(error).max() < 2.0 and (np.abs(error) <= 3.0 * deviation).all()
-
-
-def test_a_user_is_warned_of_the_ambiguity():
-    one = begun(GyroModel(noise=STEADY_NOISE), assumptions=Assumptions(
-        bias_temperature_coefficient=0.0), temperature=None)
-    time, output, _ = simulated(TURN_FIRST)
-    messages = []
-    for at, value in zip(time, output):
-        one.add(at, value, 1.7e9)
-        messages.append(one.bias_message)
-    assert messages[round(10 * RATE)] == ''
-    assert 'several steady rates' in messages[round(38 * RATE)]
-    assert messages[-1] == ''
