@@ -104,7 +104,7 @@ def is_sample_offset(estimate: float, deviation: float, interval: float) -> bool
         for offset in (interval, 0.5 * interval))
 
 
-class LineFit(NamedTuple):
+class _LineFit(NamedTuple):
     """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
 
     factor: float
@@ -140,7 +140,7 @@ def heading_spline(time: Array, heading: Array) -> Callable[[Array, int], Array]
     return make_interp_spline(time, heading, 5)
 
 
-def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:
+def fit_line(time: Array | None, rate: Array, output: Array) -> _LineFit | None:
     """Return the line of the output over the rate by block means, or None without motion."""
     known = np.isfinite(rate) & np.isfinite(output)
     if np.count_nonzero(known) < 8 or not np.ptp(rate[known]) > 0.0:
@@ -178,7 +178,7 @@ def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)
     # of an exact line it is below 0 by rounding
     variance = max((inverse @ scores @ scores.T @ inverse)[0, 0], 0.0)
-    return LineFit(float(solution[0]), float(solution[1]), float(student * math.sqrt(variance)))
+    return _LineFit(float(solution[0]), float(solution[1]), float(student * math.sqrt(variance)))
 
 
 def model_scale_factor(model: GyroModel, rate: Array) -> float:
