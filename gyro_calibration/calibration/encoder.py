@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
-    Dwells, extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
+    extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     interpolate_reference, join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
     COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
@@ -48,7 +48,7 @@ from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, is_course, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, refuse_unit_error, RunPieces, split_run, UNIT_TOLERANCE)
+    fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects)
 from gyro_calibration.calibration.self_calibration import (
@@ -93,16 +93,9 @@ _OWN_DIFFERENCE_SHARE = 1e-6
 
 @dataclass(frozen=True)
 class HeadingResidual:
-    """
-    Heading of the gyro less that of the reference, over a whole log.
+    """Heading of the gyro less that of the reference, over a whole log."""
 
-    Attributes
-    ----------
-    heading : rad, shape (n,); its mean is 0, as the gyro's first heading is not known
-
-    """
-
-    heading: Array
+    heading: Array  # rad, shape (n,); its mean is 0, as the gyro's first heading is not known
 
     @property
     def rms(self) -> float:
@@ -378,8 +371,11 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         if contradiction and log.output is not None:
             rows = np.isfinite(log.output[known])
             gyro = split_run(time[rows], log.output[known][rows])
-            left = [_unexplained_share(gyro, each)
-                    for each in (motion_from_rates(time, rate[known]), motion)]
+            left = []  # shares of the squares of what the gyro turned
+            for each in (motion_from_rates(time, rate[known]), motion):
+                delay = fit_profile(gyro, each, COURSE_TREATMENT.largest_delay)[2]
+                off = gyro.gyro_angle - gyro.reference_angle(each, delay)
+                left.append(float(np.var(off)) / max(float(np.var(gyro.gyro_angle)), 1e-300))
             if max(left) > max((UNIT_TOLERANCE - 1.0) ** 2, 2.0 * min(left)):
                 by_rate = left[0] < left[1]
     remarks = [f'The reference heading is known in {counts[1]} samples only; the rate, known in '
@@ -390,13 +386,6 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
                        'the wrong one out.')
     return (replace(log, reference_heading=None) if by_rate
             else replace(log, reference_rate=None)), remarks
-
-
-def _unexplained_share(gyro: RunPieces, motion: Motion) -> float:
-    """Return the share of the squares of what the gyro turned that a motion leaves."""
-    _, _, delay = fit_profile(gyro, motion, COURSE_TREATMENT.largest_delay)
-    left = gyro.gyro_angle - gyro.reference_angle(motion, delay)
-    return float(np.var(left)) / max(float(np.var(gyro.gyro_angle)), 1e-300)
 
 
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
@@ -487,21 +476,14 @@ def _number_pieces(time: Array) -> NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class _Drift:
-    """
-    How a heading drifts after a fit.
+    """How a heading drifts after a fit."""
 
-    Attributes
-    ----------
-    bias, deviation : mean bias over the log and its standard deviation, rad/s
-    wander_deviation : standard deviation of the mean bias less the bias at the beginning, rad/s
-    angle_random_walk, walk_bounds : rad/√s, over times longer than a piece of the log, and its
-        95 % bounds if nothing else moves the heading from piece to piece
-
-    """
-
+    # mean bias over the log and its standard deviation, rad/s
     bias: float
     deviation: float
-    wander_deviation: float
+    wander_deviation: float  # of the mean bias less the bias at the beginning, rad/s
+    # rad/√s, over times longer than a piece of the log, and its 95 % bounds if nothing else moves
+    # the heading from piece to piece
     angle_random_walk: float
     walk_bounds: tuple[float, float]
 
@@ -705,11 +687,17 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
             log.time is None or log.reference_rate is not None or log.reference_heading is None
             for log in logs.values())):
         is_settled = effects or method or len(logs) > 1
+        share, parts = MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE, []
         try:
-            table = join_dwells([_extract_named_dwells(path, log) if len(logs) > 1
-                                 else extract_dwells(log, min_share=(
-                                     MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE))
-                                 for path, log in logs.items()])
+            for path, log in logs.items():
+                name = Path(path).name if len(logs) > 1 else ''
+                try:
+                    parts.append(extract_dwells(log, name, share))
+                except DataRefused as error:
+                    if name:
+                        raise type(error)(f'{name}: {error}') from None
+                    raise
+            table = join_dwells(parts)
             table = replace(table, remarks=(*remarks, *table.remarks))
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
@@ -752,11 +740,3 @@ def _refuse_own_reference(log: Log) -> None:
                 _OWN_DIFFERENCE_SHARE * white_noise_deviation(columns @ shares, 6)):
             raise DataRefused('the reference is computed from this gyro, since it follows its '
                               'noise from sample to sample: give a reference without it')
-
-
-def _extract_named_dwells(path: str, log: Log) -> Dwells:
-    name = Path(path).name
-    try:
-        return extract_dwells(log, name)
-    except DataRefused as error:
-        raise type(error)(f'{name}: {error}') from None

@@ -257,22 +257,18 @@ class _RunAlignment:
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
         accelerations = np.empty((0, 3))
-        if self.is_measured:
-            accelerations = np.diff(np.add.reduceat(weight[:, None] * self._accelerations(
-                time, gyro_time[is_covered]), begins), axis=0)
+        if self.is_measured:  # those by gyro and reference over a block, and the 4th order
+            whole, half = (_second_difference(self._integral_at, gyro_time[is_covered], each)
+                           for each in (base, 0.5 * base))
+            of_reference = _second_difference(
+                lambda at: np.interp(at, points.time, points.heading), time, base)
+            accelerations = np.diff(np.add.reduceat(weight[:, None] * np.column_stack(
+                [whole, of_reference, 16.0 * (whole - half) / base ** 2]), begins), axis=0)
         start_offsets = np.concatenate([
             [means[0, 0], means[0, 1] - points.time[start[0]]], means[0, 5:],
             means[0, 4] - self._rate_and_integral(gyro_time[start], constant)[2]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
                            1.0 / precision, means[:, 1], start_offsets, accelerations, base, count)
-
-    def _accelerations(self, time: Array, gyro_time: Array) -> Array:
-        """Return those by gyro and reference over a block, and the 4th order, shape (n, 3)."""
-        base = self._block_duration
-        whole, half = (_second_difference(self._integral_at, gyro_time, each)
-                       for each in (base, 0.5 * base))
-        return np.column_stack([whole, _second_difference(self._reference_at, time, base),
-                                16.0 * (whole - half) / base ** 2])
 
     def set_lag(self, lag: float) -> None:
         """Compute accelerations as in a Gaussian window of a lag, s² (Gauss and Hermite)."""
@@ -313,9 +309,6 @@ class _RunAlignment:
         within = (self._integral[index]
                   + 0.5 * (inside - self._time[index]) * (rate + self._rate[index]))
         return within + (at - inside) * rate
-
-    def _reference_at(self, at: Array) -> Array:
-        return np.interp(at, self._points.time, self._points.heading)
 
     def find_coarse_offset(self, largest: float) -> float:
         """
@@ -631,9 +624,10 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
     start = np.linalg.lstsq(matrix, weighted.T @ data.gyro_increments, rcond=1e-14)[0]
     rest = data.gyro_increments - data.columns @ start
     gradient, residual, dof = weighted.T @ rest, rest, max(count - len(prior) - 1.0, 1.0)
+    # above rounding errors
+    least = 1e-18 * float(np.mean(data.gyro_increments ** 2 / data.walk_variance))
     for _ in range(3):
-        rate_variance = max(float(residual @ noise.solve(residual)) / dof,
-                            _min_rate_variance(data))
+        rate_variance = max(float(residual @ noise.solve(residual)) / dof, least)
         precision = rate_variance / prior ** 2
         regular = matrix + np.diag(precision)
         size = np.sqrt(np.abs(np.diag(regular)))
@@ -710,11 +704,6 @@ def _repetition(data: _Increments, estimate: _Estimate) -> float:
     return max(float(np.sum(sums ** 2 / counts)) / free / float(np.mean(white ** 2)), 1.0)
 
 
-def _min_rate_variance(data: _Increments) -> float:
-    """Return the smallest variance of the noise above rounding errors."""
-    return 1e-18 * float(np.mean(data.gyro_increments ** 2 / data.walk_variance))
-
-
 def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
     """
     Return the columns with an acceleration whose noise is not correlated with the observations.
@@ -761,17 +750,6 @@ def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
         of_fourth = scales[0, 2] - products[1, 2] / products[0, 1] * of_lag
         return math.inf, abs(lag * max(0.2 * abs(lag), of_first_order) * float(of_fourth))
     return 1e-9, possible * abs(float(of_lag))
-
-
-def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
-    """Estimate again, with the reference heading smoothed by the gyro as the instrument."""
-    for _ in range(3):
-        instrument = _instrument(data, estimate.noise)
-        instrument[:, 0] += (estimate.noise.expected_reference_error(estimate.residual)
-                             / _nonzero_scale(estimate.values[0]))
-        estimate = _solve_weighted(data, estimate.noise, estimate.noise.solve(instrument),
-                                   estimate.prior_deviation)
-    return estimate
 
 
 def _nonzero_scale(scale: float) -> float:
@@ -902,8 +880,13 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
         values, covariance, estimate = _average_over_noise(data, prior_factors,
                                                            alignment.has_shaft)
         for _ in range(8):
-            if alignment.is_measured:
-                estimate = _errors_in_variables(data, estimate)
+            for _ in range(3 * alignment.is_measured):
+                # errors in variables: with the reference smoothed by the gyro as the instrument
+                instrument = _instrument(data, estimate.noise)
+                instrument[:, 0] += (estimate.noise.expected_reference_error(estimate.residual)
+                                     / _nonzero_scale(estimate.values[0]))
+                estimate = _solve_weighted(data, estimate.noise, estimate.noise.solve(instrument),
+                                           estimate.prior_deviation)
             delay_change = float(np.clip(estimate.values[2], -0.02, 0.02))
             lag_change = 0.0 if alignment.is_measured else max(float(estimate.values[3]), -lag)
             if abs(delay_change) < 1e-9 and abs(lag_change) < 1e-9:

@@ -507,7 +507,10 @@ def _errors_in_variables(regression: _Regression, noise: TridiagonalMatrix, prec
         solved = noise.solve(regression.observed - regression.columns @ values)
         error = np.zeros(len(solved))
         for variance, part in parts:
-            error += variance * _multiply(part, solved)
+            error += variance * part.diagonal * solved
+            if part.off_diagonal is not None:
+                error[1:] += variance * part.off_diagonal[1:] * solved[:-1]
+                error[:-1] += variance * part.off_diagonal[1:] * solved[1:]
         instrument = regression.columns.copy()
         instrument[:, column_index] += error / math.copysign(max(abs(scale), 1e-3), scale)
         weighted = noise.solve(instrument)
@@ -517,12 +520,3 @@ def _errors_in_variables(regression: _Regression, noise: TridiagonalMatrix, prec
                                          sizes * (weighted.T @ regression.observed),
                                          rcond=1e-13)[0]
     return values
-
-
-def _multiply(part: BandedNoise, vector: Array) -> Array:
-    """Return the matrix of a part times a vector."""
-    found = part.diagonal * vector
-    if part.off_diagonal is not None:
-        found[1:] += part.off_diagonal[1:] * vector[:-1]
-        found[:-1] += part.off_diagonal[1:] * vector[1:]
-    return found

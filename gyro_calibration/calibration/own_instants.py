@@ -148,9 +148,14 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         if found is None or not (found.interval <= _LONGEST_INTERVAL
                                  or found.is_held and is_heading):
             continue
-        if found.is_held and not is_heading and (
-                output_delay(log, given) > 0.0 or _follows_steps(log, given, found)):
-            continue
+        if found.is_held and not is_heading:
+            assert log.output is not None
+            both = np.isfinite(given) & np.isfinite(log.output)
+            left = [(log.output - rate)[both] for rate in (
+                given, np.interp(log.time, found.time, found.values))]
+            steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
+            if steps < lines or output_delay(log, given) > 0.0:
+                continue
         # not those in gaps
         after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
         inside = stamps[after] - stamps[after - 1] < found.interval
@@ -166,16 +171,6 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         log = (replace(log, reference_heading=own) if is_heading
                else replace(log, reference_rate=own))
     return log, kept
-
-
-def _follows_steps(log: Log, held: Array, found: OwnInstants) -> bool:
-    """Tell whether the output follows the steps of a held rate rather than lines between them."""
-    assert log.time is not None and log.output is not None
-    known = np.isfinite(held) & np.isfinite(log.output)
-    left = [(log.output - rate)[known] for rate in (
-        held, np.interp(log.time, found.time, found.values))]
-    steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
-    return bool(steps < lines)
 
 
 def output_delay(log: Log, rate: Array) -> float:

@@ -218,7 +218,13 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     # a quick swing may have no three blocks in a row without a reversal, but as many half as long
     fast = left = place = every[:0]
     for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
-        quiet = _select_quietest(every, block)
+        blocks = len(every) // block
+        energies = np.sum(every[:blocks * block].reshape(blocks, block) ** 2, axis=1)
+        # selected by the blocks on both sides, as a block that is quiet itself may be so by
+        # chance; one with far more energy than these is a motion between two rests
+        sides = np.maximum(np.roll(energies, 1), np.roll(energies, -1))
+        most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
+        quiet = np.repeat((sides <= most) & (energies <= 3.0 * most), block)
         part = every[:len(quiet)][quiet]
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
             fast, left, place = part, rest[:len(quiet)][quiet], index[:len(quiet)][quiet]
@@ -239,17 +245,6 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
             return 0.0
     gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
-
-
-def _select_quietest(fast: Array, block: int) -> Mask:
-    """Tell which third differences of a rate are in the quietest blocks."""
-    blocks = len(fast) // block
-    energy = np.sum(fast[:blocks * block].reshape(blocks, block) ** 2, axis=1)
-    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
-    # one with far more energy than these is a motion between two rests
-    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
-    most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
-    return np.asarray(np.repeat((sides <= most) & (energy <= 3.0 * most), block))
 
 
 def is_course(log: Log) -> bool:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, product
 import math
 
@@ -48,8 +49,9 @@ _MIN_THERMAL_LAG = 12.0
 _UNNAMED_PREFIX = '~'
 PART_OF_LOG = f'{_UNNAMED_PREFIX}rate and time'
 
-#: Columns of one log: (replay) -> arrays of shape (n,).
-ColumnFunction = Callable[[Replay], Sequence[Array]]
+#: Columns of one log: (replay) -> arrays of shape (n,); and a variable that they are of.
+_ColumnFunction = Callable[[Replay], Sequence[Array]]
+_Variable = Callable[[Replay], Array]
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Candidate:
 
     cause: str  # its name
     shapes: tuple[float, ...]  # their values, in the order of the effect
-    columns: ColumnFunction  # of a log
+    columns: _ColumnFunction  # of a log
     # number of the log for a single event; None for a cause in all logs
     log_index: int | None = None
     # fixed coefficient of its column if only shapes are fitted; None if it is free
@@ -73,13 +75,10 @@ class Candidate:
 
 def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
     """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
-    parts = []
-    for run, each in enumerate(replays):
-        values = candidate.columns(each)
-        absent = candidate.log_index is not None and candidate.log_index != run
-        parts.append(np.array([np.zeros(each.point_count - 1) if absent
-                               else each.transform_samples(value) for value in values]))
-    return np.concatenate(parts, axis=1)
+    return np.concatenate([
+        np.array([each.transform_samples(value) if candidate.log_index in (None, run)
+                  else np.zeros(each.point_count - 1) for value in candidate.columns(each)])
+        for run, each in enumerate(replays)], axis=1)
 
 
 def effect_candidate(name: str, *shapes: float, log_index: int | None = None,
@@ -129,27 +128,18 @@ def fitted_shape_indices(candidate: Candidate) -> list[int]:
 
 def smooth_shapes(candidate: Candidate) -> list[int]:
     """Return the indices of fitted shapes on which the columns depend smoothly."""
-    return [] if is_discontinuous(candidate) else fitted_shape_indices(candidate)
-
-
-def is_discontinuous(candidate: Candidate) -> bool:
-    """Tell whether the columns of a candidate do not depend smoothly on its shapes."""
-    return candidate.cause in _DISCONTINUOUS
+    return [] if candidate.cause in _DISCONTINUOUS else fitted_shape_indices(candidate)
 
 
 def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
     """Return a candidate without values with another shape, within the bounds of its effect."""
-    if candidate.cause == PART_OF_LOG:
-        ends = list(candidate.shapes)
-        ends[shape_index] = value
-        return replace(_part_of_log(ends[0], ends[1], candidate.log_index, candidate.half_width),
-                       penalty=candidate.penalty)
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
-    moved = effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
-                             *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
-                             half_width=candidate.half_width)
-    return replace(moved, penalty=candidate.penalty)
+    shapes = (*candidate.shapes[:shape_index], value, *candidate.shapes[shape_index + 1:])
+    moved = (_part_of_log(*shapes) if candidate.cause == PART_OF_LOG
+             else effect_candidate(candidate.cause, *shapes))
+    return replace(moved, log_index=candidate.log_index, half_width=candidate.half_width,
+                   penalty=candidate.penalty)
 
 
 def depends_on_rate(candidate: Candidate) -> bool:
@@ -262,13 +252,13 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
 _WAVE_COUNTS, _SPLINE_KNOTS = range(1, 13), 8
-#: Linear response of a motion to its reference rate; lags between which it is constant, s.
+#: Linear response of a motion to its reference rate; lags between which it is constant, s: from
+#: 0.1 s on two in an octave.
 RESPONSE = f'{_UNNAMED_PREFIX}rate_change'
-_RESPONSE_LAGS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 1.6, 2.4)
+_RESPONSE_LAGS = np.append(0.05 * np.arange(-2, 2),
+                           np.outer(2.0 ** np.arange(5), (0.1, 0.15)))
 #: Widths of a bump in time as shares of the duration.
 _BUMP_WIDTHS = (0.01, 0.05)
-
-Variable = Callable[[Replay], Array]
 
 
 def is_named(candidate: Candidate) -> bool:
@@ -283,105 +273,87 @@ def unnamed_variable(candidate: Candidate) -> str:
 
 def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give the generic terms that these logs may show."""
+    def unnamed(name: str, columns: Callable[..., Sequence[Array]], *variables: _Variable,
+                shapes: tuple[float, ...] = (), log_index: int | None = None) -> Candidate:
+        return Candidate(_UNNAMED_PREFIX + name, shapes, lambda each: columns(
+            *(of(each) for of in variables)), log_index)
+
     def heading(each: Replay) -> Array:
         return each.channels.heading
 
-    variables = dict(_scaled_variables(replays))
-    for name, of in variables.items():
-        for count in _WAVE_COUNTS if name in ('rate', 'temperature') else ():
-            yield _unnamed_term(name, _wave_columns(of, np.pi * count))
-        yield _unnamed_term(name, _spline_columns(of))
-    if 'rate' in variables:
-        for number in _WAVE_COUNTS[1:]:
-            yield _unnamed_term('heading', _wave_columns(heading, number))
-        for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
-                             ('supply', 1)):
-            if name in variables:
-                yield _unnamed_term(f'{name} and heading',
-                                    _wave_columns(heading, number, variables[name]))
-    if 'rate' in variables and 'reference_rate' in common_channels(replays):
-        yield _response_term(max(each.interval for each in replays))
-    for (first, one), (second, other) in combinations(variables.items(), 2):
-        if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
-            yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
-    # a scale factor that differs in a part of a log; so many ends have `MAX_STEP_TIMES` pairs
-    ends = math.isqrt(2 * MAX_STEP_TIMES // len(replays)) + 1
-    for run, each in enumerate(replays):
-        begin = float(each.channels.time[each.valid][0])
-        if 'rate' in variables:
-            for part in combinations(begin + each.duration * np.linspace(0.0, 1.0, ends), 2):
-                if part[1] - part[0] < 0.99 * each.duration:
-                    yield _part_of_log(*part, run, each.duration / (ends - 1))
-        for width in _BUMP_WIDTHS:
-            count = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
-            for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
-                yield _unnamed_term('time', _bump_columns(moment, width * each.duration), run,
-                                    moment)
+    def splines(values: Array) -> Sequence[Array]:
+        return tuple(BSpline.design_matrix(values, knots, 3).toarray().T[1:])
 
-
-def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = None,
-                  *shapes: float) -> Candidate:
-    return Candidate(_UNNAMED_PREFIX + name, shapes, columns, log_index)
-
-
-def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable]]:
-    """Give the variables that change in these logs, each scaled to -1 to 1."""
+    # those that change in these logs, each scaled to -1 to 1
+    variables: dict[str, _Variable] = {}
     has = common_channels(replays) - constant_channels(replays)
-    known: dict[str, Variable] = {
+    known: dict[str, _Variable] = {
         'rate': lambda each: each.channels.rate,
         'temperature': lambda each: each.channels.temperature,
         'supply': lambda each: np.asarray(each.channels.supply),
         'specific_force': lambda each: each.lagged('specific_force', 0.3)}
-    for name in ('rate', *(each for each in list(known)[1:] if each in has)):
-        of = known[name]
-        low = min(float(of(each).min()) for each in replays)
-        high = max(float(of(each).max()) for each in replays)
+    for name in (each for each in known if each == 'rate' or each in has):
+        ends = [(float(values.min()), float(values.max())) for values in map(known[name], replays)]
+        low, high = min(low for low, _ in ends), max(high for _, high in ends)
         if high > low:
-            yield name, _scale_to_unit_range(of, low, high)
-
-
-def _scale_to_unit_range(variable: Variable, low: float, high: float) -> Variable:
-    return lambda each: np.clip((2.0 * variable(each) - low - high) / (high - low), -1.0, 1.0)
-
-
-def _product_columns(one: Variable, other: Variable) -> ColumnFunction:
-    return lambda each: (one(each) * other(each),)
-
-
-def _wave_columns(phase: Variable, number: float,
-                  factor_variable: Variable | None = None) -> ColumnFunction:
-    def columns(each: Replay) -> Sequence[Array]:
-        factor = 1.0 if factor_variable is None else factor_variable(each)
-        return (factor * np.sin(number * phase(each)), factor * np.cos(number * phase(each)))
-    return columns
-
-
-def _spline_columns(variable: Variable) -> ColumnFunction:
+            variables[name] = partial(_scaled, known[name], low, high)
     knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, _SPLINE_KNOTS - 2), [1.0] * 3])
-    # their sum is constant, as the bias is
-    return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
+    for name, of in variables.items():
+        for count in _WAVE_COUNTS if name in ('rate', 'temperature') else ():
+            yield unnamed(name, partial(_waves, np.pi * count), of)
+        # the sum of all splines is constant, as the bias is
+        yield unnamed(name, splines, of)
+    if 'rate' in variables:
+        for number in _WAVE_COUNTS[1:]:
+            yield unnamed('heading', partial(_waves, number), heading)
+        for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
+                             ('supply', 1)):
+            if name in variables:
+                yield unnamed(f'{name} and heading', partial(_waves, number), heading,
+                              variables[name])
+    if 'rate' in variables and 'reference_rate' in common_channels(replays):
+        # the mean rate between two neighbouring lags less the rate, in samples of the slowest log
+        interval = max(each.interval for each in replays)
+        lags = np.unique(np.rint(_RESPONSE_LAGS / interval)) * interval
+
+        def late_rates(each: Replay) -> Sequence[Array]:
+            time, rate = each.channels.time, each.channels.rate
+            late = np.interp(time - lags[:, None], time, integrate(time, rate))
+            return [*((late[:-1] - late[1:]) / np.diff(lags)[:, None] - rate)]
+
+        yield Candidate(RESPONSE, (), late_rates)
+    for (first, one), (second, other) in combinations(variables.items(), 2):
+        if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
+            yield unnamed(f'{first} and {second}', lambda *values: (values[0] * values[1],), one,
+                          other)
+    # a scale factor that differs in a part of a log; so many ends have `MAX_STEP_TIMES` pairs
+    ends_count = math.isqrt(2 * MAX_STEP_TIMES // len(replays)) + 1
+    for run, each in enumerate(replays):
+        begin, duration = float(each.channels.time[each.valid][0]), each.duration
+        if 'rate' in variables:
+            for part in combinations(begin + duration * np.linspace(0.0, 1.0, ends_count), 2):
+                if part[1] - part[0] < 0.99 * duration:
+                    yield replace(_part_of_log(*part), log_index=run,
+                                  half_width=duration / (ends_count - 1))
+        for width in _BUMP_WIDTHS:
+            number = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
+            for moment in begin + duration * np.linspace(0.0, 1.0, number)[1:-1]:
+                yield unnamed('time', partial(_bump, moment, width * duration),
+                              lambda each: each.channels.time, shapes=(moment,), log_index=run)
 
 
-def _response_term(interval: float) -> Candidate:
-    """Return the mean rate between two lags less the rate, for each pair of neighbouring lags."""
-    # whole samples of the slowest log
-    edges = np.unique(np.rint(np.array(_RESPONSE_LAGS) / interval)) * interval
-
-    def columns(each: Replay) -> Sequence[Array]:
-        time, rate = each.channels.time, each.channels.rate
-        late = np.interp(time - edges[:, None], time, integrate(time, rate))
-        return [*((late[:-1] - late[1:]) / np.diff(edges)[:, None] - rate)]
-
-    return Candidate(RESPONSE, (), columns)
+def _scaled(of: _Variable, low: float, high: float, each: Replay) -> Array:
+    return np.clip((2.0 * of(each) - low - high) / (high - low), -1.0, 1.0)
 
 
-def _part_of_log(first: float, last: float, log_index: int | None,
-                 half_width: float | None) -> Candidate:
-    """Return a scale factor error from a first to a last time."""
+def _waves(number: float, phase: Array, size: Array | float = 1.0) -> Sequence[Array]:
+    return size * np.sin(number * phase), size * np.cos(number * phase)
+
+
+def _bump(middle: float, width: float, time: Array) -> Sequence[Array]:
+    return (np.exp(-0.5 * ((time - middle) / width) ** 2),)
+
+
+def _part_of_log(first: float, last: float) -> Candidate:
     return Candidate(PART_OF_LOG, (first, last), lambda each: (each.channels.rate * (
-        (each.channels.time >= first) & (each.channels.time < last)),), log_index,
-        half_width=half_width)
-
-
-def _bump_columns(middle: float, width: float) -> ColumnFunction:
-    return lambda each: (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)
+        (each.channels.time >= first) & (each.channels.time < last)),))

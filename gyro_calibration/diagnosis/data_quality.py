@@ -23,21 +23,21 @@ units are reported if they are large enough to matter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_output
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import (
-    compare_headings, compare_output, fit_line, identify_unit_factor, is_implausible_factor,
-    LineFit, model_scale_factor, OutputComparison, reference_angle, reference_rate,
-    resample_reference, select_reference, spline_rate, UNIT_FACTORS)
+    compare_headings, fit_line, identify_unit_factor, is_implausible_factor, model_scale_factor,
+    reference_angle, reference_rate, resample_reference, select_reference, spline_rate,
+    UNIT_FACTORS)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
-    bridge_gaps, encoder_step, find_codes, find_runs, QuantizationCodes, robust_deviation)
+    bridge_gaps, encoder_step, find_codes, find_runs, QuantizationCodes, robust_deviation,
+    white_noise_deviation)
 from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -72,6 +72,16 @@ _RARE_SIGMAS = 4.5
 _NEIGHBOURS_PER_SIDE, _JOLT_SAMPLES, _SCATTER_BLOCK_SAMPLES, _MAX_OUTLIER_RUN = 3, 10, 256, 2
 
 
+@dataclass(frozen=True)
+class _Comparison:
+    """Output and expectation, in rad/s, shape (n,)."""
+
+    output: Array  # without nan; gaps are interpolated
+    expected: Array | None  # from the reference, nan in its gaps; None without a reference
+    noise_deviation: float  # standard deviation of the white noise of a sample
+    deviation: float  # standard deviation of a sample from the expected output, at least that
+
+
 # codes
 
 def _local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
@@ -104,30 +114,18 @@ class _DeadBand:
 
     value: float  # rad/s
     half_width: float  # distance of the nearest other value, rad/s
-
-    def contains(self, output: Array) -> Mask:
-        """Mark the samples in it."""
-        return np.abs(output - self.value) < 0.5 * self.half_width
-
-    def membership_chance(self, comparison: OutputComparison) -> Array:
-        """Return the chance of each sample to be in it, by its expected output, or by a rest."""
-        rest = (np.full(len(comparison.output), np.median(comparison.output))
-                if comparison.expected is None else comparison.expected)
-        off = np.nan_to_num(rest - self.value)
-        deviation = max(comparison.deviation, 1e-9 * self.half_width)
-        reach = self.half_width + 2.0 * deviation
-        return ndtr((reach - off) / deviation) - ndtr((-reach - off) / deviation)
+    within: Mask  # the samples in it, shape (n,)
 
 
 def _find_dead_band(codes: QuantizationCodes, output: Array) -> _DeadBand | None:
-    """Return the dead band of an output, or None where it shows none."""
     counts = np.where(np.abs(codes.values) < _rest_rate_limit(output), codes.counts, 0)
     place = int(np.argmax(counts))
-    away = np.abs(np.delete(codes.values, place) - codes.values[place])
-    band = _DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
-    runs = np.count_nonzero(np.diff(band.contains(output), prepend=False, append=False)) // 2
-    return (band if counts[place] > 1 and runs > 1
-            and band.half_width > 1.5 * codes.step else None)
+    value = float(codes.values[place])
+    half_width = float(np.abs(np.delete(codes.values, place) - value).min(initial=np.inf))
+    within = np.abs(output - value) < 0.5 * half_width
+    return (_DeadBand(value, half_width, within)
+            if counts[place] > 1 and len(find_runs(within)) > 1 and half_width > 1.5 * codes.step
+            else None)
 
 
 def _rest_rate_limit(output: Array) -> float:
@@ -135,36 +133,21 @@ def _rest_rate_limit(output: Array) -> float:
     return _REST_RATE_SHARE * float(np.quantile(np.abs(output), 0.99))
 
 
-@dataclass(frozen=True)
-class _Limit:
-    """Largest and smallest code of a saturated output."""
-
-    # low, high: the limit on each side, infinite where there is none
-    low: float
-    high: float
-    p_value: float  # the chance that an output without one repeats its extreme codes as often
-
-    @property
-    def size(self) -> float:
-        """Return the limit as a rate without sign."""
-        return min(-self.low, self.high)
-
-    def is_reached(self, output: Array) -> Mask:
-        """Mark the samples at the limit."""
-        slack = 1e-9 * self.size
-        return (output >= self.high - slack) | (output <= self.low + slack)
+def _is_beyond(output: Array, low: float, high: float) -> Mask:
+    rounded = 1.0 - 1e-9
+    return (output >= rounded * high) | (output <= rounded * low)
 
 
-def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
-                level: float) -> _Limit | None:
+def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[float, float, float]:
     """
-    Return the limit of an output, or None, by a test of this level on each side.
+    Return the low and high limit of an output, infinite without one, and the p-value of a test.
 
     An extreme code is a limit if it is larger than the output at rest; if it is more frequent than
     its neighbours, which are more frequent without a limit; and if the expected output is beyond
     it, which is not so for a coarse code at a constant rate.
     """
-    chances, (low, high) = {}, codes.values[[0, -1]].tolist()
+    (low, high), found = codes.values[[0, -1]].tolist(), {1.0: math.inf, -1.0: math.inf}
+    p_value = 1.0
     deviation, noise = comparison.deviation, comparison.noise_deviation
     fine = codes.step < _MIN_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
@@ -176,12 +159,12 @@ def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
         near = int(counts[:-1][values[:-1] > extreme - reach - 0.5 * step].sum())
         chance = float(stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + near,
                                       1.0 / (min(reach / step, 1e6) + 1.0)))
-        if chance >= level or extreme <= _rest_rate_limit(comparison.output):
+        if chance >= FALSE_ALARM_CHANCE or extreme <= _rest_rate_limit(comparison.output):
             continue
         at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
         # a limit on either side counts the runs of both
-        both = (_Limit(low, high, chance).is_reached(comparison.output)
-                if abs(low + high) < 1.5 * step else at_extreme)
+        both = (_is_beyond(comparison.output, low, high) if abs(low + high) < 1.5 * step
+                else at_extreme)
         expected = (np.array([]) if comparison.expected is None
                     else sign * comparison.expected[at_extreme])
         beyond = (float(np.nanmedian(expected)) - extreme if np.isfinite(expected).any()
@@ -189,46 +172,50 @@ def _find_limit(codes: QuantizationCodes, comparison: OutputComparison,
         # The expected output errs by bias wander and nonlinearity, which these samples share.
         if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
                 or fine and len(find_runs(both)) >= _MIN_LIMIT_RUNS):
-            chances[sign] = (sign * extreme, chance)
-    if not chances:
-        return None
-    return _Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
-                  min(chance for _, chance in chances.values()))
+            found[sign], p_value = float(extreme), min(p_value, chance)
+    return -found[-1.0], found[1.0], p_value
 
 
 # repeated samples
 
-@dataclass(frozen=True)
-class _SampleFault:
-    """Faulty samples."""
-
-    is_faulty: Mask  # mask of the samples, shape (n,)
-    p_value: float  # of their number, or of the length of a run
-    sigmas: float = 0.0  # largest deviation of outliers in standard deviations
-
-
-def _find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
-                           band: _DeadBand | None, valid: Mask,
-                           level: float) -> _SampleFault | None:
-    """Find repeated samples among valid ones, or return None."""
+def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
+                           band: _DeadBand | None, valid: Mask) -> tuple[Mask, float]:
+    """Mark repeated samples among valid ones; and return the p-value of number or longest run."""
     known, change = valid[1:] & valid[:-1], np.diff(comparison.output)
     same = (change == 0.0) & known
     expected = (np.zeros(len(change)) if comparison.expected is None
                 else np.nan_to_num(np.diff(comparison.expected)))
-    if not same.any():
-        return None
-    width = _local_code_steps(codes, comparison.output[:-1])
-    chance = _repeat_chances(change, expected, width, known)
-    if band is not None:  # a sample in it repeats while the next is due in it
-        within = band.contains(comparison.output[:-1])
-        chance = np.where(
-            within, np.maximum(chance, band.membership_chance(comparison)[1:]), chance)
-        width = np.where(within, 2.0 * band.half_width, width)
     repeats, p_value, by_run = np.zeros(len(valid), dtype=bool), 1.0, 1.0
+    if not same.any():
+        return repeats, p_value
+    width = _local_code_steps(codes, comparison.output[:-1])
+    # an upper bound of the probability of each repeat: that of a change by less than a step for
+    # the scatter of changes of similar expectation, and no less than the share of changes by one
+    # code or two, each way
+    chance, classes = np.ones(len(change)), _motion_classes(np.abs(expected))
+    for each in np.unique(classes):
+        members = np.flatnonzero((classes == each) & known)
+        if len(members):
+            due, steps, size = expected[members], width[members], np.abs(change[members])
+            # zeros count: with many, the codes are coarse
+            scale = np.maximum(_robust_quantile(np.abs(change[members] - due)), 1e-9 * steps)
+            count = np.count_nonzero((size > 0.5 * steps) & (size < 2.5 * steps))
+            chance[members] = np.maximum(_chance_within(due, steps, scale),
+                                         (count + 2.0 * np.sqrt(count)) / 4.0 / len(size))
+    if band is not None:
+        # a sample in it repeats while the next is due in it, by its expected output or by a rest
+        due = (np.full(len(change), np.median(comparison.output)) if comparison.expected is None
+               else comparison.expected[1:])
+        deviation = max(comparison.deviation, 1e-9 * band.half_width)
+        member = _chance_within(np.nan_to_num(due - band.value),
+                                band.half_width + 2.0 * deviation, deviation)
+        within = band.within[:-1]
+        chance = np.where(within, np.maximum(chance, member), chance)
+        width = np.where(within, 2.0 * band.half_width, width)
     rare = (chance < _COARSE_REPEAT_CHANCE) & known
     excess, expected_count = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
     by_number = float(stats.poisson.sf(excess - 1, expected_count))
-    if by_number < level and excess > 1.5 * expected_count:
+    if by_number < FALSE_ALARM_CHANCE and excess > 1.5 * expected_count:
         repeats[1:], p_value = same & (chance < _RARE_REPEAT_CHANCE), by_number
     product, travel = (np.concatenate([[0.0], np.cumsum(each)])
                        for each in (np.log(np.maximum(chance, 1e-12)), expected))
@@ -242,33 +229,15 @@ def _find_repeated_samples(comparison: OutputComparison, codes: QuantizationCode
             left = abs(travel[run.stop] - travel[run.start]) - width[run.start]
             unlikely = float(2.0 * stats.norm.sf(
                 left / (math.sqrt(2.0) * comparison.deviation))) if left > 0.0 else 1.0
-        if unlikely * len(valid) < level:
+        if unlikely * len(valid) < FALSE_ALARM_CHANCE:
             repeats[run.start + 1:run.stop + 1] = True
             by_run = min(by_run, unlikely * len(valid))
-    if not repeats.any():
-        return None
-    return _SampleFault(repeats, min(by_run, p_value))
+    return repeats, min(by_run, p_value)
 
 
-def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) -> Array:
-    """
-    Return an upper bound of the probability of each repeat, shape (n - 1,).
-
-    That of a change by less than a step for the scatter of changes of similar expectation, and no
-    less than the share of changes by one code or two, each way.
-    """
-    chances, classes = np.ones(len(change)), _motion_classes(np.abs(expected))
-    for each in np.unique(classes):
-        members = np.flatnonzero((classes == each) & known)
-        if len(members):
-            due, steps, size = expected[members], step[members], np.abs(change[members])
-            # zeros count: with many, the codes are coarse
-            scale = np.maximum(_robust_quantile(np.abs(change[members] - due)), 1e-9 * steps)
-            count = np.count_nonzero((size > 0.5 * steps) & (size < 2.5 * steps))
-            chances[members] = np.maximum(
-                ndtr((steps - due) / scale) - ndtr((-steps - due) / scale),
-                (count + 2.0 * np.sqrt(count)) / 4.0 / len(size))
-    return chances
+def _chance_within(expected: Array, half_width: Array | float, deviation: Array | float) -> Array:
+    """Return the probability that normal values are within a half-width about zero."""
+    return ndtr((half_width - expected) / deviation) - ndtr((-half_width - expected) / deviation)
 
 
 def _motion_classes(motion: Array) -> NDArray[np.intp]:
@@ -284,14 +253,19 @@ def _robust_quantile(off: Array) -> float:
 
 # outliers
 
-def _find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
-                   level: float) -> _SampleFault | None:
-    """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
+def _find_outliers(comparison: _Comparison, valid: Mask,
+                   min_scatter: float) -> tuple[Mask, float, float]:
+    """
+    Mark outliers among valid samples; and return their p-value and the largest one's sigmas.
+
+    `min_scatter` is half a code.
+    """
     measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
+    count = len(output)
     # more for very long logs
-    limit = max(OUTLIER_THRESHOLD, float(stats.norm.isf(0.25 * level / len(output))))
+    limit = max(OUTLIER_THRESHOLD, float(stats.norm.isf(0.25 * FALSE_ALARM_CHANCE / count)))
     # how much the output is expected to change about each sample, and how far it jumps
-    expected: Array = np.zeros(len(output))
+    expected: Array = np.zeros(count)
     expected_change = jumps = expected
     if comparison.expected is not None and np.isfinite(comparison.expected).any():
         expected = bridge_gaps(comparison.expected)
@@ -301,84 +275,54 @@ def _find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float
         # from the cubic through two samples on each side
         by_cubic = np.abs(np.diff(np.pad(expected, 2, mode='edge'), 4)) / 6.0
         jumps = maximum_filter1d(by_cubic, 2 * _JOLT_SAMPLES + 1)
-    off = _distance_to_median(output)
-    sigmas = _outlier_sigmas(output, off, expected_change, valid, min_scatter)
+    # the samples about each one, the outer ones at the ends, and those without itself
+    size, index = 2 * _NEIGHBOURS_PER_SIDE + 1, np.arange(count)
+    first = np.clip(index - _NEIGHBOURS_PER_SIDE, 0, count - size)
+    window = first[:, None] + np.arange(size)
+    neighbours = window[window != index[:, None]].reshape(count, size - 1)
+    near = output[neighbours]
+    off = np.abs(output - np.median(near, axis=1))
+    # in standard deviations: of the samples about it, and of those that move alike, by far ones
+    # too if there are enough, for rough motion
+    blocks = max(1, count // _SCATTER_BLOCK_SAMPLES)
+    parts, kept = np.array_split(off, blocks), np.array_split(valid, blocks)
+    of_blocks = [_robust_quantile(part[own]) for part, own in zip(parts, kept)]
+    scale = np.repeat(maximum_filter1d(of_blocks, 3, mode='nearest'),
+                      [len(part) for part in parts])
+    classes = _motion_classes(expected_change)
+    for each in np.unique(classes):
+        members, own = off[(classes == each) & valid], classes == each
+        scale[own] = np.maximum(scale[own], max(
+            [_robust_quantile(members),
+             *(np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share)
+               for share in (0.05, 0.01) if share * members.size > 5)]))
+    # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
+    outside = np.maximum(output - near.max(axis=1), near.min(axis=1) - output)
+    sigmas = np.where(outside > 0.5 * off, off / np.maximum(scale, max(min_scatter, 1e-300)), 0.0)
     # an outlier is one among samples of the same rate too, and in the output itself
-    sigmas *= np.minimum(_distance_to_median(output, np.argsort(expected, kind='stable'))
-                         / np.maximum(off, 1e-300), 1.0)
-    sigmas[_distance_to_parabola(measured) < 0.5 * off] = 0.0
+    order = np.argsort(expected, kind='stable')
+    ordered, off_ordered = output[order], np.empty(count)
+    off_ordered[order] = np.abs(ordered - np.median(ordered[neighbours], axis=1))
+    sigmas *= np.minimum(off_ordered / np.maximum(off, 1e-300), 1.0)
+    # and off the parabola through its neighbours
+    powers, weights = np.vander(np.arange(size), 3), np.eye(size)
+    for place, row in enumerate(weights):
+        others = np.arange(size) != place
+        row[others] = -powers[place] @ np.linalg.pinv(powers[others])
+    sigmas[np.abs((measured[window] * weights[index - first]).sum(axis=1)) < 0.5 * off] = 0.0
     # near a jump of the reference of half the size: a jolt, or the reference is outlying
     sigmas[jumps > 0.5 * off] = 0.0
-    missing = np.count_nonzero(_neighbour_samples(~valid), axis=1)
-    tested = valid & (missing < _NEIGHBOURS_PER_SIDE)
+    tested = valid & (np.count_nonzero(~valid[neighbours], axis=1) < _NEIGHBOURS_PER_SIDE)
     outlying = (sigmas > limit) & tested
     for run in find_runs(outlying):
         outlying[run] = run.stop - run.start <= _MAX_OUTLIER_RUN
-    count = int(np.count_nonzero(outlying))
-    near = int(np.count_nonzero((sigmas > _RARE_SIGMAS) & (sigmas <= limit) & tested))
-    usual = stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_RARE_SIGMAS))
-    if not count or near > 0.5 * count + usual:
-        return None
-    p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
-    return (_SampleFault(outlying, p_value, float(sigmas[outlying].max())) if p_value < level
-            else None)
-
-
-def _windows(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp]]:
-    """Return the seven samples about each one, the outer ones at the ends, and its place there."""
-    size, index = 2 * _NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
-    first = np.clip(index - _NEIGHBOURS_PER_SIDE, 0, len(values) - size)
-    return sliding_window_view(values, size)[first], index - first
-
-
-def _neighbour_samples(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the samples before and after each one, the next six at the ends, shape (n, 6)."""
-    window, place = _windows(values)
-    size = window.shape[1]
-    return window[np.arange(size) != place[:, None]].reshape(-1, size - 1)
-
-
-def _distance_to_median(values: Array, order: NDArray[np.intp] | None = None) -> Array:
-    """Return how far each sample is from the median of its neighbours, in time or in an order."""
-    if order is None:
-        return np.abs(values - np.median(_neighbour_samples(values), axis=1))
-    distance = np.empty(len(values))
-    distance[order] = _distance_to_median(values[order])
-    return distance
-
-
-def _distance_to_parabola(values: Array) -> Array:
-    """Return how far each sample is from the parabola through its neighbours."""
-    window, place = _windows(values)
-    powers = np.vander(np.arange(window.shape[1]), 3)
-    weights = np.eye(len(powers))
-    for each, row in enumerate(weights):
-        others = np.arange(len(powers)) != each
-        row[others] = -powers[each] @ np.linalg.pinv(powers[others])
-    return np.abs((window * weights[place]).sum(axis=1))
-
-
-def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Mask,
-                    min_scatter: float) -> Array:
-    """Return distances from neighbours in standard deviations, local ones and those by motion."""
-    near = _neighbour_samples(values)
-    # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
-    outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
-    blocks = max(1, len(off) // _SCATTER_BLOCK_SAMPLES)
-    parts, kept = np.array_split(off, blocks), np.array_split(valid, blocks)
-    of_blocks = [_robust_quantile(part[own]) for part, own in zip(parts, kept)]
-    local = np.repeat(maximum_filter1d(of_blocks, 3, mode='nearest'),
-                      [len(part) for part in parts])
-    by_motion, classes = np.zeros(len(off)), _motion_classes(expected_change)
-    for each in np.unique(classes):
-        members = off[(classes == each) & valid]
-        # by far ones too if there are enough, for rough motion
-        by_motion[classes == each] = max(
-            [_robust_quantile(members),
-             *(np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share)
-               for share in (0.05, 0.01) if share * members.size > 5)])
-    scale = np.maximum(np.maximum(local, by_motion), max(min_scatter, 1e-300))
-    return np.where(outside > 0.5 * off, off / scale, 0.0)
+    found = int(np.count_nonzero(outlying))
+    rare = int(np.count_nonzero((sigmas > _RARE_SIGMAS) & (sigmas <= limit) & tested))
+    usual = stats.poisson.isf(0.01, 2.0 * count * stats.norm.sf(_RARE_SIGMAS))
+    p_value = float(stats.poisson.sf(found - 1, 4.0 * count * stats.norm.sf(limit)))
+    if rare > 0.5 * found + usual or p_value >= FALSE_ALARM_CHANCE:
+        outlying[:] = False
+    return outlying, p_value, float(sigmas[outlying].max(initial=0.0))
 
 
 # the record
@@ -410,12 +354,18 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
 
     """
     log, notes = select_reference(log)
-    output, rate = require_output(log), reference_rate(resample_reference(log))
-    has_output = np.isfinite(output)
+    resampled = resample_reference(log)
+    output, rate = require_output(log), reference_rate(resampled)
+    has_output, heading = np.isfinite(output), resampled.reference_heading
     line = None if rate is None else fit_line(log.time, rate, output)
     if (rate is not None and line is not None and log.time is not None
-            and log.reference_rate is None):
-        rate = _follow_corners(log, rate, line)
+            and log.reference_rate is None and heading is not None):
+        # A smooth rate of a heading errs at the ends of a log and at corners of the motion, and
+        # that by splines by the noise of the heading: the one closer to the output is used.
+        sharp = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
+        off_sharp, off = (float(np.nanmean((output - line.factor * each - line.offset) ** 2))
+                          for each in (sharp, rate))
+        rate = sharp if off_sharp <= off else rate
         line = fit_line(log.time, rate, output) or line
     factor, units = 1.0, []
     if rate is not None and line is not None:
@@ -423,7 +373,14 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         own = 1.0 if model is None else model_scale_factor(model, rate)
         ratio, deviation = line.factor / own, line.deviation / abs(own)
         name = identify_unit_factor(ratio, deviation)
-        if name is not None and not _is_refuted_by_spans(log, UNIT_FACTORS[name]):
+        spans = ([] if name is None or log.time is None
+                 else compare_headings(log, reference_angle(log)))
+        best = max(spans, key=lambda each: each.coherence, default=None)
+        # Of a motion that is late, a rate shows less than its turns do: over spans, the headings
+        # may agree with 1 rather than with the factor.
+        if name is not None and (best is None or abs(best.factor - 1.0) >= abs(
+                best.factor - 1.0 / UNIT_FACTORS[name]) or abs(
+                best.factor - 1.0 / UNIT_FACTORS[name]) <= 5.0 * best.deviation):
             factor = 1.0 / UNIT_FACTORS[name]
             units = [_sized_finding(
                 'unit_error', ratio, NORMAL_QUANTILE_975 * deviation,
@@ -434,42 +391,20 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     if log.time is None:
         return DataQuality(tuple(units), notes, has_output, factor)
     lost, remarks = _check_stamps(log.time, has_output)
-    expected = (None if rate is None or line is None
-                else factor * (line.factor * rate + line.offset))
+    output = output * factor
+    whole, noise = bridge_gaps(output), white_noise_deviation(output)
+    comparison = _Comparison(whole, None, noise, noise)
+    if rate is not None and line is not None:
+        expected = factor * (line.factor * rate + line.offset)
+        off = (output - expected)[np.isfinite(output) & np.isfinite(expected)]
+        noise = min(noise, white_noise_deviation(output - expected))
+        comparison = _Comparison(whole, expected, noise, max(
+            noise, robust_deviation(off) if len(off) else math.inf))
     heading = log.reference_heading if log.reference_rate is None else None
     step = (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
             else encoder_step(heading))
-    found = DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
-                        heading_step=step)
-    return _check_samples(found, compare_output(output * factor, expected), model, log)
-
-
-def _is_refuted_by_spans(log: Log, factor: float) -> bool:
-    """
-    Tell whether the headings over spans agree with 1 rather than with a factor of the output.
-
-    Of a motion that is late, a rate shows less than its turns do.
-    """
-    spans = [] if log.time is None else compare_headings(log, reference_angle(log))
-    best = max(spans, key=lambda each: each.coherence, default=None)
-    return best is not None and (
-        abs(best.factor - 1.0) < abs(best.factor - 1.0 / factor)
-        and abs(best.factor - 1.0 / factor) > 5.0 * best.deviation)
-
-
-def _follow_corners(log: Log, rate: Array, line: LineFit) -> Array:
-    """
-    Return the rate of a heading by splines where it is closer to the output than a smooth one.
-
-    The smooth one errs at the ends of a log and at corners of the motion, and that by splines by
-    the noise of the heading.
-    """
-    assert log.time is not None
-    heading = resample_reference(log).reference_heading
-    assert heading is not None
-    sharp = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
-    return min((sharp, rate), key=lambda each: float(np.nanmean(
-        (require_output(log) - line.factor * each - line.offset) ** 2)))
+    return _check_samples(DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
+                                      heading_step=step), comparison, model, log.time)
 
 
 def resolve_unit(quality: DataQuality) -> DataQuality:
@@ -514,93 +449,66 @@ def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[st
                            stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
-def _check_samples(found: DataQuality, comparison: OutputComparison, model: GyroModel | None,
-                   log: Log) -> DataQuality:
+def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroModel | None,
+                   time: Array) -> DataQuality:
     """Check the samples of the gyro for quantization, limits, repeats and outliers."""
-    has_output = found.usable
-    codes, output = find_codes(comparison.output[has_output]), comparison.output
-    limit = _find_limit(codes, comparison, FALSE_ALARM_CHANCE)
-    at_limit = (np.zeros(len(output), dtype=bool) if limit is None
-                else limit.is_reached(output))
-    valid, band = has_output & ~at_limit, _find_dead_band(codes, output)
-    repeated = _find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
-    if repeated is not None and len(find_runs(at_limit)) == 1 and np.count_nonzero(
-            at_limit) - 1 <= 2 * max(run.stop - run.start
-                                     for run in find_runs(repeated.is_faulty)):
+    has_output, output, noise = quality.usable, comparison.output, comparison.noise_deviation
+    codes = find_codes(output[has_output])
+    (low, high, p_limit), band = _find_limit(codes, comparison), _find_dead_band(codes, output)
+    at_limit = _is_beyond(output, low, high)
+    repeated, p_repeated = _find_repeated_samples(comparison, codes, band, has_output & ~at_limit)
+    if repeated.any() and len(find_runs(at_limit)) == 1 and np.count_nonzero(
+            at_limit) - 1 <= 2 * max(run.stop - run.start for run in find_runs(repeated)):
         # one run at a limit that is like the others is one of repeats
-        limit, at_limit, valid = None, np.zeros_like(at_limit), has_output
-        repeated = _find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
-    valid = valid if repeated is None else valid & ~repeated.is_faulty
+        low, high, at_limit = -math.inf, math.inf, np.zeros_like(at_limit)
+        repeated, p_repeated = _find_repeated_samples(comparison, codes, band, has_output)
+    valid = has_output & ~at_limit & ~repeated
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(
-        band.contains(output), iterations=_NEIGHBOURS_PER_SIDE)
-    outlying = _find_outliers(comparison, tested, 0.5 * codes.step, FALSE_ALARM_CHANCE)
-    valid = valid if outlying is None else valid & ~outlying.is_faulty
-    away_from_limit = np.ones(len(output), dtype=bool)
-    if limit is not None and comparison.expected is not None:
+        band.within, iterations=_NEIGHBOURS_PER_SIDE)
+    outlying, p_outlying, sigmas = _find_outliers(comparison, tested, 0.5 * codes.step)
+    valid &= ~outlying
+    if comparison.expected is not None:
         # by the expected output: a selection by the measured output would be biased by its noise
         near = _RARE_SIGMAS * comparison.deviation
-        away_from_limit = ~(
-            (comparison.expected > limit.high - near) | (comparison.expected < limit.low + near))
-    findings = (*found.findings, *_code_findings(codes, comparison, limit, at_limit, model),
-                *_sample_findings(repeated, outlying, log, found.heading_step,
-                                  comparison.noise_deviation))
-    matters = codes.step >= _MIN_STEP_NOISE_RATIO * comparison.noise_deviation
-    return replace(found, findings=findings, usable=valid & away_from_limit,
-                   limit=None if limit is None else limit.size,
-                   output_step=codes.step if matters else 0.0)
+        valid &= ~((comparison.expected > high - near) | (comparison.expected < low + near))
 
+    def is_in_model(name: str, value: float) -> bool:
+        return any(term.effect.name == name and abs(term.values[0] / value - 1.0) < 0.02
+                   for term in ([] if model is None else model.terms))
 
-def _is_in_model(model: GyroModel | None, name: str, value: float) -> bool:
-    """Tell whether a model has an effect on the signal with this value, to 2 %."""
-    terms = () if model is None else model.terms
-    return any(term.effect.name == name and abs(term.values[0] / value - 1.0) < 0.02
-               for term in terms)
-
-
-def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit: _Limit | None,
-                   at_limit: Mask, model: GyroModel | None) -> Iterator[Finding]:
-    """Give quantization and saturation of the output, unless they are in the model."""
-    if (codes.step >= _MIN_STEP_NOISE_RATIO * comparison.noise_deviation and codes.step
-            and not _is_in_model(model, 'quantization', codes.step)):
+    findings = list(quality.findings)
+    matters = codes.step >= _MIN_STEP_NOISE_RATIO * noise
+    if matters and codes.step and not is_in_model('quantization', codes.step):
         chance = float(np.exp(-min(codes.counts.sum() * codes.alignment ** 2, 700.0)))
-        yield _sized_finding(
+        findings.append(_sized_finding(
             'quantization', codes.step, NORMAL_QUANTILE_975 * codes.step_deviation, chance,
             f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
-            f'where its white noise is {comparison.noise_deviation / DEGREE:.3g} deg/s')
-    if limit is not None and not _is_in_model(model, 'saturation', limit.size):
-        sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high)
-                 if np.isfinite(value)]
-        yield _sized_finding('saturation', limit.size, 0.0, limit.p_value,
-                             f'{np.count_nonzero(at_limit)} samples '
-                             f'({100.0 * at_limit.mean():.2g} %) have the extreme code '
-                             f'{" or ".join(sides)}')
-
-
-def _sample_findings(repeated: _SampleFault | None, outlying: _SampleFault | None, log: Log,
-                     reference_step: float, noise_deviation: float) -> Iterator[Finding]:
-    """Give repeated samples, outliers, and the step of the reference if it adds much variance."""
-    assert log.time is not None
-    if repeated is not None:
-        count, runs = int(np.count_nonzero(repeated.is_faulty)), find_runs(repeated.is_faulty)
-        first = log.time[int(np.argmax(repeated.is_faulty))]
-        yield _sized_finding('stuck_samples', count, 0.0, repeated.p_value,
-                             f'{count} samples in {len(runs)} run{"s" * (len(runs) > 1)} repeat '
-                             f'the one before, the first at {first:.3f} s; codes and noise '
-                             'do not explain them')
-    if outlying is not None:
-        count = int(np.count_nonzero(outlying.is_faulty))
-        first = log.time[int(np.argmax(outlying.is_faulty))]
-        yield _sized_finding('outliers', count, 0.0, outlying.p_value,
-                             f'{count} single samples differ from their neighbours by up to '
-                             f'{outlying.sigmas:.0f} sigma, the first at {first:.3f} s')
-    interval = float(np.median(np.diff(log.time)))
-    noise = interval * noise_deviation
-    if reference_step and (
-            not noise or reference_step ** 2 / 6.0 / noise ** 2 > _MIN_STEP_VARIANCE_SHARE):
-        yield _sized_finding('reference_quantization', reference_step, 0.0, 0.0,
-                             'the reference heading comes in steps of '
-                             f'{reference_step / DEGREE:.4g} deg: its rate over one sample is '
-                             'uncertain by '
-                             f'{reference_step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, '
-                             f'where the gyro has {noise_deviation / DEGREE:.3g} deg/s of noise')
+            f'where its white noise is {noise / DEGREE:.3g} deg/s'))
+    limit = min(-low, high)
+    if math.isfinite(limit) and not is_in_model('saturation', limit):
+        sides = [f'{value / DEGREE:.5g} deg/s' for value in (low, high) if np.isfinite(value)]
+        findings.append(_sized_finding(
+            'saturation', limit, 0.0, p_limit, f'{np.count_nonzero(at_limit)} samples '
+            f'({100.0 * at_limit.mean():.2g} %) have the extreme code {" or ".join(sides)}'))
+    for name, fault, p_value in (('stuck_samples', repeated, p_repeated),
+                                 ('outliers', outlying, p_outlying)):
+        if fault.any():
+            count, runs = int(fault.sum()), len(find_runs(fault))
+            first = f'the first at {time[int(np.argmax(fault))]:.3f} s'
+            findings.append(_sized_finding(
+                name, count, 0.0, p_value,
+                f'{count} single samples differ from their neighbours by up to '
+                f'{sigmas:.0f} sigma, {first}' if name == 'outliers' else
+                f'{count} samples in {runs} run{"s" * (runs > 1)} repeat the one before, '
+                f'{first}; codes and noise do not explain them'))
+    interval, step = float(np.median(np.diff(time))), quality.heading_step
+    if step and step ** 2 / 6.0 > _MIN_STEP_VARIANCE_SHARE * (interval * noise) ** 2:
+        findings.append(_sized_finding(
+            'reference_quantization', step, 0.0, 0.0, 'the reference heading comes in steps of '
+            f'{step / DEGREE:.4g} deg: its rate over one sample is uncertain by '
+            f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
+            f'{noise / DEGREE:.3g} deg/s of noise'))
+    return replace(quality, findings=tuple(findings), usable=valid,
+                   limit=limit if math.isfinite(limit) else None,
+                   output_step=codes.step if matters else 0.0)

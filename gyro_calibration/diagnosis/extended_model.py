@@ -17,7 +17,7 @@ part in the selection and fit of the causes that predict them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
@@ -35,11 +35,9 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
-#: Limits of a plausible scale factor error and its standard deviation.
-_SCALE_FACTOR_LIMITS = RunLimits()
 #: Effects with a reference value -> the effect that compensates a change of that value.
 _COMPENSATING_EFFECTS: Mapping[str, Effect] = {
     'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
@@ -88,13 +86,33 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
 
 def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> GyroModel:
     """Return a model with all named effects of the gyro, and with corrected bias and scale."""
-    new, term_covariance = _terms_with_covariance(fit, bias_deviation)
-    moves = _has_motion(fit) and not is_scale_implausible(fit)
-    return add_terms(model, new, term_covariance,
+    implausible = is_scale_implausible(fit)
+    scale = 0.0 if implausible else fit.scale_factor_error.value
+    # the mean bias of the logs given that scale factor error
+    rates = [each.channels.rate[each.valid].mean() for each in fit.distorted]
+    bias = np.mean(fit.biases) + (fit.scale_factor_error.value - scale) * np.mean(rates)
+    terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
+    # of each value its index among the estimates; None for an exact one
+    of_scale = fit.estimate_index(-1, 0)
+    ranks: list[int | None] = [None, None if implausible else of_scale]
+    for place, known in enumerate(fit.causes):
+        if known.cause in CATALOGUE and fit.is_included(place):
+            terms.append(_term_of_cause(fit, place))
+            shapes = len(known.shapes)
+            ranks += [
+                fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
+                for number in range(len(terms[-1].values))]
+    fitted = [number for number, rank in enumerate(ranks) if rank is not None]
+    chosen = [rank for rank in ranks if rank is not None]
+    term_covariance = np.zeros((len(ranks), len(ranks)))
+    term_covariance[np.ix_(fitted, fitted)] = fit.covariance[np.ix_(chosen, chosen)]
+    term_covariance[0, 0] = bias_deviation ** 2
+    moves, replays = of_scale is not None and not implausible, fit.problem.replays
+    return add_terms(model, terms, term_covariance,
                      [each.channels.output[each.valid] + each.simulated_error[each.valid]
-                      for each in fit.problem.replays if moves],
+                      for each in replays if moves],
                      [each.channels.temperature[each.valid]
-                      for each in fit.problem.replays if 'temperature' in each.available_channels])
+                      for each in replays if 'temperature' in each.available_channels])
 
 
 def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
@@ -165,43 +183,15 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
     If the gyro hardly turns, noise of the reference passes for motion that the gyro does not
     measure.
     """
-    scale = fit.scale_factor_error
-    return _has_motion(fit) and (scale.value < -_SCALE_FACTOR_LIMITS.max_scale_factor_error
-                                 or scale.deviation > _SCALE_FACTOR_LIMITS.max_scale_deviation)
-
-
-def _has_motion(fit: RegressionFit) -> bool:
-    return fit.estimate_index(-1, 0) is not None
+    scale, limits = fit.scale_factor_error, RunLimits()
+    return fit.estimate_index(-1, 0) is not None and (
+        scale.value < -limits.max_scale_factor_error
+        or scale.deviation > limits.max_scale_deviation)
 
 
 # values
 
-def _terms_with_covariance(fit: RegressionFit, bias_deviation: float) -> tuple[list[Term], Array]:
-    """Return the fitted terms, and the covariance of all their values, 0 for exact ones."""
-    implausible = is_scale_implausible(fit)
-    scale = 0.0 if implausible else fit.scale_factor_error.value
-    # the mean bias of the logs given that scale factor error
-    rates = [each.channels.rate[each.valid].mean() for each in fit.distorted]
-    bias = np.mean(fit.biases) + (fit.scale_factor_error.value - scale) * np.mean(rates)
-    terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
-    ranks: list[int | None] = [None, None if implausible else fit.estimate_index(-1, 0)]
-    for place, known in enumerate(fit.causes):
-        if known.cause in CATALOGUE and fit.is_included(place):
-            terms.append(_term_of_cause(fit, place))
-            shapes = len(known.shapes)
-            ranks += [
-                fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
-                for number in range(len(terms[-1].values))]
-    fitted = [number for number, rank in enumerate(ranks) if rank is not None]
-    chosen = [rank for rank in ranks if rank is not None]
-    term_covariance = np.zeros((len(ranks), len(ranks)))
-    term_covariance[np.ix_(fitted, fitted)] = fit.covariance[np.ix_(chosen, chosen)]
-    term_covariance[0, 0] = bias_deviation ** 2
-    return terms, term_covariance
-
-
 def _term_of_cause(fit: RegressionFit, cause_index: int) -> Term:
-    """Return a cause of the gyro as a term."""
     candidate = fit.causes[cause_index]
     effect = CATALOGUE[candidate.cause]
     coefficients = ([one.value for one in fit.coefficients(cause_index)]
@@ -219,46 +209,30 @@ def _merge_terms(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ..
 
 def _merge_term(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
     """Return terms with one more, merged with that of its effect; None if not possible."""
-    old = next((term for term in terms if term.effect.name == new.effect.name), None)
+    effect, values, others = new.effect, new.values, []
+    old = next((term for term in terms if term.effect.name == effect.name), None)
     if old is None:
         return (*terms, new)
-    aligned, *others = _align_reference(old, new)
-    one = _combine_terms(old, aligned)
-    return (None if one is None
-            else _merge_terms(tuple(one if term is old else term for term in terms), others))
-
-
-def _align_reference(old: Term, new: Term) -> list[Term]:
-    """Return a term with the reference value of another, and the terms that compensate this."""
-    if new.effect.name not in _COMPENSATING_EFFECTS or new.values[0] == old.values[0]:
-        return [new]
-    begin, value = old.values[0], new.values[1]
-    offset, compensating_effect = begin - new.values[0], _COMPENSATING_EFFECTS[new.effect.name]
-    aligned = Term(new.effect, (begin, value))
-    if new.effect is BIAS_TEMPERATURE_QUADRATIC:
-        return [aligned, Term(compensating_effect, (begin, 2.0 * offset * value)),
-                Term(BIAS, (offset ** 2 * value, ))]
-    return [aligned, Term(compensating_effect, (offset * value,))]
-
-
-def _combine_terms(old: Term, new: Term) -> Term | None:
-    """Return the term that is equivalent to two terms of one effect; None without one."""
-    effect, shapes = new.effect, len(new.effect.nonlinear_parameters)
-    if effect.stage == 'output':
-        # Logs are compared without limits and quantization of the model.
-        return new
-    # Delays add up, and so do clock rate errors, to first order.
-    first = 0 if effect.correct_stamps is not None else shapes
-    if new.values[:first] != old.values[:first] or (first and not effect.coefficients) or any(
-            each.default is not None for each in effect.coefficients):
-        return None
-    combined = Term(effect, (*new.values[:first],
-                             *(a + b for a, b in zip(old.values[first:], new.values[first:]))))
-    return combined if _is_within_bounds(combined) else None
+    if effect.name in _COMPENSATING_EFFECTS and values[0] != old.values[0]:
+        # with the reference value of the old term, and terms that compensate this
+        begin, value, other = old.values[0], values[1], _COMPENSATING_EFFECTS[effect.name]
+        offset, values = begin - values[0], (begin, value)
+        others = ([Term(other, (begin, 2.0 * offset * value)), Term(BIAS, (offset ** 2 * value,))]
+                  if effect is BIAS_TEMPERATURE_QUADRATIC else [Term(other, (offset * value,))])
+    one = new  # Logs are compared without limits and quantization of the model.
+    if effect.stage != 'output':
+        # Delays add up, and so do clock rate errors, to first order.
+        first = 0 if effect.correct_stamps is not None else len(effect.nonlinear_parameters)
+        one = Term(effect, (*values[:first], *(
+            a + b for a, b in zip(old.values[first:], values[first:]))))
+        if values[:first] != old.values[:first] or (first and not effect.coefficients) or any(
+                each.default is not None
+                for each in effect.coefficients) or not _is_within_bounds(one):
+            return None
+    return _merge_terms(tuple(one if term is old else term for term in terms), others)
 
 
 def _is_within_bounds(term: Term) -> bool:
-    """Tell whether the values of a term are within the bounds of its effect."""
     return all(parameter.bounds[0] <= value <= parameter.bounds[1]
                for parameter, value in zip(term.effect.parameters, term.values))
 
@@ -274,30 +248,25 @@ def _extended_covariance(model: GyroModel, new: Sequence[Term],
     """
     if model.terms and model.covariance is None:
         return None
-    values = _fitted_values(_merge_terms(model.terms, new))
-    deviations = np.sqrt(np.diag(term_covariance))
-    changes = np.zeros((len(values), len(term_covariance)))
-    for place in np.flatnonzero(deviations).tolist():
-        changes[:, place] = (_fitted_values(
-            _merge_terms(model.terms, list(_perturb_value(new, place, deviations[place]))))
-                             - values) / deviations[place]
-    covariance = changes @ term_covariance @ changes.T
+
+    def fitted_values(terms: Sequence[Term]) -> Array:
+        return np.array([term.values[place] for term in _merge_terms(model.terms, terms)
+                         for place in term.fitted_indices])
+
+    values, deviations = fitted_values(new), np.sqrt(np.diag(term_covariance)).tolist()
+    slopes = np.zeros((len(values), len(deviations)))
+    owners = [(number, place) for number, term in enumerate(new)
+              for place in range(len(term.values))]
+    for column, (step, (number, place)) in enumerate(zip(deviations, owners)):
+        if step:
+            own = list(new[number].values)
+            own[place] += step
+            moved = [*new[:number], replace(new[number], values=tuple(own)), *new[number + 1:]]
+            slopes[:, column] = (fitted_values(moved) - values) / step
+    covariance = slopes @ term_covariance @ slopes.T
     if model.covariance is not None:
         covariance[:len(model.covariance), :len(model.covariance)] += model.covariance
     return covariance
-
-
-def _fitted_values(terms: Sequence[Term]) -> Array:
-    return np.array([term.values[place] for term in terms for place in term.fitted_indices])
-
-
-def _perturb_value(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
-    """Give terms of which one value, by its index among all values, is changed."""
-    for term in terms:
-        here = 0 <= place < len(term.values)
-        yield replace(term, values=(*term.values[:place], term.values[place] + change,
-                                    *term.values[place + 1:])) if here else term
-        place -= len(term.values)
 
 
 def widen_range(known: tuple[float, float], parts: Sequence[Array],
@@ -320,7 +289,12 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     """
     replays = search.problem.replays
     length = min(HEADING_WINDOW, max(each.duration for each in replays) / 6.0)
-    blocks = [_held_out_blocks(each, length) for each in replays]
+    blocks = []
+    for each in replays:  # the number of the held-out block of each sample, -1 without one
+        since = (each.channels.time - each.channels.time[0]) / length
+        number = since.astype(int)
+        held_out = each.valid & (number % 3 == 1) & (number < int(since[-1] + 1e-9))
+        blocks.append(np.where(held_out, number, -1))
     if (not any((block >= 0).any() for block in blocks)
             or any(np.count_nonzero(each.valid & (block < 0)) < 20
                    for each, block in zip(replays, blocks))):
@@ -336,7 +310,13 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
     counts: list[tuple[int, int]] = []
     for run, (each, block) in enumerate(zip(replays, blocks)):
-        left = {name: _rate_residuals(each, run, found) for name, found in models.items()}
+        added = {name: 0.0 if found is None else
+                 found.total_contribution(each, run) + found.biases[run]
+                 for name, found in models.items()}
+        # against the smooth and the measured reference
+        left = {name: (each.channels.output - each.channels.rate - some,
+                       each.channels.output - each.reference - some)
+                for name, some in added.items()}
         for part in (block == place for place in np.unique(block[block >= 0])):
             counts.append((int(np.count_nonzero(part)), 1))
             for name, (of_rate, increments) in left.items():
@@ -370,29 +350,12 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
                  for name, each in squares.items() if name != 'straight'})
 
 
-def _held_out_blocks(replay: Replay, block_duration: float) -> NDArray[np.intp]:
-    """Return the number of the held-out block of each sample, -1 without one, shape (n,)."""
-    since = (replay.channels.time - replay.channels.time[0]) / block_duration
-    number = since.astype(int)
-    held_out = replay.valid & (number % 3 == 1) & (number < int(since[-1] + 1e-9))
-    return np.where(held_out, number, -1)
-
-
 def drop_samples(replay: Replay, dropped: Mask) -> Replay:
     """Return a log with fewer samples that are used."""
     left = (replay.valid & ~dropped)[replay.valid]
     place = replay.grid_index[left]
     return replace(replay, valid=replay.valid & ~dropped, grid_index=place - place[0],
                    fill_noise=replay.fill_noise[place[0]:place[-1] + 1])
-
-
-def _rate_residuals(replay: Replay, log_index: int,
-                    fit: RegressionFit | None) -> tuple[Array, Array]:
-    """Return the residuals of a log against smooth and measured reference, after a fit if any."""
-    added = (0.0 if fit is None
-             else fit.total_contribution(replay, log_index) + fit.biases[log_index])
-    return (replay.channels.output - replay.channels.rate - added,
-            replay.channels.output - replay.reference - added)
 
 
 def window_changes(changes: Array, time: Array, window: float) -> Array:

@@ -45,7 +45,7 @@ DETECTION_POWER = 0.95
 RULED_OUT_DEFICIT = 3.2
 
 
-class Record:
+class _Record:
     """A dataclass that is data for a file; `KEYS` are its fields with another key, or none."""
 
     KEYS: ClassVar[Mapping[str, str | None]] = {}
@@ -61,7 +61,7 @@ class Record:
 
 
 def _to_data(value: Any) -> Any:
-    if isinstance(value, Record):
+    if isinstance(value, _Record):
         return value.to_dict()
     if isinstance(value, Noise):
         return asdict(value)
@@ -71,7 +71,7 @@ def _to_data(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Estimate(Record):
+class Estimate(_Record):
     """A value with its 95 % interval, in SI."""
 
     KEYS = {'interval': 'ci95'}
@@ -104,7 +104,7 @@ def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Gate(Record):
+class Gate(_Record):
     """A check before causes are named."""
 
     KEYS = {'evidence': 'said', 'factor': None}
@@ -118,7 +118,7 @@ class Gate(Record):
 
 
 @dataclass(frozen=True)
-class Finding(Record):
+class Finding(_Record):
     """One cause."""
 
     KEYS = {'along': None}
@@ -144,7 +144,7 @@ class Finding(Record):
 
 
 @dataclass(frozen=True)
-class Unexplained(Record):
+class Unexplained(_Record):
     """Structure without a name: variable, share of the residual's variance, and p-value."""
 
     along: str
@@ -153,12 +153,11 @@ class Unexplained(Record):
 
 
 @dataclass(frozen=True)
-class Change(Record):
+class Change(_Record):
     """A root mean square error before and after the extension."""
 
     KEYS = {'interval': 'ci95'}
 
-    # before, after: the errors
     before: float
     after: float
     # 95 % interval of before less after; None if a single part was held out
@@ -171,7 +170,7 @@ class Change(Record):
 
 
 @dataclass(frozen=True)
-class Gain(Record):
+class Gain(_Record):
     """Reduction of errors by the extended model on parts held out of selection and fit."""
 
     held_out: str  # description of the parts
@@ -249,7 +248,7 @@ class NoiseCurve:
 
 
 @dataclass(frozen=True)
-class Reference(Record):
+class Reference(_Record):
     """The reference of a log."""
 
     KEYS = {'evidence': 'known'}
@@ -261,7 +260,7 @@ class Reference(Record):
 
 
 @dataclass(frozen=True)
-class Diagnosis(Record):
+class Diagnosis(_Record):
     """The results of a diagnosis."""
 
     KEYS = {'simulated': 'simulated_noise', **dict.fromkeys(

@@ -22,7 +22,7 @@ errors exceed those of the gyro, decide how a log is diagnosed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -74,19 +74,17 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     """
     matches = []
     for name, value in UNIT_FACTORS.items():
-        # far from 1 a confusion is the only explanation
         least, known = ((_MAX_FACTOR_ERROR, _MAX_DEVIATION) if is_implausible_factor(value)
                         else (1e-4, _MAX_DEVIATION_NEAR_ONE))
         if (abs(factor - value) < max(2.0 * deviation, least * abs(value))
                 and abs(factor / value - 1.0) < _MAX_FACTOR_ERROR
                 and deviation < known * min(abs(value - 1.0), abs(value))):
             matches.append(name)
-    if matches:
-        return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]))
-    distant_matches = [name for name, value in _COMMON_FACTORS.items()
-                       if _factor_ratio(factor, value) < UNIT_TOLERANCE]
-    return (distant_matches[0] if distant_matches and deviation < _MAX_DEVIATION * abs(factor)
-            else None)
+    distant = [name for name, value in _COMMON_FACTORS.items()
+               if _factor_ratio(factor, value) < UNIT_TOLERANCE
+               and deviation < _MAX_DEVIATION * abs(factor)]
+    return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]),
+               default=next(iter(distant), None))
 
 
 def is_implausible_factor(factor: float) -> bool:
@@ -99,56 +97,19 @@ def _factor_ratio(factor: float, value: float) -> float:
     return math.inf if factor * value <= 0.0 else max(factor / value, value / factor)
 
 
-def identify_sample_offset(estimate: float, deviation: float, interval: float) -> str | None:
-    """
-    Return 'one sample' or 'half a sample' if a time offset is either within 2 sigma; or None.
-
-    Parameters
-    ----------
-    estimate, deviation : of the offset, s
-    interval : of the samples, s
-
-    """
-    if deviation > _MAX_DEVIATION * interval:
-        return None
-    for name, part in (('one sample', 1.0), ('half a sample', 0.5)):
-        if abs(abs(estimate) - part * interval) < max(2.0 * deviation, 1e-3 * interval):
-            return name
-    return None
+def is_sample_offset(estimate: float, deviation: float, interval: float) -> bool:
+    """Tell whether a time offset is a sample interval or half of it within 2 sigma; all in s."""
+    return deviation <= _MAX_DEVIATION * interval and any(
+        abs(abs(estimate) - offset) < max(2.0 * deviation, 1e-3 * interval)
+        for offset in (interval, 0.5 * interval))
 
 
-#: Length of the parabolas by which a heading is differentiated, s; shorter ones would show its
-#: quantization.
-_SMOOTHING_DURATION = 0.15
-
-
-class LineFit(NamedTuple):
+class _LineFit(NamedTuple):
     """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
 
     factor: float
     offset: float
     deviation: float
-
-
-@dataclass(frozen=True)
-class OutputComparison:
-    """Output and expectation, in rad/s, shape (n,)."""
-
-    output: Array  # without nan; gaps are interpolated
-    expected: Array | None  # from the reference, nan in its gaps; None without a reference
-    noise_deviation: float  # standard deviation of the white noise of a sample
-    deviation: float  # standard deviation of a sample from the expected output, at least that
-
-
-def compare_output(output: Array, expected: Array | None) -> OutputComparison:
-    """Compare an output with the expected one."""
-    whole, noise = bridge_gaps(output), white_noise_deviation(output)
-    if expected is None:
-        return OutputComparison(whole, None, noise, noise)
-    difference = (output - expected)[np.isfinite(output) & np.isfinite(expected)]
-    noise = min(noise, white_noise_deviation(output - expected))
-    scatter = robust_deviation(difference) if len(difference) else math.inf
-    return OutputComparison(whole, expected, noise, max(noise, scatter))
 
 
 def reference_rate(log: Log) -> Array | None:
@@ -159,9 +120,9 @@ def reference_rate(log: Log) -> Array | None:
             or np.isfinite(log.reference_heading).sum() < 2):
         return None
     known = np.isfinite(log.reference_heading)
-    length = min(
-        max(5, 2 * round(0.5 * _SMOOTHING_DURATION / float(np.median(np.diff(log.time)))) + 1),
-        (len(known) - 1) // 2 * 2 + 1)
+    # parabolas over 0.15 s; shorter ones would show the quantization of the heading
+    length = min(max(5, 2 * round(0.075 / float(np.median(np.diff(log.time)))) + 1),
+                 (len(known) - 1) // 2 * 2 + 1)
     if length < 3:
         return None
     smooth = savgol_filter(bridge_gaps(log.reference_heading), length, 2)
@@ -179,7 +140,7 @@ def heading_spline(time: Array, heading: Array) -> Callable[[Array, int], Array]
     return make_interp_spline(time, heading, 5)
 
 
-def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:
+def fit_line(time: Array | None, rate: Array, output: Array) -> _LineFit | None:
     """Return the line of the output over the rate by block means, or None without motion."""
     known = np.isfinite(rate) & np.isfinite(output)
     if np.count_nonzero(known) < 8 or not np.ptp(rate[known]) > 0.0:
@@ -193,31 +154,18 @@ def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:
             rate, output = (np.bincount(block, each) / np.bincount(block) for each in whole)
             if np.std(rate) > 0.8 * np.std(whole[0]):
                 break
-    return _fit_robust_line(rate, output) if len(rate) >= 8 else None
-
-
-def model_scale_factor(model: GyroModel, rate: Array) -> float:
-    """Return the slope of a model's output between the 90 % quantiles of the speed, both ways."""
-    speeds = np.abs(rate[np.isfinite(rate)])
-    speed = float(np.quantile(speeds, 0.9)) if speeds.size else 0.0
-    if speed == 0.0:
-        return 1.0
-    forth, back = (float(model.output(sign * speed, model.reference_temperature))
-                   for sign in (1.0, -1.0))
-    return (forth - back) / (2.0 * speed)
-
-
-def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
+        if len(rate) < 8:
+            return None
     low, high = output.min(), output.max()
     # without the ends, which may be clipped, unless most samples are there
     ends = 0.05 * (high - low)
     inliers = (output > low + ends) & (output < high - ends)
     if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.3 * np.ptp(rate):
         inliers = np.ones(len(rate), dtype=bool)
+    columns = np.column_stack([rate, np.ones(len(rate))])
     for _ in range(4):
         if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.0:
             return None
-        columns = np.column_stack([rate, np.ones(len(rate))])
         solution = np.linalg.lstsq(columns[inliers], output[inliers], rcond=None)[0]
         residual = output - columns @ solution
         inliers = np.abs(residual) <= 5.0 * robust_deviation(residual) + 1e-15
@@ -229,9 +177,19 @@ def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
     inverse = np.linalg.pinv(columns.T @ columns)
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)
     # of an exact line it is below 0 by rounding
-    variance = (inverse @ scores @ scores.T @ inverse)[0, 0]
-    deviation = student * math.sqrt(max(variance, 0.0))
-    return LineFit(float(solution[0]), float(solution[1]), float(deviation))
+    variance = max((inverse @ scores @ scores.T @ inverse)[0, 0], 0.0)
+    return _LineFit(float(solution[0]), float(solution[1]), float(student * math.sqrt(variance)))
+
+
+def model_scale_factor(model: GyroModel, rate: Array) -> float:
+    """Return the slope of a model's output between the 90 % quantiles of the speed, both ways."""
+    speeds = np.abs(rate[np.isfinite(rate)])
+    speed = float(np.quantile(speeds, 0.9)) if speeds.size else 0.0
+    if speed == 0.0:
+        return 1.0
+    forth, back = (float(model.output(sign * speed, model.reference_temperature))
+                   for sign in (1.0, -1.0))
+    return (forth - back) / (2.0 * speed)
 
 
 # logs that are refused
@@ -258,12 +216,56 @@ def refuse_unusable(log: Log, model: GyroModel | None = None) -> None:
     DataRefused : with the reason and the remedy
 
     """
-    require_output(log)
+    output = require_output(log)
     log, _ = select_reference(log)
     if log.reference_rate is None:
         refuse_wrapped(log)
-    for problem in _log_problems(log):
-        raise DataRefused(problem)
+    known, reference = np.isfinite(output), _used_reference(log)
+    has_reference = (np.zeros(len(known), dtype=bool) if reference is None
+                     else np.isfinite(reference))
+    both = int(np.count_nonzero(known & has_reference))
+    if log.time is None:
+        if both < _MIN_TABLE_ROWS:
+            raise DataRefused(
+                f'the log has no time_s, and {both} rows with output and reference_rate_dps; '
+                f'as a rate table it needs at least {_MIN_TABLE_ROWS}, and as samples in time '
+                'it needs time_s: add rows, or give --rate')
+        if both > _MAX_TABLE_ROWS:
+            raise DataRefused(
+                f'the log has no time_s, and {both} rows, where a rate table has at most '
+                f'{_MAX_TABLE_ROWS}: add time_s, or give the sample rate with --rate')
+    else:
+        count, duration = int(np.count_nonzero(known)), log.time[-1] - log.time[0]
+        if count < max(MIN_SAMPLES, MIN_VALID_SHARE * len(known)):
+            raise DataRefused(
+                f'the gyro has a value in {count} of {len(known)} samples; at least '
+                f'{MIN_SAMPLES} and a tenth are needed: record again, and repair the line if '
+                'it loses samples')
+        if duration < _MIN_DURATION:
+            raise DataRefused(f'the log lasts {duration:.4g} s; a diagnosis needs at least '
+                              f'{_MIN_DURATION:g} s: record longer')
+        if duration > _MAX_DURATION:
+            raise DataRefused(f'the log lasts {duration:.3g} s by its stamps; check that time_s '
+                              'is in s, or give --rate')
+        if reference is None and not is_at_rest(log):
+            raise DataRefused(
+                'the log has no reference, and the gyro is not at rest: add reference_rate_dps '
+                'or reference_heading_deg, or let it rest, and add a column moving of zeros')
+        covered = np.count_nonzero(known & ~find_lost_reference(has_reference))
+        is_lost = bool(covered < MIN_VALID_SHARE * len(known))
+        if reference is not None and (both < MIN_SAMPLES or is_lost):
+            raise DataRefused(
+                f'the reference has a value in {both} of {len(known)} samples; at least '
+                f'{MIN_SAMPLES}{", and a tenth or at even intervals," * is_lost} are needed: '
+                f'{few_values_remedy(log.time, known & has_reference, MIN_SAMPLES)}')
+    values, counts = np.unique(output[known], return_counts=True)
+    share = counts.max() / counts.sum()
+    if share > 0.99:
+        raise DataRefused(
+            f'the gyro gives {values[counts.argmax()] / DEGREE:.6g} deg/s in '
+            f'{100.0 * share:.4g} % of the samples: it is dead, or its quantization step '
+            'exceeds all rates of the log; check it, and record again')
+    _refuse_copy(log, output)
     if model is not None and (problem := _unit_problem(log, model)):
         raise DataRefused(problem)
 
@@ -306,20 +308,19 @@ def resample_reference(log: Log) -> Log:
 def is_at_rest(log: Log) -> bool:
     """Tell whether a gyro is at rest in the whole log: by reference, moving flag, or output."""
     rate = reference_rate(log)
-    if rate is not None:
-        return not np.nanmax(np.abs(rate)) > 0.0 or _is_reference_noise(log, rate)
-    if log.moving is not None:
-        return bool((log.moving == 0.0).all())
-    if log.time is None or log.output is None or np.isfinite(log.output).sum() < MIN_SAMPLES:
-        return False
-    second = np.floor(log.time - log.time[0]).astype(np.int64)
-    second = np.unique(second, return_inverse=True)[1]
-    means = np.bincount(second, bridge_gaps(log.output)) / np.bincount(second)
-    return float(np.abs(means - np.median(means)).max()) < _REST_RATE_SPREAD
-
-
-def _is_reference_noise(log: Log, rate: Array) -> bool:
-    """Tell whether a reference rate is noise at rest: no rotation, and no output follows it."""
+    if rate is None:
+        if log.moving is not None:
+            return bool((log.moving == 0.0).all())
+        if log.time is None or log.output is None or np.isfinite(log.output).sum() < MIN_SAMPLES:
+            return False
+        second = np.floor(log.time - log.time[0]).astype(np.int64)
+        second = np.unique(second, return_inverse=True)[1]
+        means = np.bincount(second, bridge_gaps(log.output)) / np.bincount(second)
+        return float(np.abs(means - np.median(means)).max()) < _REST_RATE_SPREAD
+    fastest = np.nanmax(np.abs(rate))
+    if not fastest > 0.0:
+        return True
+    # a rate that is noise: no rotation, and no output follows it
     if log.time is None or log.output is None or log.moving is not None and log.moving.any():
         return False
     steps, whole = np.diff(log.time), bridge_gaps(rate)
@@ -327,58 +328,17 @@ def _is_reference_noise(log: Log, rate: Array) -> bool:
     if np.ptp(np.cumsum(whole[1:] * steps)) > 1.0 * DEGREE + 4.0 * noise:
         return False
     # Scaled, as a very small rate would be numerically zero next to the constant of the line.
-    line = fit_line(log.time, rate / np.nanmax(np.abs(rate)), log.output)
+    line = fit_line(log.time, rate / fastest, log.output)
     return line is None or abs(line.factor) < 4.0 * line.deviation
 
 
-def _log_problems(log: Log) -> Iterator[str]:
-    """Give what keeps a log, with the reference that is used, from being diagnosed."""
-    assert log.output is not None
-    known = np.isfinite(log.output)
-    reference = log.reference_heading if log.reference_rate is None else log.reference_rate
-    has_reference = (np.zeros(len(known), dtype=bool) if reference is None
-                     else np.isfinite(reference))
-    both = int(np.count_nonzero(known & has_reference))
-    if log.time is None:
-        if both < _MIN_TABLE_ROWS:
-            yield (f'the log has no time_s, and {both} rows with output and reference_rate_dps; '
-                   f'as a rate table it needs at least {_MIN_TABLE_ROWS}, and as samples in time '
-                   'it needs time_s: add rows, or give --rate')
-        if both > _MAX_TABLE_ROWS:
-            yield (f'the log has no time_s, and {both} rows, where a rate table has at most '
-                   f'{_MAX_TABLE_ROWS}: add time_s, or give the sample rate with --rate')
-    else:
-        count, duration = int(np.count_nonzero(known)), log.time[-1] - log.time[0]
-        if count < max(MIN_SAMPLES, MIN_VALID_SHARE * len(known)):
-            yield (f'the gyro has a value in {count} of {len(known)} samples; at least '
-                   f'{MIN_SAMPLES} and a tenth are needed: record again, and repair the line if '
-                   'it loses samples')
-        if duration < _MIN_DURATION:
-            yield (f'the log lasts {duration:.4g} s; a diagnosis needs at least '
-                   f'{_MIN_DURATION:g} s: record longer')
-        if duration > _MAX_DURATION:
-            yield (f'the log lasts {duration:.3g} s by its stamps; check that time_s is in s, or '
-                   'give --rate')
-        if reference is None and not is_at_rest(log):
-            yield ('the log has no reference, and the gyro is not at rest: add reference_rate_dps '
-                   'or reference_heading_deg, or let it rest, and add a column moving of zeros')
-        covered = np.count_nonzero(known & ~find_lost_reference(has_reference))
-        is_lost = bool(covered < MIN_VALID_SHARE * len(known))
-        if reference is not None and (both < MIN_SAMPLES or is_lost):
-            yield (f'the reference has a value in {both} of {len(known)} samples; at least '
-                   f'{MIN_SAMPLES}{", and a tenth or at even intervals," * is_lost} are needed: '
-                   f'{few_values_remedy(log.time, known & has_reference, MIN_SAMPLES)}')
-    values, counts = np.unique(log.output[known], return_counts=True)
-    share = counts.max() / counts.sum()
-    if share > 0.99:
-        yield (f'the gyro gives {values[counts.argmax()] / DEGREE:.6g} deg/s in '
-               f'{100.0 * share:.4g} % of the samples: it is dead, or its quantization step '
-               'exceeds all rates of the log; check it, and record again')
-    yield from _copy_problems(log, log.output)
+def _used_reference(log: Log) -> Array | None:
+    """Return the rate or the heading of the reference that is used; None without one."""
+    return log.reference_heading if log.reference_rate is None else log.reference_rate
 
 
-def _copy_problems(log: Log, output: Array) -> Iterator[str]:
-    """Give a reference computed from the output, or an output computed from the reference."""
+def _refuse_copy(log: Log, output: Array) -> None:
+    """Refuse a reference computed from the output, or an output computed from the reference."""
     rates = [] if log.reference_rate is None else [log.reference_rate]
     if log.reference_heading is not None and log.time is not None:
         steps = np.diff(log.reference_heading) / np.diff(log.time)
@@ -395,9 +355,10 @@ def _copy_problems(log: Log, output: Array) -> Iterator[str]:
         printed = math.hypot(find_codes(output[known]).step,
                              slope * find_codes(rate[known]).step) / spread
         if off < 1e-6 or off < 0.5 * printed < 1e-5:
-            yield (f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} '
-                   'deg/s, to the last digit: one was computed from the other, without noise; '
-                   'give an independent reference, or a simulation with noise')
+            raise DataRefused(
+                f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} '
+                'deg/s, to the last digit: one was computed from the other, without noise; '
+                'give an independent reference, or a simulation with noise')
 
 
 def _unit_problem(log: Log, model: GyroModel) -> str:
@@ -449,7 +410,7 @@ _MAX_LAG_SPANS, _LAG_STEP, _LAG_RATIO, _SENSE_SIGMAS = 25, 0.25, 1.5, 5.0
 _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 
 
-class Agreement(NamedTuple):
+class _Agreement(NamedTuple):
     """Agreement of the heading of the reference with the integral of the output over spans."""
 
     # factor, deviation: change of the reference over that of the integral; its standard deviation
@@ -459,12 +420,7 @@ class Agreement(NamedTuple):
     residual: float  # standard deviation, rad
     noise_share: float  # largest share of the variance of the integral that may be white noise
     lag: float = 0.0  # of the reference behind the integral, s
-    lag_step: float = 0.0  # of the trial lags, s
-
-    def is_followed(self) -> bool:
-        """Tell whether the reference may have made half the turns of the gyro, at least."""
-        highest = self.factor + NORMAL_QUANTILE_975 * self.deviation
-        return highest > 0.5 * (1.0 - self.noise_share)
+    span: float = 0.0  # shortest one, s
 
 
 def check_gates(log: Log, model: GyroModel | None = None, is_command: bool = False
@@ -476,67 +432,47 @@ def check_gates(log: Log, model: GyroModel | None = None, is_command: bool = Fal
     """
     log, _ = choose_reference(log, prefer_rate=True)
     results = [] if log.output is None else list(_run_gates(log, model))
-    failed = next((place for place, gate in enumerate(results) if gate.passed is False), None)
-    if failed is None:
+    first = next((place for place, gate in enumerate(results) if gate.passed is False), None)
+    if first is None:
         return tuple(results)
-    late = (_late_motion_gate(log, results[failed], is_command)
-            if log.time is not None and log.reference_rate is not None else results[failed])
-    return (*results[:failed], late)
-
-
-def _late_motion_gate(log: Log, failed: Gate, is_command: bool) -> Gate:
-    """
-    Return the gate of a motion that follows a rate late, or the one that failed if it does not.
-
-    Later than a gyro, and not in the ratio of two units at all frequencies, as a robot follows its
-    command; it turns opposite to a swing half a period later.
-    """
-    assert log.time is not None and log.output is not None
+    failed, results = results[first], results[:first]
+    if log.time is None or log.output is None or log.reference_rate is None:
+        return (*results, failed)
+    # A motion may follow a rate late: later than a gyro, and not in the ratio of two units at all
+    # frequencies, as a robot follows its command; it turns opposite to a swing half a period later
     reference = reference_angle(log)
-    by_length = compare_headings(log, reference)
-    if not by_length:
-        return failed
-    best = max(by_length, key=lambda each: each.coherence)
-    if abs(best.lag) <= max(MAX_GYRO_LAG, best.lag_step):
-        return failed
-    gain, deviation, coherence = _response_gain(
-        log.time, integrate(log.time, bridge_gaps(log.output)), reference,
-        best.lag_step / _LAG_STEP)
-    if gain < -_SENSE_SIGMAS * deviation and not is_implausible_factor(-gain):
-        return next(each for each in _unit_gates(gain, deviation, log) if each.passed is False)
-    is_ratio = (failed.name != 'motion' and deviation < _MAX_DEVIATION * abs(gain)
-                and _factor_ratio(gain, 1.0 / best.factor) < UNIT_TOLERANCE)
-    if coherence < _MIN_MOTION_COHERENCE or is_ratio:
-        return failed
-    evidence = (f'{100.0 * coherence:.3g} % of the variance of the heading over spans follows the '
-                'reference, but late, and slow motion in another ratio than fast motion')
-    return (Gate('motion', None, evidence) if is_command
-            else Gate('motion', False, evidence,
-                      'if this is the command of a robot, state --reference-kind rate_command, '
-                      'and turn at several rates for several seconds each, with rests; otherwise '
-                      'give a reference of this motion, with stamps of the same clock'))
-
-
-def _response_gain(time: Array, turned: Array, reference: Array, span: float
-                   ) -> tuple[float, float, float]:
-    """
-    Return the gain of a motion that follows a heading with any response, and how well it does.
-
-    They are the sum of the response at lags from 0 to 25 spans, each with a prior of 0 +- 1; its
-    standard deviation; and the share of the variance of the motion over spans.
-    """
+    best = max(compare_headings(log, reference), key=lambda each: each.coherence, default=None)
+    if best is None or abs(best.lag) <= max(MAX_GYRO_LAG, _LAG_STEP * best.span):
+        return (*results, failed)
+    # The gain is the sum of the response at lags from 0 to 25 spans, each with a prior of 0 +- 1.
+    turned, span = integrate(log.time, bridge_gaps(log.output)), best.span
     lags = span * np.append(0.0, _LAG_RATIO ** np.arange(
         int(math.log(_MAX_LAG_SPANS) / math.log(_LAG_RATIO)) + 1))
-    at = np.arange(time[0] + lags[-1], time[-1], span)
-    moved = np.diff(np.interp(at, time, turned))
-    columns = np.array([*(np.diff(np.interp(at - lag, time, reference)) for lag in lags),
+    at = np.arange(log.time[0] + lags[-1], log.time[-1], span)
+    moved = np.diff(np.interp(at, log.time, turned))
+    columns = np.array([*(np.diff(np.interp(at - lag, log.time, reference)) for lag in lags),
                         np.full(len(moved), span)]).T
     left = moved - columns @ np.linalg.lstsq(columns, moved, rcond=None)[0]
     variance = float(left @ left) / (len(left) - len(lags) - 1)
     inverse = np.linalg.inv(columns.T @ columns + variance * np.diag([*np.ones(len(lags)), 0.0]))
-    gain = inverse[:-1].sum(axis=0)
-    return (float(gain @ (columns.T @ moved)), math.sqrt(variance * float(gain[:-1].sum())),
-            1.0 - float(np.var(left) / max(np.var(moved), np.finfo(float).tiny)))
+    sums = inverse[:-1].sum(axis=0)
+    gain, deviation = float(sums @ (columns.T @ moved)), math.sqrt(variance * sums[:-1].sum())
+    # how well the motion follows
+    coherence = 1.0 - float(np.var(left) / max(np.var(moved), np.finfo(float).tiny))
+    if gain < -_SENSE_SIGMAS * deviation and not is_implausible_factor(-gain):
+        failed = next(each for each in _unit_gates(gain, deviation, log) if each.passed is False)
+    elif coherence >= _MIN_MOTION_COHERENCE and (
+            failed.name == 'motion' or deviation >= _MAX_DEVIATION * abs(gain)
+            or _factor_ratio(gain, 1.0 / best.factor) >= UNIT_TOLERANCE):
+        evidence = (f'{100.0 * coherence:.3g} % of the variance of the heading over spans follows '
+                    'the reference, but late, and slow motion in another ratio than fast motion')
+        failed = (Gate('motion', None, evidence) if is_command
+                  else Gate('motion', False, evidence,
+                            'if this is the command of a robot, state --reference-kind '
+                            'rate_command, and turn at several rates for several seconds each, '
+                            'with rests; otherwise give a reference of this motion, with stamps '
+                            'of the same clock'))
+    return (*results, failed)
 
 
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
@@ -579,7 +515,11 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     scale = best.factor * (own if 0.1 < abs(own) < 10.0 else 1.0)
     relative = best.deviation / abs(best.factor)
     is_certain, unit = best.coherence > _MIN_UNIT_COHERENCE, (1.0 / scale, relative / abs(scale))
-    is_excluded = is_implausible_factor(_nearest_scale(scale, relative, best.coherence))
+    # the scale nearest to 1 that is not excluded; noise of the gyro reduces it
+    half = NORMAL_QUANTILE_975 * relative
+    is_excluded = is_implausible_factor(math.copysign(
+        min(max(1.0, abs(scale) * (1.0 - half)), abs(scale) * (1.0 + half) / best.coherence),
+        scale))
     unit_gates = [*_unit_gates(*unit, log)]
     is_other_axis = (is_excluded and not is_certain and unit_gates[-1].name == 'unit'
                      and identify_unit_factor(*unit) is None)
@@ -590,14 +530,7 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
         yield from unit_gates
 
 
-def _nearest_scale(scale: float, relative_deviation: float, coherence: float) -> float:
-    """Return the scale nearest to 1 that is not excluded; noise of the gyro reduces it."""
-    half = NORMAL_QUANTILE_975 * relative_deviation
-    return math.copysign(min(max(1.0, abs(scale) * (1.0 - half)),
-                             abs(scale) * (1.0 + half) / coherence), scale)
-
-
-def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: float,
+def _motion_gate(best: _Agreement, by_length: Sequence[_Agreement], turned_angle: float,
                  log: Log, other_axis: str = '') -> Gate:
     evidence = (f'{100.0 * best.coherence:.3g} % of the variance of the heading over spans is '
                 f'common to gyro and reference{other_axis}')
@@ -606,9 +539,10 @@ def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: 
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
     elif best.coherence >= _MIN_MOTION_COHERENCE and not other_axis:
         return Gate('motion', True, evidence)
-    # errors of a reference leave the factor as it is
-    if turned_angle < _MIN_TURNED_ANGLE or (longest.residual < _MIN_HEADING_DIFFERENCE
-                                            and all(each.is_followed() for each in by_length)):
+    # errors of a reference leave the factor as it is: it may have made half the turns of the gyro
+    if turned_angle < _MIN_TURNED_ANGLE or longest.residual < _MIN_HEADING_DIFFERENCE and all(
+            each.factor + NORMAL_QUANTILE_975 * each.deviation > 0.5 * (1.0 - each.noise_share)
+            for each in by_length):
         return Gate('motion', best.coherence >= _MIN_MOTION_COHERENCE or None,
                     f'{evidence}; the difference is within the errors of a reference')
     others = [name for name in log.others if 'gyro' in name.lower()]
@@ -667,7 +601,7 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
 def reference_angle(log: Log) -> Array:
     """Return the heading of the reference at each sample, gaps interpolated, rad."""
     assert log.time is not None
-    values = log.reference_heading if log.reference_rate is None else log.reference_rate
+    values = _used_reference(log)
     assert values is not None
     if not np.isfinite(values).any():
         return np.zeros(len(values))
@@ -675,11 +609,14 @@ def reference_angle(log: Log) -> Array:
             else integrate(log.time, bridge_gaps(values)))
 
 
-def compare_headings(log: Log, reference: Array) -> list[Agreement]:
-    """Compare the changes of heading over spans of each length; none if there are too few."""
-    assert log.time is not None and log.output is not None
-    values = log.reference_heading if log.reference_rate is None else log.reference_rate
-    assert values is not None
+def compare_headings(log: Log, reference: Array) -> list[_Agreement]:
+    """
+    Compare the changes of heading over spans of each length; none if there are too few.
+
+    Each is compared at the best lag, up to 25 of the shortest spans.
+    """
+    values = _used_reference(log)
+    assert log.time is not None and log.output is not None and values is not None
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _MIN_SPANS or np.isfinite(log.output).sum() < 2 * _MIN_SPANS:
         return []
@@ -694,31 +631,26 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     if not np.ptp(rates) > 1e-9 * np.abs(rates).max():  # they differ by rounding
         return []
     white = white_noise_deviation(output) ** 2 * float(np.median(np.diff(log.time)))
-    return [_regress_at_best_lag(log.time, turned, at[::together], heading[::together], span,
-                                 white)
-            for together in _SPAN_MULTIPLES if len(at[::together]) > _MIN_SPANS]
-
-
-def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading: Array,
-                         span: float, white: float) -> Agreement:
-    """Return the agreement at the best lag, up to 25 spans; white noise in rad²/s."""
-    change, steps = np.diff(heading), np.diff(point_times)
     # at fractions of a span, of which a delay may be a swing's phase of some degrees: where no lag
     # near zero agrees, one half a period later does, in the opposite sense
-    most = _MAX_LAG_SPANS / _LAG_STEP
+    most, best = _MAX_LAG_SPANS / _LAG_STEP, []
     lags = _LAG_STEP * span * np.arange(-most, most + 1.0)
-    found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change,
-                              white) for lag in lags]
-    least = min(1.0 - each.coherence for each in found)
-    # a periodic motion agrees again a period later
-    near = [place for place, each in enumerate(found)
-            if 1.0 - each.coherence <= 1.5 * least + 0.01]
-    place = min(near, key=lambda place: abs(lags[place]))
-    return found[place]._replace(lag=float(lags[place]), lag_step=_LAG_STEP * span)
+    for together in _SPAN_MULTIPLES:
+        points, change = at[::together], np.diff(heading[::together])
+        if len(points) > _MIN_SPANS:
+            found = [_regress_changes(np.diff(np.interp(points - lag, log.time, turned)),
+                                      np.diff(points), change, white) for lag in lags]
+            highest = max(each.coherence for each in found)
+            # a periodic motion agrees again a period later
+            best.append(min((each._replace(lag=lag, span=span)
+                             for each, lag in zip(found, lags.tolist())
+                             if 1.0 - each.coherence <= 1.5 * (1.0 - highest) + 0.01),
+                            key=lambda each: abs(each.lag)))
+    return best
 
 
-def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> Agreement:
-    """Return the agreement without outlying spans."""
+def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> _Agreement:
+    """Return the agreement without outlying spans; white noise in rad²/s."""
     scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
 
@@ -744,8 +676,8 @@ def _regress_changes(gyro: Array, steps: Array, change: Array, white: float) -> 
         left / max(kept.sum() - 2, 1) / max(variance_of(gyro) / scale ** 2, 1e-300))
     noise_share = (white * float(steps[kept].mean()) / max(variance_of(gyro), 1e-300)
                    * float(stats.chi2.isf(FALSE_ALARM_RATE, kept.sum())) / kept.sum())
-    return Agreement(float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left),
-                     min(noise_share, 1.0))
+    return _Agreement(float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left),
+                      min(noise_share, 1.0))
 
 
 #: Gate that failed -> its meaning, for people.

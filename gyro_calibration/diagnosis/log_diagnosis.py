@@ -39,8 +39,8 @@ from gyro_calibration.diagnosis.findings import (
     OnProgress, probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
     VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.gates import (
-    check_gates, check_model_units, classify_reference, identify_sample_offset, is_at_rest,
-    is_reference_limiting, mismatch_finding, refuse_unusable)
+    check_gates, check_model_units, classify_reference, is_at_rest,
+    is_reference_limiting, is_sample_offset, mismatch_finding, refuse_unusable)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference, FollowedReference, follows_rate, HIDDEN_CAUSES, is_late)
@@ -544,8 +544,8 @@ def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidenc
     confounders = [other for other, _ in others]
     size = next(iter(parameters.values()))
     deviation = size.deviation
-    if name == 'time_offset' and identify_sample_offset(size.estimate, deviation,
-                                                        replays[0].interval):
+    if name == 'time_offset' and is_sample_offset(size.estimate, deviation,
+                                                  replays[0].interval):
         confounders.append('unit_error')
     # the evidence of a size of n standard deviations is n² / 2
     threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)

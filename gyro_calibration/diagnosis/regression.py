@@ -26,7 +26,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 from gyro_calibration.diagnosis.candidates import (
     Candidate, candidate_transforms, fitted_shape_indices, MAX_STEP_TIME_LACK, MAX_STEP_TIMES,
@@ -45,9 +44,9 @@ from scipy.special import logsumexp
 Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
-#: Longest averaging interval of filtered noise, s, and largest ratio of its power in the last to
-#: that in the second quarter of the frequencies; of a smoothed record before causes are fitted
-#: (jumps have 0.18, noise not less).
+#: Longest averaging interval of filtered noise, s, and largest significant ratio of its power in
+#: the last to that in the second quarter of the frequencies; of a smoothed record before causes
+#: are fitted (jumps have 0.18, noise not less).
 _MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
 
 
@@ -515,16 +514,15 @@ def group_columns(problem: RegressionProblem, columns: Array,
     return ColumnGroups(columns, groups, of_width)
 
 
-class _LeftOfColumns(NamedTuple):
-    """What a fit leaves of the groups of columns of one width."""
+def _left_of_columns(fit: RegressionFit,
+                     groups: ColumnGroups) -> Iterator[tuple[Indices, Array, Array]]:
+    """
+    Give what a fit leaves of groups of columns, for each width.
 
-    places: Indices  # of the groups of which it leaves something, shape (n,)
-    products: Array  # of the columns of each group under each noise, shape (g, n, width, width)
-    pull: Array  # products of the columns with the residual, shape (g, n, width)
-
-
-def _left_of_columns(fit: RegressionFit, groups: ColumnGroups) -> Iterator[_LeftOfColumns]:
-    """Give what a fit leaves of groups of columns, for each width."""
+    These are the places of the groups of which it leaves something, shape (n,), the products of
+    the columns of each group under each noise, shape (g, n, width, width), and the products of the
+    columns with the residual, shape (g, n, width).
+    """
     crossing = fit.problem.products(groups.columns, fit.rows)
     crossing, pull = crossing[:, :, :-1], crossing[:, :, -1]
     towards = crossing @ fit.inverse_information
@@ -540,7 +538,7 @@ def _left_of_columns(fit: RegressionFit, groups: ColumnGroups) -> Iterator[_Left
         shown = (of_left > MIN_INDEPENDENT_SHARE * of_whole).all(axis=(0, 2))
         if len(members[0]) > 1:  # columns that depend on each other count as one
             left = left * (1.0 + 1e-10 * np.eye(len(members[0])))
-        yield _LeftOfColumns(places[shown], left[:, shown], pull[:, members[shown]])
+        yield places[shown], left[:, shown], pull[:, members[shown]]
 
 
 def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
@@ -576,11 +574,11 @@ def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
 def _fit_with_column(fit: RegressionFit, column: Array,
                      amplitude: float | None) -> tuple[float, float]:
     """Return the log-likelihood with one more column, shape (1, m), and its coefficient."""
-    left = next(_left_of_columns(fit, group_columns(fit.problem, column / fit.problem.deviation,
-                                                    [[0]])))
-    if not len(left.places):
+    places, products, pulls = next(_left_of_columns(fit, group_columns(
+        fit.problem, column / fit.problem.deviation, [[0]])))
+    if not len(places):
         return fit.log_likelihood, 0.0
-    product, pull = left.products[:, 0, 0, 0], left.pull[:, 0, 0]
+    product, pull = products[:, 0, 0, 0], pulls[:, 0, 0]
     values = pull / product if amplitude is None else np.full_like(pull, amplitude)
     likelihood, log_likelihood = _changed_likelihood(
         fit, amplitude is None, fit.residual_squares + values * (values * product - 2.0 * pull),
@@ -626,48 +624,33 @@ def _changed_likelihood(fit: RegressionFit, added: int, squares: Array,
 
 def _profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
     """Return the standard deviation of a shape by the profile of the likelihood, to 1 %."""
-    candidate = fit.causes[cause_index]
-    rest = fit_causes(fit.problem, fit.causes[:cause_index] + fit.causes[cause_index + 1:])
-    shape = candidate.shapes[shape_index]
-    if candidate.half_width:
-        return _time_deviation(rest, candidate, shape_index)
+    candidate, problem = fit.causes[cause_index], fit.problem
+    rest = fit_causes(problem, fit.causes[:cause_index] + fit.causes[cause_index + 1:])
 
-    def likelihood(by: float) -> float:
-        moved = with_shape(candidate, shape_index, shape + by)
-        return likelihood_with(rest, moved)
+    def moved(by: float) -> Candidate:
+        return with_shape(candidate, shape_index, candidate.shapes[shape_index] + by)
 
-    least = likelihood(0.0) - 0.5 * NORMAL_QUANTILE_975 ** 2
-    first, ends = 1e-3 * shape, []
-    for end in (first, -first):
-        while likelihood(end) >= least and abs(end) < 1e6 * abs(first):
-            end *= 2.0
-        ends.append(abs(bisect(lambda by: likelihood(by) - least, 0.0, end, rtol=0.01)
-                        if likelihood(end) < least else end))
-    return max(ends) / NORMAL_QUANTILE_975
-
-
-def _shifted_evidence(fit: RegressionFit, candidate: Candidate, shape_index: int,
-                      half_range: float) -> tuple[Array, Array]:
-    """Return shifts of a shape in a range, and the evidence of a candidate at each of them."""
-    shifts = np.linspace(-half_range, half_range, 2 * MAX_STEP_TIMES + 1)
-    columns = np.concatenate([candidate_transforms(with_shape(
-        candidate, shape_index, candidate.shapes[shape_index] + by), fit.distorted)
-        for by in shifts.tolist()])
-    return shifts, column_evidence(fit, group_columns(
-        fit.problem, columns / fit.problem.deviation, np.arange(len(shifts))[:, None].tolist()))
-
-
-def _time_deviation(fit: RegressionFit, candidate: Candidate, shape_index: int) -> float:
-    """Return the standard deviation of a time, by all times that are about as likely."""
-    half_range, last = candidate.half_width or 0.0, max(
-        each.duration for each in fit.problem.replays)
-    while True:
-        shifts, evidence = _shifted_evidence(fit, candidate, shape_index, half_range)
+    half_range = candidate.half_width
+    while half_range:  # a time: by all times that are about as likely
+        shifts = np.linspace(-half_range, half_range, 2 * MAX_STEP_TIMES + 1)
+        columns = np.concatenate([candidate_transforms(moved(by), rest.distorted)
+                                  for by in shifts.tolist()]) / problem.deviation
+        evidence = column_evidence(rest, group_columns(
+            problem, columns, np.arange(len(shifts))[:, None].tolist()))
         likely = evidence >= evidence[len(shifts) // 2] - MAX_STEP_TIME_LACK
         largest = float(np.abs(shifts[likely]).max() + shifts[1] - shifts[0])
-        if largest < half_range or half_range > last:
+        if largest < half_range or half_range > max(each.duration for each in problem.replays):
             return largest / NORMAL_QUANTILE_975
         half_range *= 2.0
+    least = likelihood_with(rest, moved(0.0)) - 0.5 * NORMAL_QUANTILE_975 ** 2
+    first, ends = 1e-3 * candidate.shapes[shape_index], []
+    for end in (first, -first):
+        while (excess := likelihood_with(rest, moved(end)) - least) >= 0.0 and (
+                abs(end) < 1e6 * abs(first)):
+            end *= 2.0
+        ends.append(abs(end) if excess >= 0.0 else abs(bisect(
+            lambda by: likelihood_with(rest, moved(by)) - least, 0.0, end, rtol=0.01)))
+    return max(ends) / NORMAL_QUANTILE_975
 
 
 # filtered noise
@@ -682,19 +665,18 @@ def average_filtered_noise(fit: RegressionFit,
     shows in the residual of the causes, as motion that is delayed or filtered would pass for
     noise.
     """
-    while any(is_filtered := [
-            _high_frequency_power_ratio(part) < max_ratio
-            and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME
-            for each, part in zip(fit.problem.replays, fit.residual_transforms())]):
-        fit = fit_causes(build_problem([replace(each, decimation=each.decimation * (1 + more))
-                                        for each, more in zip(fit.problem.replays, is_filtered)]),
-                         fit.causes)
-    return fit
-
-
-def _high_frequency_power_ratio(whitened: Array) -> float:
-    """Return the power in the last quarter of the angle over the second; 1 if insignificant."""
-    _, second, _, last = (float(np.median(part ** 2)) for part in np.array_split(whitened, 4))
-    # 4.5 standard deviations; that of the logarithm of a median of n is 2.33 over root n
-    by_chance = np.exp(-4.5 * 2.33 * np.sqrt(8.0 / len(whitened)))
-    return last / second if last < by_chance * second else 1.0
+    while True:
+        decimations = []
+        for each, whitened in zip(fit.problem.replays, fit.residual_transforms()):
+            _, second, _, last = (float(np.median(part ** 2))
+                                  for part in np.array_split(whitened, 4))
+            # 4.5 standard deviations; that of the logarithm of a median of n is 2.33 over root n
+            by_chance = np.exp(-4.5 * 2.33 * np.sqrt(8.0 / len(whitened)))
+            is_filtered = (last < min(by_chance, max_ratio) * second
+                           and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME)
+            decimations.append(each.decimation * (1 + is_filtered))
+        if decimations == [each.decimation for each in fit.problem.replays]:
+            return fit
+        fit = fit_causes(build_problem([
+            replace(each, decimation=decimation)
+            for each, decimation in zip(fit.problem.replays, decimations)]), fit.causes)

@@ -111,13 +111,39 @@ def main_charts(diagnosis: Diagnosis) -> list[Chart]:
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
-    """Give titles with their content."""
     curves, others = _divide_curves(diagnosis)
-    yield 'Simulation and measurement', _misfit_charts(diagnosis.trace, curves or others)
+    misfit: list[Markup] = []
+    if diagnosis.trace is not None:
+        misfit += [element('p', 'The stretch where they differ most:'),
+                   _side_by_side(map(draw_chart, _trace_charts(diagnosis.trace)))]
+    for place, curve in curves or others:
+        before, after = (format_amount(float(np.abs(each[np.isfinite(each)]).max(initial=0.0)),
+                                       'rad/s') for each in (curve.before, curve.after))
+        unchanged = np.array_equal(curve.before, curve.after, equal_nan=True)
+        misfit += [element('p', f'Along {readable_name(curve.along)}, the error of the simulation '
+                           f'is up to {before}' + ('.' if unchanged else ' before the extension, '
+                                                   f'and up to {after} after it.')),
+                   _side_by_side(map(draw_chart, [*_error_charts(curve, place),
+                                                  _residual_chart(curve, place)]))]
+    yield 'Simulation and measurement', misfit
     yield 'Causes', [element('article', element('h3', f'{place} {cause_title(found)}'),
                              *(element('p', text) for text in cause_paragraphs(found, diagnosis)))
                      for place, found in enumerate(diagnosis.findings, 1)]
-    yield 'Heading' if diagnosis.gain is None else 'Gain on held-out parts', _gain(diagnosis)
+    parts = [] if diagnosis.heading is None else [draw_chart(_heading_chart(diagnosis.heading))]
+    if (gain := diagnosis.gain) is None:
+        yield 'Heading', [_side_by_side(parts)] if parts else []
+    else:
+        rows = []
+        for what, change, unit in gain.rows():
+            won = change.before - change.after
+            rows.append([what, format_amount(change.before, unit),
+                         format_amount(change.after, unit),
+                         format_quantity(Estimate(won, change.interval or (won, won), unit))])
+        yield 'Gain on held-out parts', [
+            element('p', f'Measured on {to_printable(gain.held_out)}, which took no part in the '
+                    'choice or the fit.'),
+            _side_by_side([*parts, _table(
+                ['rms', 'before', 'after', 'reduction, 95 % interval'], rows)])]
     if diagnosis.noise_curve is not None or diagnosis.noise != Noise():
         charts = ([] if diagnosis.noise_curve is None
                   else [draw_chart(_allan_chart(diagnosis.noise_curve))])
@@ -155,38 +181,7 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
     return element('div', table, class_='fold')
 
 
-def _gain(diagnosis: Diagnosis) -> Iterator[Markup]:
-    parts = [] if diagnosis.heading is None else [draw_chart(_heading_chart(diagnosis.heading))]
-    if (gain := diagnosis.gain) is not None:
-        rows = gain.rows()
-        yield element('p', f'Measured on {to_printable(gain.held_out)}, which took no part in the '
-                      'choice or the fit.')
-        reductions = [Estimate(won, change.interval or (won, won), unit)
-                      for _, change, unit in rows for won in [change.before - change.after]]
-        parts.append(_table(['rms', 'before', 'after', 'reduction, 95 % interval'], [
-            [what, format_amount(change.before, unit), format_amount(change.after, unit),
-             format_quantity(reduction)]
-            for (what, change, unit), reduction in zip(rows, reductions)]))
-    if parts:
-        yield _side_by_side(parts)
-
-
 # charts
-
-def _misfit_charts(trace: Trace | None, curves: Sequence[tuple[int, Curve]]) -> Iterator[Markup]:
-    if trace is not None:
-        yield element('p', 'The stretch where they differ most:')
-        yield _side_by_side(map(draw_chart, _trace_charts(trace)))
-    for place, curve in curves:
-        before, after = (format_amount(float(np.abs(each[np.isfinite(each)]).max(initial=0.0)),
-                                       'rad/s') for each in (curve.before, curve.after))
-        unchanged = np.array_equal(curve.before, curve.after, equal_nan=True)
-        yield element('p', f'Along {readable_name(curve.along)}, the error of the simulation is '
-                      f'up to {before}' + ('.' if unchanged else ' before the extension, and up '
-                                           f'to {after} after it.'))
-        yield _side_by_side(map(draw_chart, [*_error_charts(curve, place),
-                                             _residual_chart(curve, place)]))
-
 
 def _trace_charts(trace: Trace) -> Iterator[Chart]:
     time, measured, simulated, extended = _thin_points(
@@ -356,11 +351,11 @@ class Chart:
     x_names: Sequence[str] = ()  # of the horizontal values, if they are numbered from 1 on
 
 
-#: Colour in the light theme, its name in the style of the page, and stroke of a style.
-_STYLES: dict[str, tuple[str, str, Any]] = {
-    'measured': ('#1d2327', 'measured', '-'), 'simulated': ('#59636b', 'simulated', (0, (6, 4))),
-    'before': ('#b4480f', 'before', (0, (8, 2))), 'after': ('#0a6c85', 'after', '-'),
-    'text': ('#59636a', 'quiet', '-'), 'grid': ('#e9e6df', 'grid', '-')}
+#: Style, by its name in the style of the page -> colour in the light theme and stroke.
+_STYLES: dict[str, tuple[str, Any]] = {
+    'measured': ('#1d2327', '-'), 'simulated': ('#59636b', (0, (6, 4))),
+    'before': ('#b4480f', (0, (8, 2))), 'after': ('#0a6c85', '-'),
+    'quiet': ('#59636a', '-'), 'grid': ('#e9e6df', '-')}
 
 
 def draw_chart(chart: Chart) -> Markup:
@@ -369,8 +364,24 @@ def draw_chart(chart: Chart) -> Markup:
         return element('p', f'{chart.title}: there is nothing to draw.', class_='quiet')
     picture = (_draw_svg(chart) if find_spec('matplotlib')
                else element('p', 'matplotlib is not installed: no picture', class_='quiet'))
+    heads = [(chart.x_label, chart.x_unit), *((each.name, chart.y_unit) for each in chart.lines)]
+    rows = []
+    for row, at in enumerate(chart.x.tolist()):
+        cells = [chart.x_names[round(at) - 1] if chart.x_names else format_number(at, 4)]
+        for line in chart.lines:  # a value with the half of its interval
+            is_known = math.isfinite(line.values[row])
+            cells.append(format_number(float(line.values[row])) if is_known else '–')
+            if is_known and line.deviation is not None:
+                half = NORMAL_QUANTILE_975 * float(line.deviation[row])
+                cells[-1] += f' ± {format_number(half, 2)}'
+        rows.append(element('tr', *(element('td', cell) for cell in cells)))
+    titles = (element('th', _with_unit(*head), scope='col') for head in heads)
+    table = element('table', element('caption', f'{chart.title}, {chart.y_label}'),
+                    element('thead', element('tr', *titles)), element('tbody', *rows))
     return element('figure', element('figcaption', chart.title), picture,
-                   element('p', chart.description, class_='quiet'), _value_table(chart))
+                   element('p', chart.description, class_='quiet'),
+                   element('details', element('summary', 'Values'),
+                           element('div', table, class_='scroll', tabindex='0')))
 
 
 def _drawable(chart: Chart) -> list[Mask]:
@@ -391,10 +402,22 @@ def draw_axes(axes: Any, chart: Chart) -> None:
     if chart.is_logarithmic:
         axes.set(xscale='log', yscale='log')
     else:
-        axes.axhline(0.0, color=_STYLES['text'][0], linewidth=0.8)
+        axes.axhline(0.0, color=_STYLES['quiet'][0], linewidth=0.8)
         axes.ticklabel_format(axis='y', useOffset=False)
     for line, shown in zip(chart.lines, _drawable(chart)):
-        _draw_line(axes, line, np.where(shown, chart.x, np.nan))
+        # a line breaks where there is no value
+        (colour, stroke), x = _STYLES[line.style], np.where(shown, chart.x, np.nan)
+        name = _plain(line.name) + ('' if line.deviation is None else ', 95 %')
+        half = (None if line.deviation is None
+                else NORMAL_QUANTILE_975 * np.nan_to_num(line.deviation))
+        if line.draw_dots:
+            axes.errorbar(x, line.values, half, fmt='o', color=colour, markersize=4, elinewidth=1,
+                          label=name)
+            continue
+        axes.plot(x, line.values, color=colour, linestyle=stroke, linewidth=1.5, label=name)
+        if half is not None:
+            axes.fill_between(x, line.values - half, line.values + half, color=colour, alpha=0.18,
+                              linewidth=0)
     if chart.x_names:
         apart = math.ceil(sum(map(len, chart.x_names)) / 30) or 1
         axes.set_xticks(range(1, len(chart.x_names) + 1, apart))
@@ -409,7 +432,7 @@ def _draw_svg(chart: Chart) -> Markup:
     """Return the picture, in the colours of the page."""
     import matplotlib  # not needed without a page, and slow to load
     from matplotlib.figure import Figure
-    text, grid = _STYLES['text'][0], _STYLES['grid'][0]
+    text, grid = _STYLES['quiet'][0], _STYLES['grid'][0]
     style: dict[Any, Any] = {
         'svg.fonttype': 'none', 'svg.hashsalt': chart.name, 'font.size': 11,
         'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'text.color': text,
@@ -425,29 +448,13 @@ def _draw_svg(chart: Chart) -> Markup:
             ('Creator', 'Date', 'Format', 'Type')))
     # of the names, which other charts have too, only markers and clipping paths are used
     svg = re.sub(r' id="(?![mp][0-9a-f]{10}")[^"]+"', '', file.getvalue().partition('<svg ')[2])
-    for colour, name, _ in _STYLES.values():
+    for name, (colour, _) in _STYLES.items():
         svg = svg.replace(colour, f'var(--{name})')
     size = re.search(r'viewBox="[^"]+"', svg)
     assert size is not None
     label = _escaped(f'{chart.title}. {chart.description}')
     return Markup(f'<svg {size[0]} role="img" aria-label="{label}" '
                   f'xmlns:xlink="http://www.w3.org/1999/xlink"{svg[svg.index(">"):].rstrip()}')
-
-
-def _draw_line(axes: Any, line: Line, x: Array) -> None:
-    """Draw a line, which breaks where there is no value, or dots, with their intervals."""
-    colour, _, stroke = _STYLES[line.style]
-    name = _plain(line.name) + ('' if line.deviation is None else ', 95 %')
-    half = (None if line.deviation is None
-            else NORMAL_QUANTILE_975 * np.nan_to_num(line.deviation))
-    if line.draw_dots:
-        axes.errorbar(x, line.values, half, fmt='o', color=colour, markersize=4, elinewidth=1,
-                      label=name)
-        return
-    axes.plot(x, line.values, color=colour, linestyle=stroke, linewidth=1.5, label=name)
-    if half is not None:
-        axes.fill_between(x, line.values - half, line.values + half, color=colour, alpha=0.18,
-                          linewidth=0)
 
 
 def _plain(text: str) -> str:
@@ -457,26 +464,3 @@ def _plain(text: str) -> str:
 
 def _with_unit(name: str, unit: str) -> str:
     return f'{name} [{unit}]' if unit else name
-
-
-def _value_table(chart: Chart) -> Markup:
-    def value(line: Line, row: int) -> str:
-        """Return a value with the half of its interval."""
-        if not math.isfinite(line.values[row]):
-            return '–'
-        text = format_number(float(line.values[row]))
-        if line.deviation is None:
-            return text
-        return f'{text} ± {format_number(NORMAL_QUANTILE_975 * float(line.deviation[row]), 2)}'
-
-    heads = [(chart.x_label, chart.x_unit), *((each.name, chart.y_unit) for each in chart.lines)]
-    titles = (element('th', _with_unit(*head), scope='col') for head in heads)
-    labels = [chart.x_names[round(at) - 1] if chart.x_names else format_number(at, 4)
-              for at in chart.x.tolist()]
-    rows = (element('tr', element('td', label),
-                    *(element('td', value(line, row)) for line in chart.lines))
-            for row, label in enumerate(labels))
-    table = element('table', element('caption', f'{chart.title}, {chart.y_label}'),
-                    element('thead', element('tr', *titles)), element('tbody', *rows))
-    return element('details', element('summary', 'Values'),
-                   element('div', table, class_='scroll', tabindex='0'))

@@ -16,7 +16,7 @@ The curves are along each variable, of the given and of the extended simulation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 import math
@@ -47,10 +47,23 @@ _MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
 Limits: TypeAlias = Mapping[int, tuple[float, float]]
 #: Bins of a curve.
 _CURVE_BINS = 40
+#: Variable, unit, channel that it needs, and values of a log.
+_CURVE_VARIABLES: Sequence[tuple[str, str, str, Callable[[Replay], Array]]] = (
+    ('time', 's', '', lambda each: each.channels.time - each.channels.time[0]),
+    ('rate', 'rad/s', 'rate', lambda each: each.channels.rate),
+    ('rate_change', 'rad/s²', 'rate',
+     lambda each: np.gradient(each.channels.rate, each.channels.time)),
+    ('heading', 'rad', 'rate', lambda each: np.mod(each.channels.heading, 2.0 * np.pi)),
+    ('temperature', 'degC', 'temperature', lambda each: each.channels.temperature),
+    ('temperature_rate', 'K/s', 'temperature',
+     lambda each: (each.channels.temperature - each.lagged('temperature', 10.0)) / 10.0),
+    ('specific_force', 'm/s²', 'specific_force', lambda each: each.channels.specific_force),
+    ('vibration', '(m/s²)²', 'specific_force', lambda each: each.lagged('vibration', 1.0)),
+    ('supply', 'V', 'supply', lambda each: np.asarray(each.channels.supply)))
 
 
 @dataclass(frozen=True)
-class ChangedFigure:
+class _ChangedFigure:
     """A noise figure that differs from that of the model, beside others that do."""
 
     value: float
@@ -141,7 +154,7 @@ def fit_noise_parameters(fit: RegressionFit, is_rounding_modelled: bool = False)
 
 
 def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
-                         is_rounding_modelled: bool) -> dict[str, ChangedFigure]:
+                         is_rounding_modelled: bool) -> dict[str, _ChangedFigure]:
     """
     Find the noise figures that differ from those of a model, one by one, the clearest first.
 
@@ -170,7 +183,7 @@ def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
 
 
 def _changed_figures(bands: BandEnergies, limits: Limits,
-                     level: float) -> dict[str, ChangedFigure]:
+                     level: float) -> dict[str, _ChangedFigure]:
     kinds = [bands]
     for own in bands.markov_variances.T:
         kinds.append(replace(bands, unit_variances=bands.unit_variances.copy()))
@@ -204,10 +217,23 @@ def _changed_figures(bands: BandEnergies, limits: Limits,
             others = (NOISE_NAMES[other] for other in sorted(limits.keys() - changed)
                       if likeliest(changed - {place} | {other})[0] - cost
                       < 2.0 * RULED_OUT_DEFICIT)
-            found[NOISE_NAMES[place]] = ChangedFigure(
+            found[NOISE_NAMES[place]] = _ChangedFigure(
                 float(np.exp(0.5 * figures[place])),
                 _likelihood_interval(kind, place, figures, held(changed)), p_value, tuple(others))
     return found
+
+
+def _likelihood_interval(bands: BandEnergies, place: int, best: Array,
+                         limits: Limits) -> tuple[float, float]:
+    """Return the 95 % interval of a figure by the profile of the likelihood."""
+    def cost(shift: float) -> float:
+        return bands.fit({**limits, place: (best[place] + shift,) * 2}, best)[1]
+
+    most = cost(0.0) + float(chi2.ppf(0.95, 1))
+    low, high = (brentq(lambda by: cost(by) - most, 0.0, end, xtol=1e-3)
+                 if cost(end) > most else unlimited
+                 for end, unlimited in ((-12.0, -np.inf), (12.0, 12.0)))
+    return float(np.exp(0.5 * (best[place] + low))), float(np.exp(0.5 * (best[place] + high)))
 
 
 def _band_energies(fit: RegressionFit) -> BandEnergies:
@@ -247,22 +273,6 @@ def drop_tone_bands(bands: BandEnergies) -> BandEnergies:
     return bands
 
 
-def _likelihood_interval(bands: BandEnergies, place: int, best: Array,
-                         limits: Limits) -> tuple[float, float]:
-    """Return the 95 % interval of a figure by the profile of the likelihood."""
-    def cost(shift: float) -> float:
-        return bands.fit({**limits, place: (best[place] + shift,) * 2}, best)[1]
-
-    least = cost(0.0)
-
-    def excess(shift: float) -> float:
-        return cost(shift) - least - float(chi2.ppf(0.95, 1))
-
-    low, high = ((brentq(excess, 0.0, end, xtol=1e-3) if excess(end) > 0.0 else unlimited)
-                 for end, unlimited in ((-12.0, -np.inf), (12.0, 12.0)))
-    return float(np.exp(0.5 * (best[place] + low))), float(np.exp(0.5 * (best[place] + high)))
-
-
 # curves
 
 def model_residuals(replays: Sequence[Replay]) -> list[Array]:
@@ -277,48 +287,28 @@ def residual_curves(before: Sequence[Array], after: RegressionFit) -> list[Curve
                  for each, error, rest in zip(replays, model_residuals(replays), before)]
     values = [np.concatenate([part[each.valid] for part, each in zip(parts, replays)])
               for parts in (before, after.unbiased_residuals, simulated)]
-    found = [_binned_curve(name, unit, [of(each)[each.valid] for each in replays], values, after)
-             for name, unit, of in _curve_variables(replays)]
-    return [each for each in found if len(each.at) > 1] + [_amplitude_spectrum(before, after)]
-
-
-def _curve_variables(
-        replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[Replay], Array]]]:
-    """Give name, unit, and a function that returns the variable of a log."""
     has = common_channels(replays)
-    yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
-        yield 'rate', 'rad/s', lambda each: each.channels.rate
-        yield ('rate_change',
-               'rad/s²', lambda each: np.gradient(each.channels.rate, each.channels.time))
-        yield 'heading', 'rad', lambda each: np.mod(each.channels.heading, 2.0 * np.pi)
-    if 'temperature' in has:
-        yield 'temperature', 'degC', lambda each: each.channels.temperature
-        yield ('temperature_rate', 'K/s', lambda each: (
-            each.channels.temperature - each.lagged('temperature', 10.0)) / 10.0)
-    if 'specific_force' in has:
-        yield 'specific_force', 'm/s²', lambda each: each.channels.specific_force
-        yield 'vibration', '(m/s²)²', lambda each: each.lagged('vibration', 1.0)
-    if 'supply' in has:
-        yield 'supply', 'V', lambda each: np.asarray(each.channels.supply)
-
-
-def _binned_curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
-                  after: RegressionFit) -> Curve:
-    """Return means in even bins between the 0.1 % and 99.9 % quantiles, of 10 or more samples."""
-    at = np.concatenate(parts)
-    low, high = np.quantile(at, [0.001, 0.999])
-    if not high > low:
-        return Curve(name, unit, *(np.empty(0) for _ in range(5)))
-    bins = [np.clip(((part - low) / (high - low) * _CURVE_BINS).astype(int), 0, _CURVE_BINS - 1)
-            for part in parts]
-    place = np.concatenate(bins)
-    count = np.bincount(place, minlength=_CURVE_BINS)
-    enough = count > 9
-    middle, left, mended, simulated = (
-        np.bincount(place, each, _CURVE_BINS)[enough] / count[enough] for each in (at, *values))
-    return Curve(name, unit, middle, left, mended,
-                 np.sqrt(_bin_variances(after, bins)[enough]) / count[enough], simulated)
+        has |= {'rate'}
+    curves = []
+    for name, unit, channel, of in _CURVE_VARIABLES:
+        parts = [of(each)[each.valid] for each in replays] if {channel} <= has | {''} else []
+        at = np.concatenate([np.empty(0), *parts])
+        low, high = np.quantile(at, [0.001, 0.999]) if len(at) else (0.0, 0.0)
+        if not high > low:
+            continue
+        # means in even bins between the 0.1 % and 99.9 % quantiles, of 10 or more samples
+        bins = [np.clip(((part - low) / (high - low) * _CURVE_BINS).astype(int), 0,
+                        _CURVE_BINS - 1) for part in parts]
+        place = np.concatenate(bins)
+        count = np.bincount(place, minlength=_CURVE_BINS)
+        enough = count > 9
+        middle, *means = (np.bincount(place, each, _CURVE_BINS)[enough] / count[enough]
+                          for each in (at, *values))
+        deviation = np.sqrt(_bin_variances(after, bins)[enough]) / count[enough]
+        if len(middle) > 1:
+            curves.append(Curve(name, unit, middle, means[0], means[1], deviation, means[2]))
+    return [*curves, _amplitude_spectrum(before, after)]
 
 
 def _bin_variances(fit: RegressionFit, bins: Sequence[NDArray[np.intp]]) -> Array:

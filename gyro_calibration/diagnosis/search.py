@@ -28,8 +28,8 @@ from typing import Any
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
     Candidate, candidate_transforms, depends_on_rate, effect_candidate, fitted_shape_indices,
-    gaussian_pulse, generic_terms, indices_by_cause, is_discontinuous, is_named, MAX_STEP_TIMES,
-    propose_candidates, unnamed_variable, with_shape)
+    gaussian_pulse, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
+    propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
     OnProgress, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
@@ -123,27 +123,23 @@ class Search:
         key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
-            known = self.columns_cache.popitem()[1] if self.columns_cache else None
-            self.columns_cache[key] = group_columns(self.problem,
-                                                    *self._candidate_columns(fit, known))
-        columns = self.columns_cache[key]
-        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in columns.groups])
-        return column_evidence(fit, columns) - penalty
-
-    def _candidate_columns(self, fit: RegressionFit,
-                           known: ColumnGroups | None) -> tuple[Array, Sequence[Sequence[int]]]:
-        """Return whitened columns and those of each candidate; known ones for another rate."""
-        deviation = self.problem.deviation
-        if known is None:
-            parts = [candidate_transforms(each, fit.distorted) / deviation
-                     for each in self.candidates]
-            ends = np.cumsum([len(part) for part in parts]).tolist()
-            return np.concatenate([np.empty((0, len(deviation))), *parts]), [
-                range(end - len(part), end) for end, part in zip(ends, parts)]
-        for each, own in zip(self.candidates, known.groups):
-            if depends_on_rate(each):
-                known.columns[own] = candidate_transforms(each, fit.distorted) / deviation
-        return known.columns, known.groups
+            deviation = self.problem.deviation
+            if self.columns_cache:  # those for another rate
+                known = self.columns_cache.popitem()[1]
+                columns, groups = known.columns, known.groups
+                for each, own in zip(self.candidates, groups):
+                    if depends_on_rate(each):
+                        columns[own] = candidate_transforms(each, fit.distorted) / deviation
+            else:
+                parts = [candidate_transforms(each, fit.distorted) / deviation
+                         for each in self.candidates]
+                columns = np.concatenate([np.empty((0, len(deviation))), *parts])
+                ends = np.cumsum([len(part) for part in parts]).tolist()
+                groups = [range(end - len(part), end) for end, part in zip(ends, parts)]
+            self.columns_cache[key] = group_columns(self.problem, columns, groups)
+        known = self.columns_cache[key]
+        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in known.groups])
+        return column_evidence(fit, known) - penalty
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
@@ -201,7 +197,7 @@ def _find_strongest(search: Search, causes: Sequence[Candidate],
                      each.cause, evidence - each.penalty) < SUSPECTED_RATE_FACTOR * search.rate]
     worth.sort(key=lambda each: -each[1])
     steps = sorted((refine_shape(fit, each) for each, _ in worth[:_MAX_CONFOUNDERS]),
-                   key=lambda step: -step[1])
+                   key=lambda each: -each[1])
     best = None
     if significant:
         # The screening fits a free size at the first shape; after refinement a cause may explain
@@ -231,10 +227,10 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
                           float(found[best])))
     scans = {'interference_tone': _find_tones, 'reference_slip': _find_slips,
              'bias_step': _find_steps}
-    first += [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)]
-    likeliest = {each.cause: (each, evidence) for each, evidence in sorted(
-        first, key=lambda scored: scored[1] - scored[0].penalty)}
-    return list(likeliest.values())
+    first += [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
+              if math.isfinite(each[1])]
+    return list({each.cause: (each, evidence) for each, evidence in sorted(
+        first, key=lambda scored: scored[1] - scored[0].penalty)}.values())
 
 
 def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
@@ -243,7 +239,7 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
     half = candidate.half_width
     half_range = half or _SHAPE_RANGE
     # those of smooth columns follow by Gauss-Newton steps
-    for place in places if is_discontinuous(candidate) else places[:1]:
+    for place in places[:1] if smooth_shapes(candidate) else places:
         if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
             ratio = free_amplitude(fit, candidate)
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
@@ -277,16 +273,6 @@ def _is_lasting(candidate: Candidate) -> bool:
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
 
-def _find_suspected(search: Search, selected: Causes) -> Causes:
-    """Return one more cause at `SUSPECTED_RATE_FACTOR` times the rate, if there is one."""
-    _, steps = _find_strongest(search, selected)
-    score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
-    cause_names = {each.cause for each in selected}
-    return next(((each,) for each, likelihood in steps
-                 if _is_lasting(each) and each.cause not in cause_names and p_value(
-                     each.cause, likelihood - score) < SUSPECTED_RATE_FACTOR * search.rate), ())
-
-
 # scans over all frequencies and times
 
 def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
@@ -297,7 +283,7 @@ def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
 
 
 def _find_tones(fit: RegressionFit) -> list[Scored]:
-    """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
+    """Return the strongest tone of each log, which has its own size and phase."""
     found, left = [], fit.whitened_series()
     for run in _logs_to_scan(fit, 'interference_tone'):
         each, white = fit.problem.replays[run], left[run]
@@ -310,29 +296,20 @@ def _find_tones(fit: RegressionFit) -> list[Scored]:
             # of all frequencies that are this one in means over some samples
             places = np.arange(each.decimation // 2 + 1) / each.point_interval
             aliases = np.concatenate([places + frequency, places[1:] - frequency])
-            frequency = max(aliases.tolist(), key=lambda at: _amplitude(
-                each, each.channels.output - each.reference, at))
+            error = (each.channels.output - each.reference)[each.valid]
+            time = each.channels.time[each.valid]
+            frequency = max(aliases.tolist(), key=lambda at: float(np.abs(
+                np.mean(error * np.exp(-2.0j * np.pi * at * time)))))
             found.append((replace(
                 effect_candidate('interference_tone', frequency, log_index=run,
                                  half_width=1.0 / each.duration),
                 penalty=math.log(len(power) * len(left))), float(power[best]) - VALUE_PENALTY))
-    return _best_of_scan(found)
-
-
-def _best_of_scan(found: Sequence[Scored]) -> list[Scored]:
-    return sorted((each for each in found if math.isfinite(each[1])),
-                  key=lambda each: each[1] - each[0].penalty)[-1:]
-
-
-def _amplitude(replay: Replay, values: Array, frequency: float) -> float:
-    """Return the amplitude of a frequency in samples."""
-    wave = np.exp(-2.0j * np.pi * frequency * replay.channels.time[replay.valid])
-    return float(2.0 * np.abs(np.mean(values[replay.valid] * wave)))
+    return found
 
 
 def _find_steps(fit: RegressionFit) -> list[Scored]:
     """
-    Return the clearest step of the bias at any time, under the likeliest noise.
+    Return the clearest step of the bias of each log at any time, under the likeliest noise.
 
     Beside a random walk that soon exceeds the white noise, a step shows for a short time only.
     """
@@ -367,12 +344,12 @@ def _find_steps(fit: RegressionFit) -> list[Scored]:
         evidence.append(own)
     every = np.concatenate(evidence)
     mean = float(logsumexp(every)) - math.log(len(every))
-    return _best_of_scan([(replace(each, penalty=float(own.max()) - mean), float(own.max()))
-                          for each, own in zip(found, evidence)])
+    return [(replace(each, penalty=float(own.max()) - mean), float(own.max()))
+            for each, own in zip(found, evidence)]
 
 
 def _find_slips(fit: RegressionFit) -> list[Scored]:
-    """Return the clearest jumps of the reference's heading, where it accelerates."""
+    """Return the clearest jumps of the heading of each reference, where it accelerates."""
     found, left = [], fit.whitened_series()
     factors = [own / each for own, each in zip(fit.whitening_factors(), fit.problem.split_by_log(
         fit.problem.deviation))]
@@ -387,7 +364,7 @@ def _find_slips(fit: RegressionFit) -> list[Scored]:
             # The largest number indicates a continuous disturbance, not slips.
             if max(len(slips.shapes) - 1 for slips, _ in tried) < _MAX_SLIPS:
                 found += tried
-    return _best_of_scan(found)
+    return found
 
 
 def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
@@ -452,7 +429,6 @@ def search_causes(search: Search) -> Causes:
 
 
 def _select_forward(search: Search) -> Causes:
-    """Add causes one by one (forward selection)."""
     named: Causes = ()
     for _ in range(2 * MAX_CAUSES):  # some are removed again
         if search.on_progress(None, f'search for causes, {len(named)} found'):
@@ -482,71 +458,69 @@ def _with_several(search: Search, causes: Causes) -> Causes:
         candidates=tuple(filter(_is_lasting, search.candidates)), problem=replace(
             problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
             log_determinants=problem.log_determinants[:1]))
-    while len(grown) < MAX_CAUSES and (steps := _find_steps(fit_causes(white.problem, grown))):
+    while len(grown) < MAX_CAUSES:
+        step, evidence = max(_find_steps(fit_causes(white.problem, grown)),
+                             key=lambda each: each[1] - each[0].penalty)
         # the first of a pair may not be significant alone
         if len(grown) > len(causes) + 1 and p_value(
-                'bias_step', steps[0][1] - steps[0][0].penalty) > search.rate:
+                'bias_step', evidence - step.penalty) > search.rate:
             break
-        grown = _refine_in_turn(white, (*grown, steps[0][0]), len(causes))
+        grown = _refine_in_turn(white, (*grown, step), len(causes))
         tried.append(grown)
     for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
                            key=lambda each: each[0].penalty - each[1])[:3]:
         tried.append(_eliminate_backward(
             white, _refine_in_turn(white, (*grown, drift), len(causes))))
-    evidence, best = max(((_joint_evidence(search, causes, each, len(tried)), each)
-                          for each in tried if _are_apart(problem, each)),
-                         default=(-math.inf, ()), key=lambda each: each[0])
-    if evidence < 0.0:
+
+    def evidence_of(several: Causes) -> float:
+        """Return the evidence for several in place of the causes beyond that of noise alone."""
+        score, before = (fit_causes(problem, some).log_likelihood
+                         - sum(map(complexity_penalty, some)) for some in (several, causes))
+        more = max(len(several) - len(causes), 1)
+        return score - before - 0.5 * float(chi2.isf(search.rate / len(tried), more))
+
+    def are_apart(several: Causes) -> bool:
+        """Tell whether no steps of opposite signs are as near as the ends of a pulse, or a gap."""
+        steps = [each for each in several if each.cause == 'bias_step']
+        return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
+                   or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
+                   >= problem.replays[one.log_index or 0].duration
+                   for one, other in combinations(steps, 2))
+
+    best = max(filter(are_apart, tried), key=evidence_of, default=())
+    if not best or evidence_of(best) < 0.0:
         return ()
     best = _eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
     return best if len(best) > len(causes) + 1 else ()
 
 
-def _joint_evidence(search: Search, causes: Causes, several: Causes, tried: int) -> float:
-    """Return the evidence for several causes in place of others beyond that of noise alone."""
-    gain = (fit_causes(search.problem, several).log_likelihood
-            - fit_causes(search.problem, causes).log_likelihood)
-    penalty = sum(map(complexity_penalty, several)) - sum(map(complexity_penalty, causes))
-    more = max(len(several) - len(causes), 1)
-    return gain - penalty - 0.5 * float(chi2.isf(search.rate / tried, more))
-
-
 def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
     """Refine the shape of each cause from a first on, given the others, and then all together."""
     for place in range(first, len(causes)):
-        fit = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
+        fit = fit_causes(search.problem, _without(causes, place))
         causes = (*causes[:place], refine_shape(fit, causes[place])[0], *causes[place + 1:])
     return refine_jointly(search, causes)
 
 
-def _are_apart(problem: RegressionProblem, causes: Causes) -> bool:
-    """Tell whether no two steps of opposite signs are as near as the ends of a pulse, or a gap."""
-    steps = [each for each in causes if each.cause == 'bias_step']
-    return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
-               or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
-               >= problem.replays[one.log_index or 0].duration
-               for one, other in combinations(steps, 2))
+def _without(causes: Sequence[Candidate], place: int) -> Causes:
+    return *causes[:place], *causes[place + 1:]
 
 
 def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
     """Refine all shapes and values together by Gauss-Newton steps."""
-    current = tuple(causes)
+    current = list(causes)
     for _ in range(3 if causes else 0):
-        done = fit_causes(search.problem, current)
-        current = tuple(_gauss_newton_update(done, place) for place in range(len(current)))
-    return current
-
-
-def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> Candidate:
-    candidate = fit.causes[cause_index]
-    own = dict(zip(fit.column_owners, fit.estimates[0].tolist()))
-    values = tuple(own.get((cause_index, number), 0.0)
-                   for number in range(fit.column_counts[cause_index]))
-    for shape in fitted_shape_indices(candidate):
-        most = 0.3 * abs(candidate.shapes[shape])
-        change = np.clip(own.get((cause_index, -1 - shape), 0.0), -most, most)
-        candidate = with_shape(candidate, shape, candidate.shapes[shape] + float(change))
-    return replace(candidate, values=values or (candidate.amplitude or 0.0,))
+        fit = fit_causes(search.problem, current)
+        own = dict(zip(fit.column_owners, fit.estimates[0].tolist()))
+        for place, candidate in enumerate(fit.causes):
+            values = tuple(own.get((place, number), 0.0)
+                           for number in range(fit.column_counts[place]))
+            for shape in fitted_shape_indices(candidate):
+                most = 0.3 * abs(candidate.shapes[shape])
+                change = np.clip(own.get((place, -1 - shape), 0.0), -most, most)
+                candidate = with_shape(candidate, shape, candidate.shapes[shape] + float(change))
+            current[place] = replace(candidate, values=values or (candidate.amplitude or 0.0,))
+    return tuple(current)
 
 
 def complexity_penalty(cause: Candidate) -> float:
@@ -563,7 +537,7 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
     without one, the shape of the other is refined.
     """
     fit = fit_causes(search.problem, causes)
-    rest = (*causes[:cause_index], *causes[cause_index + 1:])
+    rest = _without(causes, cause_index)
     without = likelihood_without(fit, cause_index)
     if is_rate_distortion(causes[cause_index].cause) and any(
             is_rate_distortion(each.cause) for each in rest):
@@ -596,7 +570,7 @@ def _eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Ca
         weakest = int(np.argmax(chances))
         if chances[weakest] < search.rate:
             break
-        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
+        causes = refine_jointly(search, _without(causes, weakest))
     return causes
 
 
@@ -609,36 +583,31 @@ def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     A name is withdrawn if structure without a name lies along the same variable, if there are many
     tones, or if a cause along a temperature differs between logs.
     """
-    variables = {unnamed_variable(each)
-                 for each in causes if not is_named(each)}
+    variables = {unnamed_variable(each) for each in causes if not is_named(each)}
     exceeded = {name for variable in variables for name in variable.split(' and ')}
     tones = [each.log_index for each in causes if each.cause == 'interference_tone']
     if any(tones.count(run) >= _MAX_PER_LOG['interference_tone'] for run in tones):
         exceeded.add('frequency')
-    kept = [each for each in causes
-            if is_named(each) and CAUSES[each.cause].along not in exceeded
-            and _is_repeatable(search, causes, each)]
-    unnamed = tuple(each for each in causes if each not in kept
-                    and (not is_named(each)
-                         or CAUSES[each.cause].along not in variables))
+    kept, problem = [], search.problem
+    for each in causes:
+        if not is_named(each) or CAUSES[each.cause].along in exceeded:
+            continue
+        # as far as it is one along a temperature, with its own size in each log but the last
+        alone = [replace(each, log_index=run, values=()) for run in range(
+            len(problem.replays) - 1) if CAUSES[each.cause].along in _REPEATING_VARIABLES
+            and each.amplitude is None]
+        more = 2.0 * (fit_causes(problem, [*causes, *alone]).log_likelihood
+                      - fit_causes(problem, causes).log_likelihood) if alone else 0.0
+        if not alone or chi2.sf(
+                max(more, 0.0), len(each.values) * len(alone)) > MIN_FIT_PROBABILITY:
+            kept.append(each)
     if len(kept) == len(causes):
         return causes, ()
+    unnamed = tuple(each for each in causes if each not in kept and (
+        not is_named(each) or CAUSES[each.cause].along not in variables))
     left = _eliminate_backward(search, refine_jointly(search, (*kept, *unnamed)))
     keys = {(each.cause, each.log_index) for each in kept}
-    return tuple(each for each in left
-                 if (each.cause, each.log_index) in keys), unnamed
-
-
-def _is_repeatable(search: Search, causes: Causes, cause: Candidate) -> bool:
-    """Tell whether a cause along a temperature has the same size in all logs within the noise."""
-    runs = len(search.problem.replays)
-    if (runs == 1 or CAUSES[cause.cause].along not in _REPEATING_VARIABLES
-            or cause.amplitude is not None):
-        return True
-    alone = [replace(cause, log_index=run, values=()) for run in range(runs - 1)]
-    more = 2.0 * (fit_causes(search.problem, [*causes, *alone]).log_likelihood
-                  - fit_causes(search.problem, causes).log_likelihood)
-    return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > MIN_FIT_PROBABILITY)
+    return tuple(each for each in left if (each.cause, each.log_index) in keys), unnamed
 
 
 # confirmation
@@ -663,8 +632,15 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
     named, alternatives = _choose_simplest(search, named, unnamed)
     taken = {each.cause for each in named}
     suspected = tuple(each for each in removed if _is_lasting(each) and each.cause not in taken)
-    return Selection(named, alternatives, unnamed,
-                     suspected or _find_suspected(search, (*named, *unnamed)),
+    if not suspected:  # one more cause at a higher rate, if there is one
+        selected = (*named, *unnamed)
+        _, steps = _find_strongest(search, selected)
+        score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
+        suspected = tuple(each for each, likelihood in steps if _is_lasting(each)
+                          and each.cause not in {other.cause for other in selected} and p_value(
+                              each.cause, likelihood - score)
+                          < SUSPECTED_RATE_FACTOR * search.rate)[:1]
+    return Selection(named, alternatives, unnamed, suspected,
                      tuple(each for each in removed if not _is_lasting(each)))
 
 
@@ -678,8 +654,14 @@ def _remove_unconfirmed(search: Search, causes: Causes,
     """
     removed: Causes = ()
     while causes:
-        sigmas = np.minimum(np.array(held_out_sigmas(search, causes)) / MIN_PREDICTION_SIGMAS,
-                            np.array(_size_sigmas(search, causes)) / NORMAL_QUANTILE_975)
+        fit, sigmas = fit_causes(search.problem, causes), []
+        for place, (known, held_out) in enumerate(zip(causes, held_out_sigmas(search, causes))):
+            sizes = fit.coefficients(place) or list(fit.shapes(place).values())
+            # sine or cosine alone may be 0 for a wave that is not
+            is_wave = len(sizes) == 2 and known.cause != 'reference_slip'
+            size = (math.inf if is_wave or not sizes or not sizes[0].deviation
+                    else abs(sizes[0].value) / sizes[0].deviation)
+            sigmas.append(min(held_out / MIN_PREDICTION_SIGMAS, size / NORMAL_QUANTILE_975))
         weakest = int(np.argmin(sigmas))
         if sigmas[weakest] > 1.0:
             break
@@ -715,7 +697,7 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
         if known.cause == 'reference_slip':
             found.append(math.inf)
             continue
-        rest = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
+        rest = fit_causes(search.problem, _without(causes, place))
         before = np.concatenate(rest.whitened_series(full))
         added = before - off
         score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
@@ -728,18 +710,6 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
         found.append(prediction_sigmas(
             0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
     return found
-
-
-def _size_sigmas(search: Search, causes: Causes) -> list[float]:
-    """Return the distance of the size of each cause from 0 in standard deviations."""
-    found, sigmas = fit_causes(search.problem, causes), []
-    for place, known in enumerate(causes):
-        sizes = found.coefficients(place) or list(found.shapes(place).values())
-        # sine or cosine alone may be 0 for a wave that is not
-        wave = len(sizes) == 2 and known.cause != 'reference_slip'
-        sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
-                      else abs(sizes[0].value) / sizes[0].deviation)
-    return sigmas
 
 
 def _choose_simplest(search: Search, named: Causes,
@@ -767,7 +737,7 @@ def _alternatives(search: Search, named: Causes, place: int,
         return len(fitted_shape_indices(known)) + _free_column_count(known, search.problem)
 
     own = named[place]
-    _, steps = _find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
+    _, steps = _find_strongest(search, (*_without(named, place), *unnamed))
     mine = max((score for each, score in steps if each.cause == own.cause), default=math.inf)
     members = [(each, mine - score) for each, score in steps
                if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(own, 0.0)]

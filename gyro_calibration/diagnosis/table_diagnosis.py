@@ -52,6 +52,9 @@ from scipy.linalg import block_diag
 from scipy.stats import norm
 from scipy.stats import t as student
 
+#: Share of the false-alarm rate for causes other than a bias and a scale factor that differ from
+#: those of the model, which have 0.1; structure and outliers have the rest.
+_CAUSE_ALARM_SHARE = 0.65
 _METHOD_TEXT = (
     'The rates and temperatures of the dwells were simulated, and the difference of measured and '
     'simulated outputs was compared with the effects of rate and temperature. The scatter of '
@@ -87,25 +90,24 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
                           'bias; record several rates, both ways')
     record = resolve_unit(inspect_record(log, model))
     dwells = replace(dwells, output=dwells.output * record.unit_factor)
-    named = _name_causes(dwells, model, FALSE_ALARM_RATE)
-    structures, gains = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
+    named = _name_causes(dwells, model)
+    structures, gains = _find_structure(named.fit)
     # structure along the variable of a cause, above a tenth of what that explains
     withdrawn = frozenset(
         effect for effect in named.causes if effect not in BASIC_EFFECTS
         and any(gain > 0.1 * named.misfit_reduction(effect) for name, gain in gains.items()
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
-        named = _NamedCauses.of(named.fit, model, FALSE_ALARM_RATE, withdrawn)
-        structures, _ = _find_structure(named.fit, 0.2 * FALSE_ALARM_RATE)
-    gain = (_cross_validated_gain(dwells, model, FALSE_ALARM_RATE, withdrawn, on_progress)
+        named = _NamedCauses.of(named.fit, model, withdrawn)
+        structures, _ = _find_structure(named.fit)
+    gain = (_cross_validated_gain(dwells, model, withdrawn, on_progress)
             if named.causes else None)
     on_progress(0.97, 'findings')
     before = model or named.plain_model
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
     after = _assemble_model(model, named.fit) if offered else before
     strongest_first = sorted(named.causes, key=lambda each: -named.misfit_reduction(each))
-    outliers = _outlier_findings(named.fit, 0.05 * FALSE_ALARM_RATE)
-    findings = add_remedies([*record.findings, *outliers, *(
+    findings = add_remedies([*record.findings, *_outlier_findings(named.fit), *(
         _cause_finding(named, effect) for effect in strongest_first)], {}, after)
     if after is not before:
         notes = origin_notes(findings, [record.unit_factor])
@@ -121,8 +123,8 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
 
 # the steps
 
-def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                          withdrawn: frozenset[Effect], on_progress: OnProgress) -> Gain | None:
+def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, withdrawn: frozenset[Effect],
+                          on_progress: OnProgress) -> Gain | None:
     """Return the gain on sweeps left out of selection and fit in turn; None if not possible."""
     parts = cross_validation_parts(dwells)
     count = min(8, int(parts.max()) + 1)  # of groups of sweeps, for the computing time
@@ -135,7 +137,7 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
         hidden = groups == number
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:
-            named = _name_causes(rest, model, false_alarm_rate, withdrawn)
+            named = _name_causes(rest, model, withdrawn)
             models = (model or GyroModel(), named.plain_model, _assemble_model(model, named.fit))
         except DataRefused:
             continue
@@ -154,7 +156,7 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
                              'plain' if model is None else 'given', HEADING_WINDOW)
 
 
-def _outlier_findings(fit: Calibration, level: float) -> Iterator[Finding]:
+def _outlier_findings(fit: Calibration) -> Iterator[Finding]:
     """Give outlying dwells, if the largest deviation from a fit to the others is significant."""
     outlying, freedom = ~fit.scatter.inliers, surface_dof(fit.used)
     if not outlying.any() or min(freedom, fit.dof) < 1:
@@ -162,7 +164,7 @@ def _outlier_findings(fit: Calibration, level: float) -> Iterator[Finding]:
     dwells = select_dwells(fit.dwells, outlying)
     sigmas = np.abs(fit.residual[outlying]) / np.sqrt(np.diag(fit.prediction_covariance(dwells)))
     chance = min(1.0, len(fit.dwells) * 2.0 * float(student.sf(sigmas.max(), freedom)))
-    if chance < level:
+    if chance < 0.05 * FALSE_ALARM_RATE:
         yield make_finding(
             'outliers', {'outliers': Estimate.from_half_width(float(len(dwells)), 0.0, '1')},
             chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
@@ -179,34 +181,25 @@ class _NamedCauses:
 
     fit: Calibration  # of causes, bias and scale factor to the dwells
     causes: tuple[Effect, ...]  # the named effects of the fit
-    false_alarm_rate: float  # of the diagnosis
 
     @classmethod
-    def of(cls, fit: Calibration, model: GyroModel | None, false_alarm_rate: float,
+    def of(cls, fit: Calibration, model: GyroModel | None,
            withdrawn: Collection[Effect] = ()) -> _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
-        named = cls(fit, (), false_alarm_rate)
         causes = [each for each in fit.effects if each not in BASIC_EFFECTS
-                  or model is not None and fit.p_value(each) < named.level(each)]
-        if _is_slope_by_origin(fit):
-            causes.remove(BIAS_TEMPERATURE)
-        return replace(named, causes=tuple(causes))
-
-    def level(self, effect: Effect) -> float:
-        """
-        Return the p-value below which a cause is named.
-
-        Of the false-alarm rate, 65 % is for causes other than bias and scale factor, and 10 % for
-        a bias and a scale factor that differ from the model's.
-        """
-        share = 0.1 if effect in BASIC_EFFECTS else 0.65
-        return share * self.false_alarm_rate / self.tested_count(effect)
-
-    def tested_count(self, effect: Effect) -> int:
-        """Return the number of causes that were tested together with one."""
-        basic = len(BASIC_EFFECTS)
-        return basic if effect in BASIC_EFFECTS else len(STATIC_EFFECTS) - basic
+                  or model is not None and fit.p_value(each) < _naming_level(each)]
+        values = {term.effect: term.values for term in fit.terms}
+        if BIAS_TEMPERATURE_QUADRATIC in values:
+            # If a parabola over temperature has its vertex near the measured ones, the slope is
+            # that at the temperature which it happens to be counted from.
+            origin, slope = values[BIAS_TEMPERATURE]
+            temperature = np.asarray(fit.dwells.temperature)
+            vertex = origin - 0.5 * slope / values[BIAS_TEMPERATURE_QUADRATIC][1]
+            middle = 0.5 * (temperature.max() + temperature.min())
+            if abs(vertex - middle) < np.ptp(temperature):
+                causes.remove(BIAS_TEMPERATURE)
+        return cls(fit, tuple(causes))
 
     def fit_without(self, effect: Effect) -> Calibration | None:
         """Return a fit with the effect as it is in the model, or None if it is not possible."""
@@ -224,23 +217,26 @@ class _NamedCauses:
         return fit_effects(self.fit.dwells, basic, self.fit.scatter).model
 
 
-def _name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
+def _tested_count(effect: Effect) -> int:
+    """Return the number of causes that are tested together with one."""
+    basic = len(BASIC_EFFECTS)
+    return basic if effect in BASIC_EFFECTS else len(STATIC_EFFECTS) - basic
+
+
+def _naming_level(effect: Effect) -> float:
+    """Return the p-value below which a cause is named."""
+    share = 0.1 if effect in BASIC_EFFECTS else _CAUSE_ALARM_SHARE
+    return share * FALSE_ALARM_RATE / _tested_count(effect)
+
+
+def _name_causes(dwells: Dwells, model: GyroModel | None,
                  withdrawn: Collection[Effect] = ()) -> _NamedCauses:
-    """
-    Find the causes that dwells support on top of a model, or of an ideal gyro.
-
-    Parameters
-    ----------
-    dwells : of a rate table
-    model : that is put to the test, if one was given
-    false_alarm_rate : false-alarm rate of the diagnosis
-    withdrawn : causes that are not named
-
-    """
+    """Find the causes that dwells support on top of a model, or of an ideal gyro."""
     technology = model.gyro.get('technology') if model else None
-    fit, _ = resolve_confounders(find_supported_effects(dwells, 0.65 * false_alarm_rate, model),
-                                 technology if technology in TECHNOLOGY_EFFECTS else None)
-    return _NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
+    fit, _ = resolve_confounders(
+        find_supported_effects(dwells, _CAUSE_ALARM_SHARE * FALSE_ALARM_RATE, model),
+        technology if technology in TECHNOLOGY_EFFECTS else None)
+    return _NamedCauses.of(fit, model, withdrawn)
 
 
 def _simulate_output(model: GyroModel, dwells: Dwells) -> Array:
@@ -248,19 +244,6 @@ def _simulate_output(model: GyroModel, dwells: Dwells) -> Array:
     known = replace(model, terms=tuple(static_terms(model)))
     return np.zeros(len(dwells)) + known.output_from_channels(
         channels_of(dwells, model.reference_temperature))
-
-
-def _is_slope_by_origin(fit: Calibration) -> bool:
-    """Return whether a parabola over temperature has its vertex near the measured ones."""
-    values = {term.effect: term.values for term in fit.terms}
-    if BIAS_TEMPERATURE_QUADRATIC not in values:
-        return False
-    origin, slope = values[BIAS_TEMPERATURE]
-    temperature = np.asarray(fit.dwells.temperature)
-    # the slope is then that at the temperature which it happens to be counted from
-    vertex = origin - 0.5 * slope / values[BIAS_TEMPERATURE_QUADRATIC][1]
-    return bool(abs(vertex - 0.5 * (temperature.max() + temperature.min()))
-                < np.ptp(temperature))
 
 
 def _assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
@@ -271,24 +254,19 @@ def _assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
     terms = [new.pop(term, term) for term in model.terms]
     terms += new.values()
     temperatures = [] if fit.dwells.temperature is None else [fit.dwells.temperature]
+    # the covariance of all fitted values: of model and of dwells, as if independent
+    covariance, found, known = None, fit.model.covariance, model.covariance
+    kept_terms = [term for term in terms if term not in fit.terms and term.fitted_indices]
+    if found is not None and not (kept_terms and known is None):
+        owners = [*([] if known is None else value_owners(model.terms)), *value_owners(fit.terms)]
+        both = found if known is None else block_diag(known, found)
+        places = [place for term in terms for place, owner in enumerate(owners) if owner is term]
+        covariance = both[np.ix_(places, places)]
     # A self-calibration belongs to the old bias and scale factor of the model.
-    return replace(model, terms=tuple(terms), covariance=_combined_covariance(model, fit, terms),
+    return replace(model, terms=tuple(terms), covariance=covariance,
                    rate_range=widen_range(model.rate_range, [fit.dwells.output], True),
                    temperature_range=widen_range(model.temperature_range, temperatures, True),
                    origin=previous_origins(model), self_calibration=None)
-
-
-def _combined_covariance(model: GyroModel, fit: Calibration,
-                         terms: Sequence[Term]) -> Array | None:
-    """Return the covariance of all fitted values: of model and of dwells, as if independent."""
-    found, known = fit.model.covariance, model.covariance
-    kept_terms = [term for term in terms if term not in fit.terms and term.fitted_indices]
-    if found is None or (kept_terms and known is None):
-        return None
-    owners = [*([] if known is None else value_owners(model.terms)), *value_owners(fit.terms)]
-    both = found if known is None else block_diag(known, found)
-    places = [place for term in terms for place, owner in enumerate(owners) if owner is term]
-    return both[np.ix_(places, places)]
 
 
 # structure without a name
@@ -297,8 +275,7 @@ def _combined_covariance(model: GyroModel, fit: Calibration,
 _MAX_CURVE_COLUMNS, _MIN_DWELLS_PER_COLUMN = 9, 4
 
 
-def _find_structure(fit: Calibration, false_alarm_rate: float,
-                    ) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
+def _find_structure(fit: Calibration) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
     """
     Search for structure in the residual of a fit; errors by the model's values are none.
 
@@ -308,31 +285,19 @@ def _find_structure(fit: Calibration, false_alarm_rate: float,
     whitened squared residuals by each
 
     """
-    curves = {name: columns
-              for name, columns in _structure_curves(fit.used).items() if columns.shape[1]}
-    known, curve_count = sensitivity_columns(fit.used, fit.terms), len(curves)
-    found, gains = [], {}
-    while curves:
-        tests = {name: fit.test(columns, known) for name, columns in curves.items()}
-        name = min(tests, key=lambda each: (tests[each].p_value, -tests[each].gain))
-        chance = min(1.0, curve_count * tests[name].p_value)
-        if chance >= false_alarm_rate:
-            break
-        found.append(Unexplained(name, tests[name].share, chance))
-        gains[name] = tests[name].gain
-        known = np.column_stack([known, curves.pop(name)])
-    return tuple(found), gains
-
-
-def _structure_curves(dwells: Dwells) -> dict[str, Array]:
-    """Return the columns of each curve, shape (n, m)."""
-    sweeps = len(np.unique(cross_validation_parts(dwells)))
+    dwells, parts = fit.used, cross_validation_parts(fit.used)
     # A variable that differs between sweeps alone has as many independent values as sweeps.
-    slow = min(_MAX_CURVE_COLUMNS, sweeps // 3)
+    slow = min(_MAX_CURVE_COLUMNS, len(np.unique(parts)) // 3)
+    # a column for each rate that at least four sweeps repeat
+    _, number = np.unique(np.round(_scale_to_unit_range(dwells.rate), 4), return_inverse=True)
+    single = (number[:, None] == np.arange(number.max() + 1)).astype(float)
+    repeated = np.array([len(np.unique(parts[column > 0.0])) >= 4 for column in single.T])
+    if np.count_nonzero(repeated) * _MIN_DWELLS_PER_COLUMN > len(dwells):
+        repeated[:] = False
     curves = {
         'rate': _spline_columns(
             dwells.rate, min(_MAX_CURVE_COLUMNS, len(dwells) // _MIN_DWELLS_PER_COLUMN)),
-        'single_rates': _rate_columns(dwells),
+        'single_rates': single[:, repeated],
         'order_of_dwells': _spline_columns(np.arange(len(dwells)).astype(float), slow)}
     if dwells.temperature is not None and _shows_temperature(dwells):
         curves['temperature'] = _spline_columns(dwells.temperature, slow)
@@ -340,17 +305,27 @@ def _structure_curves(dwells: Dwells) -> dict[str, Array]:
         curves['rate_times_temperature'] = np.column_stack(
             [np.zeros((len(dwells), 0)), *(rate ** i * temperature ** j for i in (1, 2, 3)
                                            for j in range(1, min(slow, 2) + 1))])
-    return curves
+    curves = {name: columns for name, columns in curves.items() if columns.shape[1]}
+    known, curve_count = sensitivity_columns(dwells, fit.terms), len(curves)
+    found, gains = [], {}
+    while curves:
+        tests = {name: fit.test(columns, known) for name, columns in curves.items()}
+        name = min(tests, key=lambda each: (tests[each].p_value, -tests[each].gain))
+        chance = min(1.0, curve_count * tests[name].p_value)
+        if chance >= 0.2 * FALSE_ALARM_RATE:
+            break
+        found.append(Unexplained(name, tests[name].share, chance))
+        gains[name] = tests[name].gain
+        known = np.column_stack([known, curves.pop(name)])
+    return tuple(found), gains
 
 
 def _shows_temperature(dwells: Dwells) -> bool:
-    """Tell whether effects of temperature can be seen."""
     return (dwells.temperature is not None
             and bool(np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD))
 
 
 def _scale_to_unit_range(values: Array) -> Array:
-    """Return values from -1 to 1."""
     low, high = float(values.min()), float(values.max())
     return (2.0 * values - low - high) / max(high - low, 1e-300)
 
@@ -365,63 +340,36 @@ def _spline_columns(values: Array, max_columns: int) -> Array:
     return BSpline.design_matrix(values, knots, 3).toarray()
 
 
-def _rate_columns(dwells: Dwells) -> Array:
-    """Return a column for each rate that at least four sweeps repeat, shape (n, rates)."""
-    _, number = np.unique(np.round(_scale_to_unit_range(dwells.rate), 4), return_inverse=True)
-    columns = (number[:, None] == np.arange(number.max() + 1)).astype(float)
-    parts = cross_validation_parts(dwells)
-    repeated = np.array([len(np.unique(parts[column > 0.0])) >= 4 for column in columns.T])
-    if np.count_nonzero(repeated) * _MIN_DWELLS_PER_COLUMN > len(dwells):
-        return columns[:, :0]
-    return columns[:, repeated]
-
-
 # findings
 
 def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
-    others, separate_by = _find_alternatives(named.fit, effect)
+    fit = named.fit
+    others, separate_by = _find_alternatives(fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
-    own = _given_values(named.fit, effect)
     # what is added to the model's values
+    own = next((term.values for term in fit.given.terms if term.effect is effect),
+               (0.0,) * len(effect.parameters))
     estimates = {parameter.name: Estimate.from_half_width(
         value - own[effect.parameters.index(parameter)], NORMAL_QUANTILE_975 * deviation,
-        parameter.unit) for name, parameter, value, deviation in named.fit.model.estimates()
+        parameter.unit) for name, parameter, value, deviation in fit.model.estimates()
         if name == effect.name}
     rest = named.fit_without(effect)
     evidence = '' if rest is None else (
         f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} deg/s, '
-        f'with it to {named.fit.left_out_rms / DEGREE:.3g} deg/s; '
+        f'with it to {fit.left_out_rms / DEGREE:.3g} deg/s; '
         f'{math.sqrt(max(named.misfit_reduction(effect), 0.0)):.1f} sigma from zero')
-    chance = min(1.0, named.fit.p_value(effect) * named.tested_count(effect))
-    return make_finding(effect.name, estimates, chance, others,
-                        minimum_detectable=_minimum_detectable(named, effect),
+    # That of a sine response is by the cubic: a small one equals -k² w³ / 6.
+    detectable, fitted = None, CUBIC_NONLINEARITY if effect is SINE_RESPONSE else effect
+    if (by_cubic := fit if fitted is effect else try_replace(fit, effect, fitted)) is not None:
+        place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
+        detectable = float(
+            uncertainty.half_width(1.0 - _naming_level(effect))[place]
+            + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
+        if effect is SINE_RESPONSE:
+            detectable = math.sqrt(own[0] ** 2 + 6.0 * detectable) - own[0]
+    chance = min(1.0, fit.p_value(effect) * _tested_count(effect))
+    return make_finding(effect.name, estimates, chance, others, minimum_detectable=detectable,
                         separate_by=separate_by, evidence=evidence, **along)
-
-
-def _given_values(fit: Calibration, effect: Effect) -> tuple[float, ...]:
-    """Return the values that the given model has of an effect, 0 where it has none."""
-    return next((term.values for term in fit.given.terms if term.effect is effect),
-                (0.0,) * len(effect.parameters))
-
-
-def _minimum_detectable(named: _NamedCauses, effect: Effect) -> float | None:
-    """
-    Return the size of an effect that is found with 95 %, in the unit of its first value.
-
-    That of a sine response is by the cubic: a small one equals -k² w³ / 6.
-    """
-    fit, fitted = named.fit, CUBIC_NONLINEARITY if effect is SINE_RESPONSE else effect
-    by_cubic = fit if fitted is effect else try_replace(fit, effect, fitted)
-    if by_cubic is None:
-        return None
-    place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
-    size = float(uncertainty.half_width(1.0 - named.level(effect))[place]
-                 + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
-    own = _given_values(fit, SINE_RESPONSE)[0]
-    return size if fitted is effect else math.sqrt(own ** 2 + 6.0 * size) - own
-
-
-# remarks
 
 
 def _remarks(dwells: Dwells, model: GyroModel | None, named: _NamedCauses,
@@ -459,7 +407,6 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: _NamedCauses,
 # what cannot be shown
 
 def _untestable_causes(dwells: Dwells) -> dict[str, str]:
-    """Return the causes that the table cannot show, with the reasons."""
     def needed_columns(cause: Cause) -> str:
         more = cause.required_channels - {'time', 'temperature', *REFERENCES, 'reference'}
         columns = ' and '.join(['time', *sorted(more)]).replace('_', ' ')
@@ -518,11 +465,31 @@ def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str
     experiment = CAUSES[effect.name].separate_by
     if effect in _ALWAYS_CONFOUNDED:
         return [_ALWAYS_CONFOUNDED[effect]], experiment
+    dwells, channels = fit.used, channels_of(fit.used)
+    # a curve over temperature keeps its slope
+    names = [] if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects else [
+        name for name, other in STATIC_EFFECTS.items() if other not in fit.effects]
+    if not _shows_temperature(dwells):
+        names = [name for name in names if 'temperature' not in STATIC_EFFECTS[name].inputs]
+    if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
+        names += ['rate_ramp', 'warm_up']
+    tried = {}  # a column for each of their shapes
+    for name in names:
+        other = CATALOGUE[name]
+        shapes = [[fit.given.reference_temperature] if shape.default is not None
+                  else np.geomspace(*shape.bounds, 60).tolist()
+                  for shape in other.nonlinear_parameters]
+        tried[name] = np.column_stack([
+            np.asarray(Term(other, (*shape, 1.0)).error(channels)) for shape in product(*shapes)])
+    if effect in CONFOUNDERS:
+        fastest = float(np.abs(dwells.rate).max())
+        tried['saturation'] = np.column_stack([
+            np.clip(dwells.rate, -limit, limit) - dwells.rate
+            for limit in (fastest * np.linspace(0.5, 0.98, 25)).tolist()])
     others, change = [each for each in fit.terms if each.effect is not effect], fit.change(effect)
-    known = sensitivity_columns(fit.used, others)
+    known = sensitivity_columns(dwells, others)
     lacks = {name: fit.largest_gain(change[:, None], known, change)
-             - fit.largest_gain(columns, known, change)
-             for name, columns in _alternative_columns(fit, effect)}
+             - fit.largest_gain(columns, known, change) for name, columns in tried.items()}
     names = sorted((name for name in lacks if lacks[name] < MIN_DISTINGUISHING_SIGMAS ** 2),
                    key=lambda name: max(lacks[name], 0.0))
     if effect in CONFOUNDERS and CONFOUNDERS[effect].name in names:
@@ -531,26 +498,3 @@ def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str
         if rate is not None:
             experiment = f'add two dwells each way at {rate / DEGREE:.0f} deg/s'
     return names, experiment if names else ''
-
-
-def _alternative_columns(fit: Calibration, effect: Effect) -> Iterator[tuple[str, Array]]:
-    """Give the causes that may stand for an effect, with a column for each of their shapes."""
-    dwells, channels = fit.used, channels_of(fit.used)
-    fastest = float(np.abs(dwells.rate).max())
-    # a curve over temperature keeps its slope
-    names = [] if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects else [
-        name for name, other in STATIC_EFFECTS.items() if other not in fit.effects]
-    if not _shows_temperature(dwells):
-        names = [name for name in names if 'temperature' not in STATIC_EFFECTS[name].inputs]
-    if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
-        names += ['rate_ramp', 'warm_up']
-    for other in map(CATALOGUE.__getitem__, names):
-        shapes = [[fit.given.reference_temperature] if shape.default is not None
-                  else np.geomspace(*shape.bounds, 60).tolist()
-                  for shape in other.nonlinear_parameters]
-        yield other.name, np.column_stack([
-            np.asarray(Term(other, (*shape, 1.0)).error(channels)) for shape in product(*shapes)])
-    if effect in CONFOUNDERS:
-        yield 'saturation', np.column_stack([
-            np.clip(dwells.rate, -limit, limit) - dwells.rate
-            for limit in (fastest * np.linspace(0.5, 0.98, 25)).tolist()])

@@ -19,21 +19,19 @@ import textwrap
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
-    Change, DETECTION_POWER, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
+    DETECTION_POWER, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
-from gyro_calibration.model.gyro_model import GyroModel, have_same_effects
-
-_HOUR = 3600.0
+from gyro_calibration.model.gyro_model import have_same_effects
 
 #: SI unit -> displayed unit and the factor to it, except for degrees instead of radians.
 _UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0),
-          'rad/√s': ('deg/√h', math.sqrt(_HOUR) / DEGREE),
-          'rad/s/√s': ('deg/h/√h', _HOUR ** 1.5 / DEGREE), 'K/s': ('K/min', 60.0)}
+          'rad/√s': ('deg/√h', 60.0 / DEGREE), 'rad/s/√s': ('deg/h/√h', 60.0 ** 3 / DEGREE),
+          'K/s': ('K/min', 60.0)}
 #: Parameters with another displayed unit than others of the same SI unit.
 _PARAMETER_UNITS = {
-    'bias_instability': ('deg/h', _HOUR / DEGREE), 'rate_ramp': ('deg/s/h', _HOUR / DEGREE),
-    'k': ('s', 1.0),
+    **{name: (unit, 3600.0 / DEGREE) for name, unit in (
+        ('bias_instability', 'deg/h'), ('rate_ramp', 'deg/s/h'))}, 'k': ('s', 1.0),
     **dict.fromkeys(['unit_error', 'outliers', 'stuck_samples', 'dropped_samples'], ('', 1.0))}
 #: Unit -> (value below which a finer unit is used, finer unit, factor to it).
 _FINER_UNITS = {'s': (0.5, 'ms', 1e3), '%': (0.01, 'ppm', 1e4)}
@@ -151,20 +149,27 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.verdict == 'mismatched':
         (found,) = diagnosis.findings
         return found.cause, f'No cause can be named until this is corrected: {found.remedy}.'
+    gain = _gain_sentence(diagnosis)
     if diagnosis.verdict == 'adequate':
         suspected = join_list([readable_name(each.effect) for each in diagnosis.findings])
         reference_errs = bool(diagnosis.reference and diagnosis.reference.noise)
         verdict = ('No difference is established' if reference_errs or suspected
                    else 'Simulation and measurement differ by no more than noise')
         return (verdict + ' beyond the errors of the reference' * reference_errs
-                + f'; suspected: {suspected}' * bool(suspected) + '.', _gain_sentence(diagnosis))
+                + f'; suspected: {suspected}' * bool(suspected) + '.', gain)
+
+    def is_fault_of_samples(found: Finding) -> bool:
+        """Tell whether a finding is of single samples of the record, not of all of its output."""
+        cause = CAUSES.get(found.effect)
+        return cause is not None and cause.origin == 'record' and cause.along == 'time'
+
     parts = []
     established = sorted((each for each in diagnosis.findings if each.status == 'established'),
-                         key=lambda each: (_is_fault_of_samples(each),
+                         key=lambda each: (is_fault_of_samples(each),
                                            -(each.share_of_heading_error or 0.0)))
-    if established and not diagnosis.unexplained and _is_fault_of_samples(established[0]):
+    if established and not diagnosis.unexplained and is_fault_of_samples(established[0]):
         return ('No error of the gyro is established; the record has '
-                f'{_list_causes(established)}.', _gain_sentence(diagnosis))
+                f'{_list_causes(established)}.', gain)
     if established:
         parts.append('because of ' + f'{len(established)} causes: ' * (len(established) > 1)
                      + _list_causes(established))
@@ -176,34 +181,24 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         parts.append(f'along {variables} by {"something" if parts else "structure"} that no cause '
                      f'in the catalogue explains ({up_to}{_format_share(most)} of the variance of '
                      'the residual)')
-    return f'Simulation and measurement differ {", and ".join(parts)}.', _gain_sentence(diagnosis)
-
-
-def _is_fault_of_samples(found: Finding) -> bool:
-    """Tell whether a finding is of single samples of the record, not of all of its output."""
-    cause = CAUSES.get(found.effect)
-    return cause is not None and cause.origin == 'record' and cause.along == 'time'
+    return f'Simulation and measurement differ {", and ".join(parts)}.', gain
 
 
 def _list_causes(findings: Sequence[Finding]) -> str:
-    if len(findings) > 1:
-        effects = [each.effect for each in findings]
-        shown = [readable_name(each.effect) + (
-            f' at {each.where[0]:.4g} s' if each.where and effects.count(each.effect) > 1 else ''
-        ) + (' (or {})'.format(
-            join_list([readable_name(name) for name in each.ambiguous_with], 'or'))
-            if each.ambiguous_with else '') for each in findings[:_MAX_NAMED_CAUSES]]
-        more = ([f'{len(findings) - _MAX_NAMED_CAUSES} more'] if len(findings) > _MAX_NAMED_CAUSES
-                else [])
-        return join_list(shown + more)
-    (found,) = findings
-    name = readable_name(found.effect)
-    sizes = [format_quantity(value, key) for key, value in found.parameters.items()][:1]
-    if not found.ambiguous_with:
-        return ': '.join([name, *sizes])
-    names = join_list([name, *map(readable_name, found.ambiguous_with)], 'or')
-    return '; '.join([f'{names}, which these data cannot distinguish',
-                      *(f'taken as {name} it is {size}' for size in sizes)])
+    shown, effects = [], [each.effect for each in findings]
+    for found in findings[:_MAX_NAMED_CAUSES]:
+        name, others = readable_name(found.effect), [*map(readable_name, found.ambiguous_with)]
+        sizes = [format_quantity(value, key) for key, value in found.parameters.items()][:1]
+        if len(findings) == 1 and not others:
+            return ': '.join([name, *sizes])
+        if len(findings) == 1:
+            return '; '.join([f'{join_list([name, *others], "or")}, which these data cannot '
+                              'distinguish', *(f'taken as {name} it is {each}' for each in sizes)])
+        if found.where and effects.count(found.effect) > 1:
+            name += f' at {found.where[0]:.4g} s'
+        shown.append(name + (f' (or {join_list(others, "or")})' if others else ''))
+    return join_list([*shown, *[f'{len(findings) - _MAX_NAMED_CAUSES} more'] * (
+        len(findings) > _MAX_NAMED_CAUSES)])
 
 
 def verdict_phrase(diagnosis: Diagnosis) -> str:
@@ -241,36 +236,25 @@ def _gain_sentence(diagnosis: Diagnosis) -> str:
         return 'No extended model is offered: the model is unchanged.'
     if gain is None:
         return 'An extended model is offered; its gain was not measured.'
-    model = ('The extended model' if is_extended
-             else f'The model, {_model_values_phrase(diagnosis.model)} alone,')
-    what, change, unit = gain.rows()[0]
+    model = 'The extended model'
     if not diagnosis.model.terms:
         model = 'A model with the best bias and scale factor error is not offered: it'
-    return (f'{model} {_change_phrase(change, unit, f"the {what}")}, measured on '
+    elif not is_extended:
+        values = []  # with their intervals of 95 %
+        for effect, parameter, value, deviation in diagnosis.model.estimates():
+            half = NORMAL_QUANTILE_975 * deviation if math.isfinite(deviation) else 0.0
+            size = Estimate.from_half_width(value, half, parameter.unit)
+            values.append(f'{readable_name(effect)} {format_quantity(size, effect)}')
+        model = f'The model, {" and ".join(values)} alone,'
+    what, change, unit = gain.rows()[0]
+    does, note = 'changes', '; the 95 % interval of the reduction includes zero'
+    if change.interval is None:
+        note = '; one part was held out, so there is no interval'
+    elif change.interval[0] > 0.0 or change.is_worse:
+        does, note = 'increases' if change.is_worse else 'reduces', ''
+    return (f'{model} {does} the {what} from {format_amount(change.before, unit)} to '
+            f'{format_amount(change.after, unit)} rms{note}, measured on '
             f'{to_printable(gain.held_out)}.')
-
-
-def _model_values_phrase(model: GyroModel) -> str:
-    """Return the fitted values of a model with their intervals of 95 %."""
-    return ' and '.join(
-        f'{readable_name(effect)} '
-        f'{format_quantity(Estimate.from_half_width(value, half, parameter.unit), effect)}'
-        for effect, parameter, value, deviation in model.estimates()
-        for half in [NORMAL_QUANTILE_975 * deviation if math.isfinite(deviation) else 0.0])
-
-
-def _change_phrase(errors: Change, unit: str, what: str) -> str:
-    """Return the change of an error, as the end of a sentence."""
-    before, after = (format_amount(value, unit) for value in (errors.before, errors.after))
-    if errors.interval is None:
-        return (f'changes {what} from {before} to {after} rms; one part was held out, so there '
-                'is no interval')
-    if errors.interval[0] > 0.0:
-        return f'reduces {what} from {before} to {after} rms'
-    if errors.is_worse:
-        return f'increases {what} from {before} to {after} rms'
-    return (f'changes {what} from {before} to {after} rms; the 95 % interval of the reduction '
-            'includes zero')
 
 
 # causes, and lists of what else there is to say
@@ -297,23 +281,19 @@ def cause_paragraphs(found: Finding, diagnosis: Diagnosis) -> list[str]:
         detectable = ('smallest detectable: '
                       f'{format_amount(found.minimum_detectable, first.unit, name, 2)} in '
                       f'{100.0 * DETECTION_POWER:g} % of logs')
-    remedy = ('it is in the extended model' if is_in_extended_model(found, diagnosis)
-              else f'remedy: {found.remedy}' if found.remedy else '')
-    paragraphs = [(found.cause, found.evidence, status, detectable),
-                  (_alternatives(found),), (remedy,)]
-    return list(filter(None, (_join(*map(as_sentence, each)) for each in paragraphs)))
-
-
-def _alternatives(found: Finding) -> str:
-    """Return the alternatives and the experiment that would distinguish them; '' without any."""
-    if not found.ambiguous_with:
-        return ''
-    others = join_list([readable_name(name) for name in found.ambiguous_with], 'or')
-    experiment = found.separate_by.rstrip('.')
-    way = (f' To distinguish them: {experiment}.' if experiment
-           else ' No experiment is known that would distinguish them.')
-    stated = experiment and experiment in found.remedy
-    return f'These data do not exclude {others} instead.{"" if stated else way}'
+    paragraphs = [_join(*map(as_sentence, (found.cause, found.evidence, status, detectable)))]
+    if found.ambiguous_with:
+        others = join_list([readable_name(name) for name in found.ambiguous_with], 'or')
+        experiment = found.separate_by.rstrip('.')
+        way = ('' if experiment and experiment in found.remedy
+               else f' To distinguish them: {experiment}.' if experiment
+               else ' No experiment is known that would distinguish them.')
+        paragraphs.append(as_sentence(f'These data do not exclude {others} instead.{way}'))
+    if is_in_extended_model(found, diagnosis):
+        paragraphs.append('It is in the extended model.')
+    elif found.remedy:
+        paragraphs.append(as_sentence(f'remedy: {found.remedy}'))
+    return list(filter(None, paragraphs))
 
 
 def lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
