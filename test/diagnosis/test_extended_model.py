@@ -123,7 +123,7 @@ def test_delays_and_paces_of_clocks_add_up(name, own, found):
 
 @pytest.mark.parametrize('name, own, shape',
                          [('thermal_lag', (120.0, 1e-4), 300.0), ('warm_up', (30.0, 1e-3), 90.0),
-                          ('bandwidth', (0.02,), 0.05), ('time_offset', (0.9,), 0.2)])
+                          ('bandwidth', (0.02,), 0.05), ('time_offset', (1.9,), 0.2)])
 def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, own, shape):
     model, outcome = on_top(term(name, *own), name, shape)
     (out,) = unmergeable_causes(model, outcome)
