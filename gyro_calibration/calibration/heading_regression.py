@@ -513,11 +513,12 @@ class Spans:
                                                  self.rest_durations), self.rest_rounding))
         # a smoothed reference errs in proportion to the acceleration, by less than this, s²; the
         # variance of the times by which one of both is late is seldom above their mean squared
-        smoothing, changes = SMOOTHING_DEVIATION, self.acceleration_changes
-        if self.treatment.is_fine:
-            smoothing, changes = min(0.5 * self.delay ** 2, smoothing), self._likely_lag_column
-        if smoothing:
-            single.append(('smoothing', changes(), smoothing))
+        if not self.treatment.is_fine:
+            single.append(('smoothing', self.acceleration_changes(), SMOOTHING_DEVIATION))
+        elif self.delay:
+            lag, unknown = self._lag_columns().T
+            single += [('smoothing', lag, min(0.5 * self.delay ** 2, SMOOTHING_DEVIATION)),
+                       ('lag', unknown, 1.0)]
         for name, column, size in single:
             waves = np.column_stack([waves, column])
             parts = [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
@@ -525,13 +526,15 @@ class Spans:
                                  (size, size))]
         return waves, parts
 
-    def _likely_lag_column(self) -> Array:
+    def _lag_columns(self) -> Array:
         """
-        Return the column of a lag without its noise, shape (n + r,).
+        Return the column of a lag without its noise, and what its noise leaves open, (n + r, 2).
 
-        What scale factor error, bias and delay do not explain of it may be noise of the gyro,
-        which would pass for information about the lag. It is left out unless the reference shows
-        most of it too, less two standard deviations.
+        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro,
+        which would make the lag too small. It is reduced to the share that the reference shows
+        too (regression calibration, Carroll and others 2006), if that is beyond chance. The error
+        of that share, and what noise in both columns and observations may do, is an error of the
+        lag, which the others take up.
         """
         assert self.log.time is not None and self.log.output is not None
         time, columns = self.log.time, self.base_columns()
@@ -539,12 +542,23 @@ class Spans:
         turned = np.column_stack([self.point_means(integrate_with_curvature(
             time, self.log.output), self.log.output), self.heading])
         rates = CubicSpline(self.time, turned)((1.0 + self.clock_rate) * time - self.delay, 1).T
-        both = np.column_stack([column, *(
-            -self.span_changes(np.gradient(self._smooth(each), time)) for each in rates)])
-        left = both - columns @ np.linalg.lstsq(columns, both, rcond=None)[0]
-        own, common, other = (left[:, one] @ left[:, two] for one, two in ((1, 1), (1, 2), (2, 2)))
-        chance = 2.0 * math.sqrt(own * other / max(float(self._motion_share.sum()), 1.0))
-        return np.asarray(column if common - chance > 0.5 * own else column - left[:, 0])
+        seen = np.column_stack([column, *(
+            -self.span_changes(np.gradient(self._smooth(each), time)) for each in rates),
+            self.observed])
+        left = seen - columns @ np.linalg.lstsq(columns, seen, rcond=None)[0]
+        products = left.T @ left
+        common, explained = products[1, 2], column - left[:, 0]
+        chance = math.sqrt(products[1, 1] * products[2, 2] / max(self._motion_share.sum(), 1.0))
+        if common <= 2.0 * chance:
+            return np.column_stack([explained, np.zeros(len(column))])
+        # the points reduce fast accelerations of gyro and reference alike
+        share = min(products[0, 2] ** 2 / max(common * products[0, 0], 1e-300), 1.0)
+        calibrated = explained + share * left[:, 0]
+        # the noise of gyro and of reference, which the observations have too, move these apart
+        by_gyro, by_reference = products[1:3, 3] / common
+        unknown = 0.5 * (abs(by_gyro - by_reference)
+                         + abs(by_gyro + by_reference) * chance / common)
+        return np.column_stack([calibrated, unknown * explained])
 
     def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""

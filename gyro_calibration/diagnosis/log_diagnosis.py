@@ -517,7 +517,8 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
     if is_scale_implausible(fit):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is not added to the model: the motion is too '
-               'small for the noise of gyro and reference; turn faster, in both directions.')
+               'small for the noise of gyro and reference, or has one frequency, at which a lag '
+               'does the same; turn faster, at several rates, in both directions.')
     for name in dict.fromkeys(each.cause for each in unmergeable):
         remedy = ('; remove that one from the given model, and diagnose again' if name in own
                   else '')

@@ -241,12 +241,12 @@ def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
     if cause == 'bandwidth' and not fit.spans.treatment.is_fine:
         return True
     data = whiten_regression(fit, (*fit.causes, CauseTerm(cause)))
-    inverse = np.linalg.pinv(data.design.T @ data.design)
-    values, delay = inverse @ data.design.T @ data.observed, float(fit.values[2])
+    inverse = np.linalg.pinv(data.design)
+    values, delay = inverse @ data.observed, float(fit.values[2])
     # the square of a lag; and the delay that a clock rate leaves
     place, left = ((len(fit.values), 0.5 * delay ** 2) if cause == 'bandwidth'
                    else (2, -fit.spans.delay))
-    return bool(abs(values[place] - left) < 3.0 * math.sqrt(inverse[place, place]))
+    return bool(abs(values[place] - left) < 3.0 * np.linalg.norm(inverse[place]))
 
 
 def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
@@ -379,7 +379,8 @@ def _gyro_noise(fit: SpanFit) -> Noise:
     return Noise(fit.noise_size('angle_random_walk'),
                  **{part.name: fit.noise_size(part.name)
                     if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
-                    for part in fit.spans.bias_wander()[1] if part.name != 'smoothing'})
+                    for part in fit.spans.bias_wander()[1]
+                    if part.name not in ('smoothing', 'lag')})
 
 
 # gain
