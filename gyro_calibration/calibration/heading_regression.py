@@ -516,9 +516,11 @@ class Spans:
         if not self.treatment.is_fine:
             single.append(('smoothing', self.acceleration_changes(), SMOOTHING_DEVIATION))
         elif self.delay:
-            lag, unknown = self._lag_columns().T
-            single += [('smoothing', lag, min(0.5 * self.delay ** 2, SMOOTHING_DEVIATION)),
-                       ('lag', unknown, 1.0)]
+            likely = min(0.5 * self.delay ** 2, SMOOTHING_DEVIATION)
+            lag, explained, unknown = self._lag_columns()
+            # in units of their deviations, which may be tiny
+            single += [('smoothing', likely * lag, 1.0),
+                       ('lag', min(unknown, likely) * explained, 1.0)]
         for name, column, size in single:
             waves = np.column_stack([waves, column])
             parts = [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
@@ -526,15 +528,15 @@ class Spans:
                                  (size, size))]
         return waves, parts
 
-    def _lag_columns(self) -> Array:
+    def _lag_columns(self) -> tuple[Array, Array, float]:
         """
-        Return the column of a lag without its noise, and what its noise leaves open, (n + r, 2).
+        Return the column of a lag without its noise, what others explain of it, both (n + r,).
 
         What scale factor error, bias and delay do not explain of a lag may be noise of the gyro,
         which would make the lag too small. It is reduced to the share that the reference shows
         too (regression calibration, Carroll and others 2006), if that is beyond chance. The error
         of that share, and what noise in both columns and observations may do, is an error of the
-        lag, which the others take up.
+        lag, s², of this deviation, which the others take up.
         """
         assert self.log.time is not None and self.log.output is not None
         time, columns = self.log.time, self.base_columns()
@@ -550,15 +552,14 @@ class Spans:
         common, explained = products[1, 2], column - left[:, 0]
         chance = math.sqrt(products[1, 1] * products[2, 2] / max(self._motion_share.sum(), 1.0))
         if common <= 2.0 * chance:
-            return np.column_stack([explained, np.zeros(len(column))])
+            return explained, explained, 0.0
         # the points reduce fast accelerations of gyro and reference alike
         share = min(products[0, 2] ** 2 / max(common * products[0, 0], 1e-300), 1.0)
-        calibrated = explained + share * left[:, 0]
         # the noise of gyro and of reference, which the observations have too, move these apart
         by_gyro, by_reference = products[1:3, 3] / common
         unknown = 0.5 * (abs(by_gyro - by_reference)
                          + abs(by_gyro + by_reference) * chance / common)
-        return np.column_stack([calibrated, unknown * explained])
+        return explained + share * left[:, 0], explained, float(unknown)
 
     def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""

@@ -659,7 +659,8 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
         # given the other steps, a step between them rests on the stretches there
         data = whiten_regression(with_steps, with_steps.causes)
         influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, places]
-        stretches = effective_clusters(data.clusters[0], influence)
+        inside = data.clusters[0] < data.stretch_count
+        stretches = effective_clusters(data.clusters[0][inside], influence[inside])
         chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * student.sf(
             sigmas, np.maximum(stretches - 1.0, 1.0)))
         weakest = int(chances.argmax())
