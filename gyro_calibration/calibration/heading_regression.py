@@ -92,7 +92,7 @@ _MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
 #: which has no wheels. A scale of odometry is wrong as probably as it is right.
 _WIDE_PRIOR, _WIDE_ODDS_OF_COURSE = (0.3, 10.0 * DEGREE), 1e-3
 #: Prior standard deviation of the smoothing of a course, s².
-SMOOTHING_DEVIATION = 0.1
+_SMOOTHING_DEVIATION = 0.1
 #: Correlations of the errors of a course over a span that are possible.
 _COURSE_CORRELATIONS = (0.0, 0.2, 0.4, 0.6, 0.8)
 #: Names of the values that are always fitted.
@@ -111,6 +111,16 @@ _MAX_VEHICLE_WALK = 5e-4
 #: Least number of spans to determine the noise of a course, and largest deviation of its turn in
 #: a span from that of a gyro that follows it, rad.
 _MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
+
+
+def lag_deviation(delay: float) -> float:
+    """
+    Return the prior standard deviation of the lag that a delay, s, may be, s².
+
+    The variance of the times by which gyro or reference is late, twice this, is from 0 to the
+    square of their mean, of a filter of first order, and at most that of a smoothed course.
+    """
+    return min(0.5 * delay ** 2, _SMOOTHING_DEVIATION)
 
 
 @dataclass(frozen=True)
@@ -219,7 +229,7 @@ class Spans:
 
     @property
     def time_outside(self) -> Array:
-        """Return the mean time of each point before the log of the gyro, or after it, (n + 1,)."""
+        """Return the mean time of each point before the log, or after it, s, shape (n + 1,)."""
         assert self.log.time is not None
         at = self.gyro_stamps(self.value_times)
         outside = at - np.clip(at, self.log.time[0], self.log.time[-1])
@@ -511,12 +521,11 @@ class Spans:
         if self.rest_rounding:
             single.append(('rounding', np.append(np.zeros(len(self.time) - 1),
                                                  self.rest_durations), self.rest_rounding))
-        # a smoothed reference errs in proportion to the acceleration, by less than this, s²; the
-        # variance of the times by which one of both is late is seldom above their mean squared
+        # a smoothed reference errs in proportion to the acceleration
         if not self.treatment.is_fine:
-            single.append(('smoothing', self.acceleration_changes(), SMOOTHING_DEVIATION))
+            single.append(('smoothing', self.acceleration_changes(), _SMOOTHING_DEVIATION))
         elif self.delay:
-            likely = min(0.5 * self.delay ** 2, SMOOTHING_DEVIATION)
+            likely = lag_deviation(self.delay)
             lag, explained, unknown = self._lag_columns()
             # in units of their deviations, which may be tiny
             single += [('smoothing', likely * lag, 1.0),

@@ -26,7 +26,7 @@ from functools import cache, cached_property
 import math
 
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, HEADING_TREATMENT, SMOOTHING_DEVIATION)
+    COURSE_TREATMENT, HEADING_TREATMENT, lag_deviation)
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.diagnosis.gates import (
     heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
@@ -353,16 +353,15 @@ class Replay:
         """
         Return the log with the error that a lag has beside a delay, s, in its shared errors.
 
-        The variance of the times by which gyro or reference is late is from 0 to the square of
-        their mean, of a lag of first order. It is a standard deviation of its prior, unless that
-        is more than a scale factor error by its own prior, as in a fast sine.
+        It is a standard deviation of its prior, unless that is more than a scale factor error by
+        its own prior, as in a fast sine.
         """
         time, distort = self.channels.time, CATALOGUE['time_offset'].distortion
         assert distort is not None
         late = distort(self.channels.rate, time, delay)
         bend = np.gradient(np.gradient(late, time), time)
-        error = bend * min(0.5 * delay ** 2, SMOOTHING_DEVIATION, HEADING_TREATMENT.prior[0]
-                           * float(np.std(late) / max(np.std(bend), np.finfo(float).tiny)))
+        error = bend * min(lag_deviation(delay), HEADING_TREATMENT.prior[0] * float(
+            np.std(late) / max(np.std(bend), np.finfo(float).tiny)))
         left = self.resample(self.channels.output - self.reference + self.channels.rate - late)
         scale = self.error_scale or max(white_noise_deviation(left), np.finfo(float).tiny)
         return replace(self, error_scale=scale, shared_errors=np.concatenate(

@@ -188,7 +188,7 @@ class _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
         causes = [each for each in fit.effects if each not in BASIC_EFFECTS
-                  or model is not None and fit.p_value(each) < _naming_level(each)]
+                  or model is not None and fit.p_value(each) < _significance_level(each)]
         values = {term.effect: term.values for term in fit.terms}
         if BIAS_TEMPERATURE_QUADRATIC in values:
             # If a parabola over temperature has its vertex near the measured ones, the slope is
@@ -223,7 +223,7 @@ def _tested_count(effect: Effect) -> int:
     return basic if effect in BASIC_EFFECTS else len(STATIC_EFFECTS) - basic
 
 
-def _naming_level(effect: Effect) -> float:
+def _significance_level(effect: Effect) -> float:
     """Return the p-value below which a cause is named."""
     share = 0.1 if effect in BASIC_EFFECTS else _CAUSE_ALARM_SHARE
     return share * FALSE_ALARM_RATE / _tested_count(effect)
@@ -363,7 +363,7 @@ def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
     if (by_cubic := fit if fitted is effect else try_replace(fit, effect, fitted)) is not None:
         place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
         detectable = float(
-            uncertainty.half_width(1.0 - _naming_level(effect))[place]
+            uncertainty.half_width(1.0 - _significance_level(effect))[place]
             + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
         if effect is SINE_RESPONSE:
             detectable = math.sqrt(own[0] ** 2 + 6.0 * detectable) - own[0]
