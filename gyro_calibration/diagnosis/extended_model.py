@@ -24,7 +24,7 @@ from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.data_quality import DataQuality
-from gyro_calibration.diagnosis.findings import Change, Finding, Gain, HeadingCurve
+from gyro_calibration.diagnosis.findings import Change, Curve, Finding, Gain
 from gyro_calibration.diagnosis.regression import fit_causes, is_single_event, RegressionFit
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.residuals import NOISE_NAMES
@@ -418,11 +418,11 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
             'left': max(left - reference_square / square, 0.0)}
 
 
-def heading_curve(parts: Mapping[str, Array], time: Array) -> HeadingCurve:
+def heading_curve(parts: Mapping[str, Array], time: Array) -> Curve:
     """Return the heading error of a log and its rest, as `heading_error_shares` splits it."""
     total = sum(parts.values(), 0.0 * parts['left'])
     before, after = (np.concatenate([[0.0], np.cumsum(each)]) for each in (total, parts['left']))
-    return HeadingCurve(time, before, after)
+    return Curve('time', 's', time, before, after)
 
 
 def jackknife_change(square_sums: Array, counts: Array) -> Change:

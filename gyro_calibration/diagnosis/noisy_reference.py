@@ -45,7 +45,7 @@ from gyro_calibration.diagnosis.extended_model import (
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
     probabilities, Reference, RULED_OUT_DEFICIT, SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR,
-    TIME_LIMIT_REMARK, Trace, VALUE_ALARM_SHARE)
+    TIME_LIMIT_REMARK, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
@@ -473,7 +473,7 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
                f'{100.0 * done.half_width(0):.2g} %: turn more often, in both directions.')
 
 
-def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
+def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Curve]:
     """Return the residual along the rate, and the measured and simulated rate over time."""
     steps, time = np.diff(fit.spans.time), fit.spans.time
     assert fit.spans.log.output is not None
@@ -485,7 +485,8 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
     return (Curve('rate', 'rad/s', at, given, left, deviation, np.zeros(len(order))),
-            Trace(time[:-1] + 0.5 * steps, measured, measured - before, measured - after))
+            Curve('time', 's', time[:-1] + 0.5 * steps, before, after,
+                  simulated=measured - before))
 
 
 # the search

@@ -25,7 +25,7 @@ from typing import TypeAlias
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
-from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve, RULED_OUT_DEFICIT
+from gyro_calibration.diagnosis.findings import Curve, RULED_OUT_DEFICIT
 from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, NoiseShape, Replay, spline_derivative_gain)
@@ -347,22 +347,23 @@ def _amplitude_spectrum(before: Sequence[Array], after: RegressionFit) -> Curve:
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
     counts = np.diff(np.append(edges, len(frequency)))
     usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges) / counts)
-    return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
+    return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual)
 
 
-def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> HeadingCurve:
+def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Curve:
     """Return the heading error over the first log, by its residual before and after extension."""
     each = after.problem.replays[0]
     lines = [np.cumsum(each.resample(left[0])) * each.point_interval
              for left in (before, after.unbiased_residuals)]
-    return HeadingCurve(np.arange(each.point_count) * each.point_interval, *lines)
+    return Curve('time', 's', np.arange(each.point_count) * each.point_interval, *lines)
 
 
-def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> NoiseCurve:
+def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> Curve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
     each = fit.problem.replays[0]
     allan = allan_deviation(each.resample(fit.residuals[0]), each.point_interval)
     times = allan.time
-    return NoiseCurve(
-        times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
-        np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk else None)
+    return Curve(
+        'averaging time', 's', times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
+        simulated=(np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk
+                   else None))
