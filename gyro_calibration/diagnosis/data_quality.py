@@ -334,12 +334,8 @@ class DataQuality:
     findings: tuple[Finding, ...]  # one for each cause
     remarks: tuple[str, ...]  # for people, one sentence each
     usable: Mask  # the samples to use, shape (n,)
-    # by which the output is multiplied to be in rad/s; 1 if the unit is right
-    unit_factor: float = 1.0
-    # largest absolute output, rad/s after the factor; None without a limit
-    limit: float | None = None
-    # quantization step of the output, rad/s after the factor; 0 if it does not matter
-    output_step: float = 0.0
+    limit: float | None = None  # largest absolute output, rad/s; None without a limit
+    output_step: float = 0.0  # quantization step of the output, rad/s; 0 if it does not matter
     heading_step: float = 0.0  # quantization step of the reference heading, rad; 0 without one
 
 
@@ -367,7 +363,7 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
                           for each in (sharp, rate))
         rate = sharp if off_sharp <= off else rate
         line = fit_line(log.time, rate, output) or line
-    factor, units = 1.0, []
+    units = []
     if rate is not None and line is not None:
         # a factor in addition to the scale factor of the model
         own = 1.0 if model is None else model_scale_factor(model, rate)
@@ -381,21 +377,21 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         if name is not None and (best is None or abs(best.factor - 1.0) >= abs(
                 best.factor - 1.0 / UNIT_FACTORS[name]) or abs(
                 best.factor - 1.0 / UNIT_FACTORS[name]) <= 5.0 * best.deviation):
-            factor = 1.0 / UNIT_FACTORS[name]
+            is_plausible = not is_implausible_factor(ratio)
             units = [_sized_finding(
                 'unit_error', ratio, NORMAL_QUANTILE_975 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
                 f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
-                f'{name} is {UNIT_FACTORS[name]:.5g}',
-                () if is_implausible_factor(ratio) else ('scale_factor_error',))]
+                f'{name} is {UNIT_FACTORS[name]:.5g}'
+                + '; a new model has it as a scale factor error' * is_plausible,
+                ('scale_factor_error',) * is_plausible)]
     if log.time is None:
-        return DataQuality(tuple(units), notes, has_output, factor)
+        return DataQuality(tuple(units), notes, has_output)
     lost, remarks = _check_stamps(log.time, has_output)
-    output = output * factor
     whole, noise = bridge_gaps(output), white_noise_deviation(output)
     comparison = _Comparison(whole, None, noise, noise)
     if rate is not None and line is not None:
-        expected = factor * (line.factor * rate + line.offset)
+        expected = line.factor * rate + line.offset
         off = (output - expected)[np.isfinite(output) & np.isfinite(expected)]
         noise = min(noise, white_noise_deviation(output - expected))
         comparison = _Comparison(whole, expected, noise, max(
@@ -403,24 +399,8 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     heading = log.reference_heading if log.reference_rate is None else None
     step = (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
             else encoder_step(heading))
-    return _check_samples(DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
+    return _check_samples(DataQuality((*units, *lost), (*notes, *remarks), has_output,
                                       heading_step=step), comparison, model, log.time)
-
-
-def resolve_unit(quality: DataQuality) -> DataQuality:
-    """Return the treatment of the unit; a factor that a gyro may have is a scale factor error."""
-    if quality.unit_factor == 1.0:
-        return quality
-    if is_implausible_factor(quality.unit_factor):
-        note = (f'The output was multiplied by {quality.unit_factor:.6g} first, and a new model '
-                'applies to the corrected output: correct the unit or the sign of the log (its '
-                'column, --sensitivity, --invert) before it is compensated.')
-        return replace(quality, remarks=(*quality.remarks, note))
-    note = (f'The output was not multiplied by {quality.unit_factor:.6g}, as this factor may '
-            'belong to the gyro: a new model contains it as a scale factor error.')
-    return replace(quality, unit_factor=1.0, output_step=quality.output_step / quality.unit_factor,
-                   limit=None if quality.limit is None else quality.limit / quality.unit_factor,
-                   remarks=(*quality.remarks, note))
 
 
 def _sized_finding(name: str, value: float, half_width: float, p_value: float, evidence: str,

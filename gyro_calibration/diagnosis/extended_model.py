@@ -80,8 +80,10 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     figures = figures if given.noise.angle_random_walk else noise
     bounds = {name: ends for name, ends in given.noise_bounds.items()
               if getattr(figures, name) == getattr(given.noise, name)}
-    return add_origin_notes(replace(new, noise=figures, noise_bounds=bounds), given, quality,
-                            findings)
+    used = {term.effect.name for term in new.terms if term not in given.terms}
+    notes = ambiguity_notes([each for each in findings if each.effect in used])
+    return replace(new, noise=figures, noise_bounds=bounds,
+                   origin={**notes, **previous_origins(given)})
 
 
 def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> GyroModel:
@@ -126,22 +128,11 @@ def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
         temperature_range=widen_range(model.temperature_range, temperatures, has_ranges))
 
 
-def add_origin_notes(new: GyroModel, base_model: GyroModel, quality: Sequence[DataQuality],
-                     findings: Sequence[Finding] = ()) -> GyroModel:
-    """Return a new model with its ambiguities, output factors and predecessor in its origin."""
-    used = {term.effect.name for term in new.terms if term not in base_model.terms}
-    notes = origin_notes([each for each in findings if each.effect in used],
-                         [clean.unit_factor for clean in quality])
-    return replace(new, origin={**notes, **previous_origins(base_model)})
-
-
-def origin_notes(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
-    """Return the notes on ambiguous findings and on factors of the output for a model file."""
+def ambiguity_notes(findings: Sequence[Finding]) -> dict[str, object]:
+    """Return the note on ambiguous findings for a model file."""
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
             for each in findings if each.ambiguous_with]
-    output_factors = list(factors) if any(factor != 1.0 for factor in factors) else []
-    return {name: note for name, note in (('ambiguous', sets),
-                                          ('output_multiplied_by', output_factors)) if note}
+    return {'ambiguous': sets} if sets else {}
 
 
 def previous_origins(model: GyroModel) -> dict[str, object]:

@@ -36,13 +36,14 @@ from gyro_calibration.calibration.reference_noise import (
     heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
-from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate, Reference
+from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
     Array, DataRefused, DEGREE, Log, MAX_PLAUSIBLE_FACTOR, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_codes, robust_deviation, white_noise_deviation)
 from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy import stats
 from scipy.interpolate import make_interp_spline
@@ -690,20 +691,23 @@ _GATE_SENTENCES = {
     'model': 'The model has other units than the log, or belongs to another gyro.'}
 
 
-def mismatch_finding(results: Sequence[Gate]) -> Finding | None:
-    """Return the finding of a gate that failed, or None."""
+def mismatch_diagnosis(results: tuple[Gate, ...], model: GyroModel | None) -> Diagnosis | None:
+    """Return the diagnosis of a log of which a gate failed, with a given model; otherwise None."""
     failed = next((gate for gate in results if gate.passed is False), None)
     if failed is None:
         return None
     parameters = {} if failed.factor is None else {'unit_error': Estimate(*failed.factor, '1')}
-    return Finding('unit_error' if parameters else failed.name, _GATE_SENTENCES[failed.name],
-                   parameters, 0.0, evidence=failed.evidence, along='rate', remedy=failed.remedy)
+    found = Finding('unit_error' if parameters else failed.name, _GATE_SENTENCES[failed.name],
+                    parameters, 0.0, evidence=failed.evidence, along='rate', remedy=failed.remedy)
+    own = model or GyroModel()
+    return Diagnosis((found,), (), Noise(), own.noise, None, own, own, gates=results)
 
 
 def refuse_mismatch(log: Log) -> None:
     """Raise `DataRefused` where a gate fails, with its evidence and remedy."""
-    failed = mismatch_finding(check_gates(log))
-    if failed is not None:
+    mismatch = mismatch_diagnosis(check_gates(log), None)
+    if mismatch is not None:
+        (failed,) = mismatch.findings
         raise DataRefused(f'{failed.cause[:1].lower()}{failed.cause[1:].rstrip(".")} '
                           f'({failed.evidence}): {failed.remedy}')
 

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells import find_dwells, require_output
+from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
@@ -29,18 +29,17 @@ from gyro_calibration.diagnosis.candidates import (
 from gyro_calibration.diagnosis.causes import (
     add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected, next_experiment,
     REFERENCES, SINGLE_EVENT_REMEDY, untestable_causes)
-from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
+from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    add_causes, add_origin_notes, drop_samples, extend_model, heading_contributions,
-    heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
-    unmergeable_causes)
+    add_causes, drop_samples, extend_model, heading_contributions, heading_error_shares,
+    is_scale_implausible, measure_gain, merge_self_calibration, unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
     DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED,
     OnProgress, probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
     VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.gates import (
     check_gates, check_model_units, classify_reference, is_at_rest,
-    is_reference_limiting, is_sample_offset, mismatch_finding, refuse_unusable)
+    is_reference_limiting, is_sample_offset, mismatch_diagnosis, refuse_unusable)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference, FollowedReference, follows_rate, HIDDEN_CAUSES, is_late)
@@ -111,16 +110,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
         passed = check_gates(log, model, reference_kind == 'rate_command')
-        failed = mismatch_finding(passed)
-        if failed is None or failed.effect != 'wrapped_heading':
+        mismatch = mismatch_diagnosis(passed, given_model)
+        if mismatch is None or passed[-1].name != 'wrapped_heading':
             refuse_unusable(given[place])
-        if failed is None and model is not None:
+        if mismatch is None and model is not None:
             passed = (*passed, check_model_units(log, model))
-            failed = mismatch_finding(passed)
-        if failed is not None:
-            own = given_model or GyroModel()
-            return Diagnosis((failed,), (), Noise(), own.noise, None, own, own,
-                             logs=tuple(names[place:place + 1]), gates=passed)
+            mismatch = mismatch_diagnosis(passed, given_model)
+        if mismatch is not None:
+            return replace(mismatch, logs=tuple(names[place:place + 1]))
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
     logs, slips = zip(*(_bridge_jumps(log, each.kind, remarks)
@@ -187,10 +184,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                                  is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
     on_progress(None, 'data quality')
-    quality = [resolve_unit(inspect_record(log, model)) for log in logs]
+    quality = [inspect_record(log, model) for log in logs]
     on_progress(None, 'replay of the model')
-    replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
-                      generator, clean.heading_step, clean.output_step, model)
+    replays = [replay(log, clean.usable, generator, clean.heading_step, clean.output_step, model)
                for log, clean in zip(logs, quality)]
     searched = _search_logs(logs, replays, rate, on_progress, is_command)
     search = searched.search
@@ -235,7 +231,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     plain = fit_causes(search.problem, [])
     deviation = _mean_bias_deviation(inside, noise)
     best = replace(add_causes(GyroModel(), plain, deviation), noise=noise)
-    before = model or add_origin_notes(best, GyroModel(), quality)
+    before = model or best
     after = extend_model(model, inside, quality, findings, noise, deviation) if offered else before
     # Curves before the extension contain the best bias and scale factor error, unless these differ
     # significantly from those of the model.
