@@ -290,44 +290,28 @@ class _Searched:
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                  on_progress: OnProgress, is_command: bool) -> _Searched:
     """Search for causes, given the motion that follows where a log follows its reference."""
-    def find_settled(fit: RegressionFit, follows: bool) -> tuple[Mask, Unexplained] | None:
-        """Return the samples in dwells if the residual is larger between them."""
-        if len(logs) > 1 or logs[0].reference_rate is None:
-            return None
-        motion = replace(logs[0], reference_rate=fit.problem.replays[0].channels.rate)
-        return (_find_settled(motion, fit, rate, follows)
-                or _find_settled(logs[0], fit, rate, follows))
-
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
     follows = follows_rate(replays) and (is_command or is_late(plain))
-    settled = None
     if not follows:
         replays = _drop_unknown_ends(plain, rate)
         found = _search_replays(replays, rate, on_progress)
         replays = found.search.problem.replays
-        responds = RESPONSE in {each.cause for each in found.causes}
-        settled = find_settled(fit_causes(found.search.problem, found.causes), responds)
-        if not responds and not settled:
+        if RESPONSE not in {each.cause for each in found.causes}:
             return found
     followed = follow_reference(replays, follows)
     moved = fit_causes(build_problem(followed.replays), [])
-    if follows:
-        settled = find_settled(moved, True)
-    replays = ([drop_samples(followed.replays[0], ~settled[0])] if settled
-               else followed.replays)
+    within = _find_settled(moved, rate) if follows and len(logs) == 1 else None
+    replays = (followed.replays if within is None
+               else [drop_samples(followed.replays[0], ~within)])
     found = _search_replays(replays, rate, on_progress, {RESPONSE, *HIDDEN_CAUSES})
     if follows:
-        found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
-                        followed=followed)
-    elif settled:
-        found = replace(found, unexplained=[settled[1]])
-    else:
-        before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
-                         for each in (fit_causes(plain.problem, []), moved))
-        found = replace(found, unexplained=[Unexplained(
-            'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
-    return replace(found, remarks=[_SETTLED_REMARK] if settled else [])
+        return replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
+                       remarks=[] if within is None else [_SETTLED_REMARK], followed=followed)
+    before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
+                     for each in (fit_causes(plain.problem, []), moved))
+    return replace(found, unexplained=[Unexplained(
+        'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
 
 
 def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
@@ -359,49 +343,33 @@ def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgr
     return _Searched(search, causes, without)
 
 
-def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
-                  follows: bool) -> tuple[Mask, Unexplained] | None:
+def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
     """
-    Return the samples of a log in dwells if the residual is larger between them; otherwise None.
+    Return the samples in dwells of a motion if the residual is larger between them, or None.
 
-    The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
-    with dynamics that no cause describes. The mean squares of the residual, whitened in the second
-    case, are compared stretch by stretch (Mann and Whitney). Unless the response of the motion is
-    among the causes, they have to be twice as large between dwells. Dwells of less than half the
-    range of rates, such as rests alone, do not show what the motion does.
+    The motion then has more of its own than a response to its command. The mean squares of the
+    residual are compared stretch by stretch (Mann and Whitney). Dwells of less than half the range
+    of rates, such as rests alone, do not show what the motion does.
     """
+    replay, = fit.problem.replays
+    time, rate = replay.channels.time, np.asarray(replay.channels.rate)
     try:
-        dwells = find_dwells(log)
+        dwells = find_dwells(Log(time=time, output=replay.channels.output, reference_rate=rate))
     except DataRefused:
         return None
-    channels = fit.problem.replays[0].channels
-    if np.ptp(dwells.rate) < 0.5 * np.ptp(np.asarray(channels.rate)):
+    if np.ptp(dwells.rate) < 0.5 * np.ptp(rate):
         return None
-    time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
-    replay = fit.problem.replays[0]
-    if not follows and len(replay.shared_errors):  # it rests where the rate does
-        return None
-    if follows:  # whitening would spread what is between dwells
-        left, inside = fit.unbiased_residuals[0][replay.valid], within[replay.valid]
-    else:
-        left = fit.whitened_series()[0]
-        at = time[replay.valid][0] + replay.point_interval * np.arange(len(left))
-        inside = within[np.clip(np.searchsorted(time, at), 0, len(time) - 1)]
+    squares, inside = fit.unbiased_residuals[0][replay.valid] ** 2, within[replay.valid]
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
-    squares = np.add.reduceat(left ** 2, begin) / np.diff(np.append(begin, len(left)))
-    steady, between = squares[inside[begin]], squares[~inside[begin]]
+    means = np.add.reduceat(squares, begin) / np.diff(np.append(begin, len(squares)))
+    steady, between = means[inside[begin]], means[~inside[begin]]
     if len(replay.shared_errors):
         steady = np.maximum(steady, replay.output_step ** 2 / 12.0)
-    if (min(len(steady), len(between)) < MIN_STRETCHES
-            or not follows and np.median(between) < 2.0 * np.median(steady)):
+    if (min(len(steady), len(between)) < MIN_STRETCHES or mannwhitneyu(
+            between, steady, alternative='greater').pvalue > false_alarm_rate):
         return None
-    chance = float(mannwhitneyu(between, steady, alternative='greater').pvalue)
-    if chance > (1.0 if follows else VALUE_ALARM_SHARE) * false_alarm_rate:
-        return None
-    excess = left[~inside] ** 2 - np.median(steady)
-    return within, Unexplained(
-        'rate_change', float(max(excess.sum(), 0.0) / (left @ left)), chance)
+    return within
 
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
