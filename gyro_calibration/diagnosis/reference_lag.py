@@ -35,11 +35,8 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import (
     cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
-from gyro_calibration.logs.quality import white_noise_deviation
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
-from scipy.signal import oaconvolve
 from scipy.stats import norm
 
 #: Causes that cannot be told from the dynamics of a motion, which may also vibrate.
@@ -63,9 +60,6 @@ _MAX_PRIOR_SHARE = 0.5
 #: number of samples; number of lags of the response to the limited command, and the longest, s.
 _FIRST_LIMITS, _LIMIT_STEP, _LIMITED_SAMPLES = 0.25 * 2.0 ** np.arange(7), 0.005, 16384
 _LIMITED_LAGS, _LIMITED_LAG = 24, 2.0
-#: Standard deviations of the times of commands that are tried, in samples.
-_CHANGE_DEVIATIONS = 0.1 * 2.0 ** np.arange(6)
-NP = 4
 
 
 @dataclass(frozen=True)
@@ -148,39 +142,35 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     known = time[np.isfinite(plain.reference)]
     begins = np.append(time[0], known[1:][np.diff(known) > LEAD + plain.interval])
     unknown = time - begins[np.searchsorted(begins, time, 'right') - 1] < longest[len(kernels) - 1]
-    tried = [(each, _response_transforms(each, kernels)) for each in (
-        drop_samples(each, unknown) for each in (plain, limited))]
-    fits = [_fit_response(transforms, 1, kernels @ lags) for _, transforms in tried]
+    tried = [drop_samples(each, unknown) for each in (plain, limited)]
+    # of command, delayed commands, and residual
+    transforms = [np.array([cosine_transform(each.resample(values)) for values in (
+        each.channels.rate, *each.delayed_commands(kernels),
+        each.channels.output - each.reference)]) for each in tried]
+    fits = [_fit_response(each, 1, kernels @ lags) for each in transforms]
     # Two limits have to be worth their number (Schwarz), by as many independent errors as there
     # are changes of the command: most errors are after these, and by their time between samples.
     share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
     chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
-    moved, (rate, *seen) = tried[chosen]
-    late = moved
-    between: Array = np.zeros(len(time))
-    fitted, others = fits[chosen], list[Array]()
+    moved, (rate, *seen) = tried[chosen], transforms[chosen]
+    late, fitted, own = moved, fits[chosen], [rate]
     for _ in range(2):
-        if others:
-            motion, *own = (cosine_transform(late.resample(each)) for each in (
-                moved.channels.rate, *others))
-            # what an effect has in common with the motion would pass for a part of it
-            own = [rate, *(each - motion * (motion @ each) / (motion @ motion) for each in own)]
-            seen[-1] -= cosine_transform(late.resample(between))
-            fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
-                                   len(own), kernels @ lags)
         response = fitted.values @ kernels
-        change = next(late.delayed_commands(response[None])) + between
         # effects along this motion would otherwise pass for a longer response
-        moved = replace(late.with_motion(change), responses=fitted.independent @ kernels,
+        moved = replace(late.with_motion(next(late.delayed_commands(response[None]))),
+                        responses=fitted.independent @ kernels,
                         response_noise=moved.response_noise)
         fit = fit_causes(build_problem([moved]), [])
-        more = _changes_between_samples(moved, response, fit.unbiased_residuals[0] + between)
-        if more.any():
-            moved = moved.with_motion(more - between)
-            between, fit = more, fit_causes(build_problem([moved]), [])
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
-        others = [column for name in _MOTION_EFFECTS
-                  for column in effect_candidate(name).columns(moved)]
+        if len(own) > 1:
+            break
+        motion, *others = (cosine_transform(late.resample(each)) for each in (
+            moved.channels.rate, *(column for name in _MOTION_EFFECTS
+                                   for column in effect_candidate(name).columns(moved))))
+        # what an effect has in common with the motion would pass for a part of it
+        own += [each - motion * (motion @ each) / (motion @ motion) for each in others]
+        fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
+                               len(own), kernels @ lags)
     most = _MAX_PRIOR_SHARE * HEADING_TREATMENT.prior[0]
     # on average no motion is ahead of its command
     if is_command and (fitted.scale_deviation > most or response @ lags < -LEAD):
@@ -191,58 +181,6 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     return (moved, Estimate.from_half_width(
         float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's'),
         limits if chosen else np.full(2, math.inf))
-
-
-def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Array:
-    """
-    Return what is left of the output by changes of the command between samples, rad/s, (n,).
-
-    A change is earlier than the sample that shows it, or is followed after an uneven time. Such
-    times are normal, with the likeliest standard deviation, if it is worth its number (Schwarz);
-    otherwise, or where the responses to the changes overlap, zeros are returned.
-    """
-    grid, command = replay.held_command
-    lead = -round(kernel_lags(replay.interval)[0] / replay.interval)
-    known = replay.valid & np.isfinite(left)
-    whole = np.zeros(len(command))
-    whole[grid[known]] = left[known]
-    noise = white_noise_deviation(left[known])
-    alike = oaconvolve(response, response[::-1])[len(response) - 1:]
-    sizes = np.diff(command)
-    at = np.flatnonzero(np.abs(sizes) * math.sqrt(alike[0]) > noise)
-    alike = alike[:np.flatnonzero(np.abs(alike) > _MIN_RATIO * alike[0])[-1] + 1]
-    if not 0 < len(at) * len(alike) < len(command):
-        return np.zeros(len(left))
-    sizes, alike = sizes[at], alike * np.linspace(1.0, 0.0, len(alike), endpoint=False)
-    seen = sizes * oaconvolve(whole, response[::-1])[at - lead + len(response) - 1]
-    width = int(np.max(np.searchsorted(at, at + len(alike)) - np.arange(len(at))))
-    bands = np.zeros((width, len(at)))
-    for place, band in enumerate(bands):
-        apart = at[place:] - at[:len(at) - place]
-        band[:len(apart)] = (np.append(alike, 0.0)[np.minimum(apart, len(alike))]
-                             * sizes[place:] * sizes[:len(apart)])
-    count, added = np.count_nonzero(known), np.zeros(len(command))
-    best = count * math.log(whole @ whole) - math.log(count)
-    for deviation in _CHANGE_DEVIATIONS:
-        ratio = (deviation / noise) ** 2
-        factor = cholesky_banded(ratio * bands + np.eye(width, 1), lower=True)
-        delays = ratio * cho_solve_banded((factor, True), seen)
-        impulses = np.zeros(len(command))
-        impulses[at] = sizes * delays
-        tried = oaconvolve(np.pad(impulses, (len(response) - 1 - lead, lead)), response, 'valid')
-        rest = left[known] - tried[grid[known]]
-        criterion = (count * math.log(rest @ rest + delays @ delays / ratio)
-                     + 2.0 * float(np.log(factor[0]).sum()))
-        if criterion < best:
-            best, added = criterion, tried
-    return np.asarray(added[grid])
-
-
-def _response_transforms(replay: Replay, kernels: Array) -> Array:
-    """Return those of command, delayed commands, and residual, shape (k + 2, points - 1)."""
-    return np.array([cosine_transform(replay.resample(each)) for each in (
-        replay.channels.rate, *replay.delayed_commands(kernels),
-        replay.channels.output - replay.reference)])
 
 
 def _limit_acceleration(command: Array, interval: float, limits: Array) -> Array:
