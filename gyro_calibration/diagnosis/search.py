@@ -34,9 +34,8 @@ from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
     OnProgress, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.diagnosis.regression import (
-    build_problem, column_evidence, ColumnGroups, fit_causes, free_amplitude, group_columns,
-    Indices, is_rate_distortion, likelihood_with, likelihood_without, MIN_INDEPENDENT_SHARE,
-    RegressionFit, RegressionProblem)
+    build_problem, column_evidence, ColumnGroups, fit_causes, group_columns, Indices,
+    is_rate_distortion, likelihood_with, MIN_INDEPENDENT_SHARE, RegressionFit, RegressionProblem)
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, inverse_cosine_transform, Replay)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
@@ -66,6 +65,8 @@ _MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 _SHAPE_RANGE = 0.8
 #: Effects of fixed amplitude that grow with their shapes.
 _GROWING_EFFECTS = ('sine_response', 'time_offset', 'bandwidth', 'clock_rate')
+#: Name of one of them as a column with an amplitude.
+_FREE_DISTORTION = 'distortion'
 #: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
 #: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
 #: same level, so that no single stretch establishes a cause.
@@ -241,7 +242,9 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
     # those of smooth columns follow by Gauss-Newton steps
     for place in places[:1] if smooth_shapes(candidate) else places:
         if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
-            ratio = free_amplitude(fit, candidate)
+            free = replace(candidate, cause=_FREE_DISTORTION, amplitude=None)
+            ratio = fit_causes(fit.problem, [*fit.causes, free]).coefficients(
+                len(fit.causes))[0].value
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
@@ -538,7 +541,7 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
     """
     fit = fit_causes(search.problem, causes)
     rest = _without(causes, cause_index)
-    without = likelihood_without(fit, cause_index)
+    without = fit_causes(search.problem, rest).log_likelihood
     if is_rate_distortion(causes[cause_index].cause) and any(
             is_rate_distortion(each.cause) for each in rest):
         without = max(without, fit_causes(
