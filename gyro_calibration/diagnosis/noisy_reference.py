@@ -62,7 +62,6 @@ from scipy.stats import t as student
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Standard deviations of a value that is found in 95 % of logs.
 _DETECTION_SIGMAS = 4.8
-_CLOCK_REMEDY = ('synchronize the clocks of gyro and reference; the model does not contain it')
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -79,18 +78,8 @@ _METHOD_TEXT = (
 #: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropped_samples',
                   'unit_error', 'quantization', 'saturation'}
-#: Largest number of parts of a log for cross-fitting.
-_FOLD_COUNT = 5
-#: Largest effect along the rate that is established, as a share of the rate: two standard
-#: deviations of the prior of a scale factor error. Larger ones result from several similar columns
-#: that nearly cancel each other.
-_MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
-#: Most steps of the search for the k of a sine response, each of which multiplies its error.
-_SHAPE_STEPS = 20
 #: Correlation of the columns of two steps of the bias above which spans do not distinguish them.
 _MAX_ALIKENESS = 0.999
-#: Variables whose causes are similar to errors of an encoder that repeat with its position.
-_MOTION_VARIABLES = frozenset({'rate', 'heading'})
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
@@ -143,7 +132,8 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     of_record = {each.effect for each in record.findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
-    findings = [replace(each, remedy=_CLOCK_REMEDY)
+    findings = [replace(each, remedy='synchronize the clocks of gyro and reference; the model '
+                                     'does not contain it')
                 if each.effect in of_clocks and each.status == 'established' else each
                 for each in findings]
     changed = any(each.status == 'established' and CAUSES[each.effect].origin == 'gyro'
@@ -597,7 +587,7 @@ def _fit_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm) -> list[
         return [term]
     # beyond a quarter of a wave the output would fall while the rate increases
     largest = 0.5 * math.pi / float(np.abs(spans.channels.rate).max())
-    for _ in range(_SHAPE_STEPS):
+    for _ in range(20):  # each of which multiplies its error
         column, left = _given_design(data, data.whiten_columns(spans.cause_columns(term)))
         square = float(np.sum(column ** 2))
         amplitude = float(left @ column[:, 0]) / square if square > 0.0 else 0.0
@@ -709,7 +699,10 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
         return 0.0
     columns = CATALOGUE[cause.cause].columns(fit.spans.channels, *cause.shapes)
     added = np.abs(np.tensordot(values, np.array(columns), 1)).max()
-    return float(added / np.abs(fit.spans.channels.rate).max()) / _MAX_RELATIVE_EFFECT
+    # of two standard deviations of the prior of a scale factor error, as a share of the rate;
+    # larger ones result from several similar columns that nearly cancel each other
+    return float(added / np.abs(fit.spans.channels.rate).max()) / (
+        2.0 * HEADING_TREATMENT.prior[0])
 
 
 def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[CauseTerm],
@@ -748,7 +741,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     simplest = min(equivalent.values(), key=complexity)
     # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring
     # ones, and fifths of the log
-    numbers, count = np.arange(data.stretch_count), min(_FOLD_COUNT, data.stretch_count)
+    numbers, count = np.arange(data.stretch_count), min(5, data.stretch_count)
     folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
              for sets in ([numbers[fold::count] for fold in range(count)],
                           np.array_split(numbers, count))]
@@ -770,10 +763,10 @@ def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[s
     given, left = _given_design(data, columns, rows)
     clusters = [each[rows] for each in data.clusters]
     least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
+    # along the motion they are similar to errors of an encoder that repeat with its position
     return [_cluster_robust_evidence(
-        given[:, place], left,
-        clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], least[place])
-        for place, each in zip(places, terms)]
+        given[:, place], left, clusters if CAUSES[each.cause].along in ('rate', 'heading')
+        else clusters[:1], least[place]) for place, each in zip(places, terms)]
 
 
 def _given_design(data: WhitenedRegression, columns: Array,

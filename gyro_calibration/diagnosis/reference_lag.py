@@ -35,8 +35,11 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import (
     cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
+from gyro_calibration.logs.quality import white_noise_deviation
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
+from scipy.signal import oaconvolve
 from scipy.stats import norm
 
 #: Causes that cannot be told from the dynamics of a motion, which may also vibrate.
@@ -46,20 +49,8 @@ HIDDEN_CAUSES = frozenset({
 #: Effects of the gyro along the motion, linear in their sizes.
 _MOTION_EFFECTS = ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
                    'heading_sensitivity')
-#: Longest lag of a motion as a share of the duration of a log.
-_MAX_LAG_SHARE = 0.1
-#: Number of lags of a gyro that are compared with longer ones, and probability by which those have
-#: to be likelier.
-_LAGS_OF_GYRO, _LATE_LEVEL = 4, 0.05
-#: Numbers of time constants and sizes of the prior of a response that are tried; and least
-#: variance of a response by its prior, over that by the noise.
-_TIME_CONSTANTS, _PRIOR_SIZES, _MIN_RATIO = 16, 65, 0.01
-#: Largest standard deviation of a scale factor error beside the response, as a share of the prior.
-_MAX_PRIOR_SHARE = 0.5
-#: Limits of acceleration that are tried at first, rad/s², and share to which they are found;
-#: number of samples; number of lags of the response to the limited command, and the longest, s.
-_FIRST_LIMITS, _LIMIT_STEP, _LIMITED_SAMPLES = 0.25 * 2.0 ** np.arange(7), 0.005, 16384
-_LIMITED_LAGS, _LIMITED_LAG = 24, 2.0
+#: Least variance of a response by its prior, over that by the noise.
+_MIN_RATIO = 0.01
 
 
 @dataclass(frozen=True)
@@ -96,9 +87,9 @@ def is_late(fit: RegressionFit) -> bool:
         return max(likelihood_with(fit, effect_candidate('time_offset', each)) for each in lags)
 
     of_gyro = max(fit.log_likelihood, likelihood(
-        *np.linspace(0.0, MAX_GYRO_LAG, _LAGS_OF_GYRO + 1)[1:].tolist()))
-    return likelihood(*np.geomspace(MAX_GYRO_LAG, LONGEST_LAG, 5 * _LAGS_OF_GYRO)[1:].tolist()
-                      ) > of_gyro - math.log(_LATE_LEVEL)
+        *np.linspace(0.0, MAX_GYRO_LAG, 5)[1:].tolist()))
+    return likelihood(*np.geomspace(MAX_GYRO_LAG, LONGEST_LAG, 20)[1:].tolist()
+                      ) > of_gyro - math.log(0.05)
 
 
 def follows_rate(replays: Sequence[Replay]) -> bool:
@@ -132,7 +123,7 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
     longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]
-    kernels = kernels[longest < _MAX_LAG_SHARE * replay.duration]
+    kernels = kernels[longest < 0.1 * replay.duration]
     plain = replace(replay, command=replay.channels.rate)
     grid, command = plain.held_command
     limits = _likely_limits(plain)
@@ -153,25 +144,32 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
     chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
     moved, (rate, *seen) = tried[chosen], transforms[chosen]
-    late, fitted, own = moved, fits[chosen], [rate]
+    late = moved
+    between: Array = np.zeros(len(time))
+    fitted, others = fits[chosen], list[Array]()
     for _ in range(2):
+        if others:
+            motion, *own = (cosine_transform(late.resample(each)) for each in (
+                moved.channels.rate, *others))
+            # what an effect has in common with the motion would pass for a part of it
+            own = [rate, *(each - motion * (motion @ each) / (motion @ motion) for each in own)]
+            seen[-1] -= cosine_transform(late.resample(between))
+            fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
+                                   len(own), kernels @ lags)
         response = fitted.values @ kernels
+        change = next(late.delayed_commands(response[None])) + between
         # effects along this motion would otherwise pass for a longer response
-        moved = replace(late.with_motion(next(late.delayed_commands(response[None]))),
-                        responses=fitted.independent @ kernels,
+        moved = replace(late.with_motion(change), responses=fitted.independent @ kernels,
                         response_noise=moved.response_noise)
         fit = fit_causes(build_problem([moved]), [])
+        more = _changes_between_samples(moved, response, fit.unbiased_residuals[0] + between)
+        if more.any():
+            moved = moved.with_motion(more - between)
+            between, fit = more, fit_causes(build_problem([moved]), [])
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
-        if len(own) > 1:
-            break
-        motion, *others = (cosine_transform(late.resample(each)) for each in (
-            moved.channels.rate, *(column for name in _MOTION_EFFECTS
-                                   for column in effect_candidate(name).columns(moved))))
-        # what an effect has in common with the motion would pass for a part of it
-        own += [each - motion * (motion @ each) / (motion @ motion) for each in others]
-        fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
-                               len(own), kernels @ lags)
-    most = _MAX_PRIOR_SHARE * HEADING_TREATMENT.prior[0]
+        others = [column for name in _MOTION_EFFECTS
+                  for column in effect_candidate(name).columns(moved)]
+    most = 0.5 * HEADING_TREATMENT.prior[0]
     # on average no motion is ahead of its command
     if is_command and (fitted.scale_deviation > most or response @ lags < -LEAD):
         raise DataRefused(
@@ -181,6 +179,51 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     return (moved, Estimate.from_half_width(
         float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's'),
         limits if chosen else np.full(2, math.inf))
+
+
+def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Array:
+    """
+    Return what is left of the output by changes of the command between samples, rad/s, (n,).
+
+    A change is earlier than the sample that shows it, or is followed after an uneven time. Such
+    times are normal, with the likeliest standard deviation, if it is worth its number (Schwarz);
+    otherwise, or where the responses to the changes overlap, zeros are returned.
+    """
+    grid, command = replay.held_command
+    lead = -round(kernel_lags(replay.interval)[0] / replay.interval)
+    known = replay.valid & np.isfinite(left)
+    whole = np.zeros(len(command))
+    whole[grid[known]] = left[known]
+    noise = white_noise_deviation(left[known])
+    alike = oaconvolve(response, response[::-1])[len(response) - 1:]
+    sizes = np.diff(command)
+    at = np.flatnonzero(np.abs(sizes) * math.sqrt(alike[0]) > noise)
+    alike = alike[:np.flatnonzero(np.abs(alike) > _MIN_RATIO * alike[0])[-1] + 1]
+    if not 0 < len(at) * len(alike) < len(command):
+        return np.zeros(len(left))
+    sizes, alike = sizes[at], alike * np.linspace(1.0, 0.0, len(alike), endpoint=False)
+    seen = sizes * oaconvolve(whole, response[::-1])[at - lead + len(response) - 1]
+    width = int(np.max(np.searchsorted(at, at + len(alike)) - np.arange(len(at))))
+    bands = np.zeros((width, len(at)))
+    for place, band in enumerate(bands):
+        apart = at[place:] - at[:len(at) - place]
+        band[:len(apart)] = (np.append(alike, 0.0)[np.minimum(apart, len(alike))]
+                             * sizes[place:] * sizes[:len(apart)])
+    count, added = np.count_nonzero(known), np.zeros(len(command))
+    best = count * math.log(whole @ whole) - math.log(count)
+    for deviation in 0.1 * 2.0 ** np.arange(6):  # of the times, in samples
+        ratio = (deviation / noise) ** 2
+        factor = cholesky_banded(ratio * bands + np.eye(width, 1), lower=True)
+        delays = ratio * cho_solve_banded((factor, True), seen)
+        impulses = np.zeros(len(command))
+        impulses[at] = sizes * delays
+        tried = oaconvolve(np.pad(impulses, (len(response) - 1 - lead, lead)), response, 'valid')
+        rest = left[known] - tried[grid[known]]
+        criterion = (count * math.log(rest @ rest + delays @ delays / ratio)
+                     + 2.0 * float(np.log(factor[0]).sum()))
+        if criterion < best:
+            best, added = criterion, tried
+    return np.asarray(added[grid])
 
 
 def _limit_acceleration(command: Array, interval: float, limits: Array) -> Array:
@@ -215,11 +258,11 @@ def _likely_limits(replay: Replay) -> Array:
     grid, command = replay.held_command
     output = np.interp(np.arange(len(command)), grid[replay.valid],
                        replay.channels.output[replay.valid])
-    count = min(_LIMITED_SAMPLES, len(command))
+    count = min(16384, len(command))
     changes = np.cumsum(np.diff(command, prepend=command[0]) != 0.0)
     begin = int(np.argmax(changes[count - 1:] - changes[:len(changes) - count + 1]))
     command, output = (each[begin:begin + count] for each in (command, output))
-    late = np.geomspace(1.0, _LIMITED_LAG / replay.interval, _LIMITED_LAGS)
+    late = np.geomspace(1.0, 2.0 / replay.interval, 24)  # up to 2 s
     lags = np.unique(np.rint([*-late[late * replay.interval < LEAD], 0.0, *late])).astype(int)
     count -= int(np.ptp(lags))
     if count < 2 * len(lags):
@@ -235,9 +278,9 @@ def _likely_limits(replay: Replay) -> Array:
             np.ones(count), *columns, output[lags[-1]:][:count]]).T, mode='r'))
         return 2.0 * count * math.log(abs(float(reduced[-1, -1])) + np.finfo(float).tiny)
 
-    first = min(_FIRST_LIMITS, key=lambda each: cost(np.log([each, each])))
+    first = min(0.25 * 2.0 ** np.arange(7), key=lambda each: cost(np.log([each, each])))
     best = minimize(cost, np.log([first, first]), method='Nelder-Mead', options={
-        'xatol': _LIMIT_STEP, 'fatol': 1.0})
+        'xatol': 0.005, 'fatol': 1.0})
     return np.exp(best.x)
 
 
@@ -275,13 +318,13 @@ def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
     free, rest = (each - basis @ (basis.T @ each) for each in (delayed, left[:, 0]))
     total = float(rest @ rest)
     best = None
-    for constant in np.geomspace(0.1 * LEAD, LONGEST_LAG, _TIME_CONSTANTS):
+    for constant in np.geomspace(0.1 * LEAD, LONGEST_LAG, 16):
         steps = -np.diff(np.exp(-(lags + LEAD) / constant), append=0.0)
         walk = np.triu(np.ones((len(lags), len(lags)))) * np.sqrt(steps)
         walk *= np.gradient(lags)[:, None]
         along, powers, vectors = np.linalg.svd(free @ walk, full_matrices=False)
         squares = (along.T @ rest) ** 2
-        for size in np.geomspace(1e-2, 1e14, _PRIOR_SIZES) / powers[0] ** 2:
+        for size in np.geomspace(1e-2, 1e14, 65) / powers[0] ** 2:
             ratios = size * powers ** 2
             within = total - float(squares @ (ratios / (1.0 + ratios)))
             criterion = count * math.log(within) + float(np.log1p(ratios).sum())

@@ -44,10 +44,9 @@ from scipy.special import logsumexp
 Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
-#: Longest averaging interval of filtered noise, s, and largest significant ratio of its power in
-#: the last to that in the second quarter of the frequencies; of a smoothed record before causes
-#: are fitted (jumps have 0.18, noise not less).
-_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
+#: Largest ratio of the power of noise in the last to that in the second quarter of the frequencies
+#: of a smoothed record before causes are fitted (jumps have 0.18, noise not less).
+SMOOTHED_RATIO = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -586,7 +585,7 @@ def _profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -
 # filtered noise
 
 def average_filtered_noise(fit: RegressionFit,
-                           max_ratio: float = _MAX_FILTERED_RATIO) -> RegressionFit:
+                           max_ratio: float = 0.7) -> RegressionFit:
     """
     Average neighbouring points of logs whose noise is filtered, until no filter shows.
 
@@ -603,7 +602,7 @@ def average_filtered_noise(fit: RegressionFit,
             # 4.5 standard deviations; that of the logarithm of a median of n is 2.33 over root n
             by_chance = np.exp(-4.5 * 2.33 * np.sqrt(8.0 / len(whitened)))
             is_filtered = (last < min(by_chance, max_ratio) * second
-                           and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME)
+                           and 2.0 * each.point_interval <= 0.25)  # s
             decimations.append(each.decimation * (1 + is_filtered))
         if decimations == [each.decimation for each in fit.problem.replays]:
             return fit

@@ -42,8 +42,6 @@ import numpy as np
 
 #: Parts of a curve of which only the extremes are drawn.
 _THINNED_PARTS = 90
-#: The variable of the curve of amplitudes instead of means.
-_SPECTRUM_VARIABLE = 'frequency'
 
 _METHOD_TEXT = (
     '{logs} replayed through the simulation, with motion and temperature as recorded. The '
@@ -238,7 +236,7 @@ def _horizontal(curve: Curve) -> tuple[str, str, Array]:
 
 def _residual_chart(curve: Curve, place: int) -> Chart:
     name, title = f'residual-{place}', f'Residual along {readable_name(curve.along)}'
-    if curve.along == _SPECTRUM_VARIABLE:
+    if curve.along == 'frequency':  # amplitudes instead of means
         lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE),
                  Line('usual', 'simulated', np.asarray(curve.deviation) / DEGREE)]
         return Chart(name, title, 'Largest amplitude of the residual in bands of frequency, and '
