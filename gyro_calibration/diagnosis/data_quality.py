@@ -23,13 +23,12 @@ units are reported if they are large enough to matter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_output
-from gyro_calibration.diagnosis.causes import CAUSES, make_finding
-from gyro_calibration.diagnosis.findings import Estimate, Finding
+from gyro_calibration.diagnosis.causes import sized_finding
+from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.gates import (
     compare_headings, fit_line, identify_unit_factor, is_implausible_factor, model_scale_factor,
     reference_angle, reference_rate, resample_reference, select_reference, spline_rate,
@@ -362,13 +361,13 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
                 best.factor - 1.0 / UNIT_FACTORS[name]) or abs(
                 best.factor - 1.0 / UNIT_FACTORS[name]) <= 5.0 * best.deviation):
             is_plausible = not is_implausible_factor(ratio)
-            units = [_sized_finding(
+            units = [sized_finding(
                 'unit_error', ratio, NORMAL_QUANTILE_975 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
-                f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
+                ('scale_factor_error',) * is_plausible,
+                evidence=f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
                 f'{name} is {UNIT_FACTORS[name]:.5g}'
-                + '; a new model has it as a scale factor error' * is_plausible,
-                ('scale_factor_error',) * is_plausible)]
+                + '; a new model has it as a scale factor error' * is_plausible)]
     if log.time is None:
         return DataQuality(tuple(units), notes, has_output)
     lost, remarks = _check_stamps(log.time, has_output)
@@ -387,13 +386,6 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
                                       heading_step=step), comparison, model, log.time)
 
 
-def _sized_finding(name: str, value: float, half_width: float, p_value: float, evidence: str,
-                   confounders: Sequence[str] = ()) -> Finding:
-    return make_finding(
-        name, {name: Estimate.from_half_width(float(value), half_width, CAUSES[name].unit)},
-        p_value, confounders, evidence=evidence)
-
-
 def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[str]]:
     """Return lost samples as a finding, and remarks on bursts and lost values."""
     without = np.count_nonzero(~has_output)
@@ -409,8 +401,8 @@ def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[st
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
     if not lost.any() or chance >= FALSE_ALARM_CHANCE:
         return [], remarks
-    return [_sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
-                           stamps.loss_remarks[0].rstrip('.'))], remarks
+    return [sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
+                           evidence=stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
 def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroModel | None,
@@ -445,31 +437,33 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
     matters = codes.step >= _MIN_STEP_NOISE_RATIO * noise
     if matters and codes.step and not is_in_model('quantization', codes.step):
         chance = float(np.exp(-min(codes.counts.sum() * codes.alignment ** 2, 700.0)))
-        findings.append(_sized_finding(
+        findings.append(sized_finding(
             'quantization', codes.step, NORMAL_QUANTILE_975 * codes.step_deviation, chance,
-            f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
+            evidence=f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
             f'where its white noise is {noise / DEGREE:.3g} deg/s'))
     limit = min(-low, high)
     if math.isfinite(limit) and not is_in_model('saturation', limit):
         sides = [f'{value / DEGREE:.5g} deg/s' for value in (low, high) if np.isfinite(value)]
-        findings.append(_sized_finding(
-            'saturation', limit, 0.0, p_limit, f'{np.count_nonzero(at_limit)} samples '
+        findings.append(sized_finding(
+            'saturation', limit, 0.0, p_limit,
+            evidence=f'{np.count_nonzero(at_limit)} samples '
             f'({100.0 * at_limit.mean():.2g} %) have the extreme code {" or ".join(sides)}'))
     for name, fault, p_value in (('stuck_samples', repeated, p_repeated),
                                  ('outliers', outlying, p_outlying)):
         if fault.any():
             count, runs = int(fault.sum()), len(find_runs(fault))
             first = f'the first at {time[int(np.argmax(fault))]:.3f} s'
-            findings.append(_sized_finding(
+            findings.append(sized_finding(
                 name, count, 0.0, p_value,
-                f'{count} single samples differ from their neighbours by up to '
+                evidence=f'{count} single samples differ from their neighbours by up to '
                 f'{sigmas:.0f} sigma, {first}' if name == 'outliers' else
                 f'{count} samples in {runs} run{"s" * (runs > 1)} repeat the one before, '
                 f'{first}; codes and noise do not explain them'))
     interval, step = float(np.median(np.diff(time))), quality.heading_step
     if step and step ** 2 / 6.0 > 0.02 * (interval * noise) ** 2:
-        findings.append(_sized_finding(
-            'reference_quantization', step, 0.0, 0.0, 'the reference heading comes in steps of '
+        findings.append(sized_finding(
+            'reference_quantization', step, 0.0, 0.0,
+            evidence='the reference heading comes in steps of '
             f'{step / DEGREE:.4g} deg: its rate over one sample is uncertain by '
             f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
             f'{noise / DEGREE:.3g} deg/s of noise'))

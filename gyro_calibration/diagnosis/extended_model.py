@@ -23,11 +23,11 @@ from dataclasses import replace
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
+from gyro_calibration.diagnosis.causes import NOISE_NAMES
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Change, Curve, Finding, Gain
 from gyro_calibration.diagnosis.regression import fit_causes, is_single_event, RegressionFit
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.residuals import NOISE_NAMES
 from gyro_calibration.diagnosis.search import restrict_search, Search, search_causes
 from gyro_calibration.logs.log import Array, Mask
 from gyro_calibration.model.effects import (

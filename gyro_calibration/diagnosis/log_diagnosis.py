@@ -28,7 +28,7 @@ from gyro_calibration.diagnosis.candidates import (
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
     add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected, next_experiment,
-    REFERENCES, SINGLE_EVENT_REMEDY, untestable_causes)
+    NOISE_NAMES, REFERENCES, SINGLE_EVENT_REMEDY, sized_finding, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, drop_samples, extend_model, heading_contributions, heading_error_shares,
@@ -42,18 +42,17 @@ from gyro_calibration.diagnosis.gates import (
     is_reference_limiting, is_sample_offset, mismatch_diagnosis, refuse_unusable)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
-    follow_reference, FollowedReference, follows_rate, HIDDEN_CAUSES, is_late)
+    follow_reference, follows_rate, HIDDEN_CAUSES, is_late)
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise, build_problem, fit_causes, forget_fits, is_single_event, RegressionFit,
     SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, heading_error_curve, model_residuals,
-    NOISE_NAMES, residual_curves)
+    residual_curves)
 from gyro_calibration.diagnosis.search import (
     complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
     refine_shape, Scored, Search, search_causes, Selection, start_search)
-from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
@@ -223,7 +222,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     findings += searched.findings
     # a motion that follows has noise of its own
     if model is not None and not searched.hidden:
-        findings += _noise_findings(found, model, rate, rounds)
+        findings += find_changed_figures(found, model, VALUE_ALARM_SHARE * rate, rounds).values()
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
     inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
@@ -257,8 +256,8 @@ def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: 
                        model: GyroModel | None, rate: float,
                        on_progress: OnProgress) -> Diagnosis:
     """Diagnose a log by spans, if its motion has more of its own than a response to a command."""
-    assert searched.followed is not None and log.reference_rate is not None
-    motion = searched.followed.replays[0]
+    motion = searched.followed
+    assert motion is not None and log.reference_rate is not None
     of_motion = np.where(motion.valid, log.reference_rate + motion.reference - given.reference,
                          np.nan)
     found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
@@ -284,7 +283,7 @@ class _Searched:
     findings: Sequence[Finding] = ()
     unexplained: Sequence[Unexplained] = ()
     remarks: Sequence[str] = ()
-    followed: FollowedReference | None = None
+    followed: Replay | None = None  # the first log, with the motion that follows
 
 
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
@@ -299,15 +298,14 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
         replays = found.search.problem.replays
         if RESPONSE not in {each.cause for each in found.causes}:
             return found
-    followed = follow_reference(replays, follows)
-    moved = fit_causes(build_problem(followed.replays), [])
+    followed, lag = follow_reference(replays, follows)
+    moved = fit_causes(build_problem(followed), [])
     within = _find_settled(moved, rate) if follows and len(logs) == 1 else None
-    replays = (followed.replays if within is None
-               else [drop_samples(followed.replays[0], ~within)])
+    replays = followed if within is None else [drop_samples(followed[0], ~within)]
     found = _search_replays(replays, rate, on_progress, {RESPONSE, *HIDDEN_CAUSES})
     if follows:
-        return replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
-                       remarks=[] if within is None else [_SETTLED_REMARK], followed=followed)
+        return replace(found, findings=lag, followed=followed[0],
+                       remarks=[] if within is None else [_SETTLED_REMARK])
     before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
                      for each in (fit_causes(plain.problem, []), moved))
     return replace(found, unexplained=[Unexplained(
@@ -415,23 +413,10 @@ def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
         deviation = math.hypot(value.deviation, own.get(name, 0.0))
         chance = float(2.0 * norm.sf(abs(value.value) / deviation)) if deviation > 0.0 else 1.0
         if chance < VALUE_ALARM_SHARE * false_alarm_rate:
-            size = _estimate(Value(value.value, deviation), CAUSES[name].unit)
-            yield make_finding(name, {name: size}, chance, confounders,
-                               minimum_detectable=5.4 * deviation,
-                               evidence='it adds to the value of the model, '
-                               f'{abs(value.value) / deviation:.3g} sigma from zero')
-
-
-def _noise_findings(fit: RegressionFit, model: GyroModel, false_alarm_rate: float,
-                    is_rounding_modelled: bool) -> Iterator[Finding]:
-    """Give the noise figures that differ from those of the model."""
-    for name, each in find_changed_figures(fit, model, VALUE_ALARM_SHARE * false_alarm_rate,
-                                           is_rounding_modelled).items():
-        unit = CAUSES[name].unit
-        yield make_finding(name, {name: Estimate(each.value, each.interval, unit)}, each.p_value,
-                           each.alternatives, evidence='the model states '
-                           f'{format_amount(getattr(model.noise, name), unit, name)}, '
-                           f'the log {format_amount(each.value, unit, name)}')
+            yield sized_finding(name, value.value, NORMAL_QUANTILE_975 * deviation, chance,
+                                confounders, minimum_detectable=5.4 * deviation,
+                                evidence='it adds to the value of the model, '
+                                f'{abs(value.value) / deviation:.3g} sigma from zero')
 
 
 def _untestable_causes(search: Search, logs: Sequence[Log],
@@ -461,21 +446,14 @@ def _untestable_causes(search: Search, logs: Sequence[Log],
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,
              selection: Selection, unmergeable: Sequence[Candidate], gain: Gain | None,
              model: GyroModel | None) -> Iterator[str]:
-    """Give remarks on the records, on withdrawn names, and on the model."""
+    """Give remarks on the records, on parts of them, and on the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    reasons = {each.cause: 'there are tones at many frequencies, or it differs between logs, or '
-               'other structure lies along the same variable'
-               for each in selection.unnamed if is_named(each)}
-    reasons |= {each.cause: 'it does not predict held-out stretches, or its size may be 0'
-                for each in selection.refuted}
     for known in selection.unnamed:
         if known.cause == PART_OF_LOG:
             yield (f'From {known.shapes[0]:.4g} s to {known.shapes[1]:.4g} s the scale factor '
                    'differs from that of the rest of the log: an effect of a part of the log.')
-    for name, why in reasons.items():
-        yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     scale = fit.scale_factor_error
     own = {term.effect.name for term in ([] if model is None else model.terms)}
     if is_scale_implausible(fit):
@@ -488,10 +466,6 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
                   else '')
         yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
                f'cannot be merged with the first one{remedy}.')
-    for name in dict.fromkeys(each.cause
-                              for each in fit.causes if is_single_event(each)):
-        yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
-               'whose bias is the mean over the logs.')
     if gain is not None and gain.is_worse:
         yield NOT_OFFERED
 

@@ -14,9 +14,9 @@ The diagnosis of a log whose reference has errors of its own, such as a course o
 The score of a candidate is summed over stretches. Its variance is that by the noise or that by the
 scatter of the stretches, whichever is larger, and its distribution is Student's, with the
 effective number of stretches less one as the degrees of freedom. The p-value of the best candidate
-is that of a single one times their number; single events are counted separately. A cause is
-established if it is also selected without each fold, and predicts the stretches of the folds
-better than no cause; otherwise it is suspected.
+is that of a single one times their number. A cause is established if it is also selected without
+each fold, and predicts the stretches of the folds better than no cause; otherwise it is suspected.
+Steps of the bias are searched for at all times.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from gyro_calibration.diagnosis.candidates import (
     lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE)
 from gyro_calibration.diagnosis.causes import (
     add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected,
-    SINGLE_EVENT_REMEDY, untestable_causes)
+    SINGLE_EVENT_REMEDY, sized_finding, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_terms, gain_from_squares, heading_curve, heading_error_shares, HEADING_WINDOW,
@@ -193,10 +193,9 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                            if might and _is_possible_instead(fit, other)]
             if own_clock and not of_gyro:
                 known['cause'] = 'The gyro has a time offset from its reference.'
-        yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
-                           max(chance, MIN_PROBABILITY), confounders,
-                           minimum_detectable=_DETECTION_SIGMAS * deviation,
-                           evidence=f'evidence from {effective:.0f} stretches', **known)
+        yield sized_finding(name, value, half, max(chance, MIN_PROBABILITY), confounders,
+                            minimum_detectable=_DETECTION_SIGMAS * deviation,
+                            evidence=f'evidence from {effective:.0f} stretches', **known)
 
 
 def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
@@ -206,9 +205,8 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
         angle, half, chance = oblique_angle(fit.values[places], fit.normal_covariance[
             places, places])
         if chance < false_alarm_rate:
-            yield make_finding(
-                name, {name: Estimate.from_half_width(angle, half, CAUSES[name].unit)},
-                max(chance, MIN_PROBABILITY), remedy=MISALIGNMENT_REMEDY)
+            yield sized_finding(name, angle, half, max(chance, MIN_PROBABILITY),
+                                remedy=MISALIGNMENT_REMEDY)
     name = 'reference_drift'
     if CauseTerm(name) not in fit.causes:
         return
@@ -216,10 +214,9 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
     deviation = math.sqrt(fit.covariance[place, place])
     chance = float(2.0 * student.sf(abs(fit.values[place]) / deviation, fit.freedom[place]))
     if chance < false_alarm_rate:
-        yield make_finding(
-            name, {name: Estimate.from_half_width(float(fit.values[place]), fit.half_width(place),
-                                                  CAUSES[name].unit)},
-            max(chance, MIN_PROBABILITY), ['vibration_rectification'],
+        yield sized_finding(
+            name, fit.values[place], fit.half_width(place), max(chance, MIN_PROBABILITY),
+            ['vibration_rectification'],
             minimum_detectable=_DETECTION_SIGMAS * deviation,
             evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias')
 
@@ -515,10 +512,6 @@ def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
            if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
     terms = [CauseTerm(*each) for each in lasting_shapes(
         has, float(time[-1] - time[0]), np.asarray(fit.spans.channels.temperature))]
-    if not fine:
-        terms += [CauseTerm(name, (moment,))
-                  for moment in np.linspace(time[0], time[-1], 22)[1:-1].tolist()
-                  for name in ('bias_step', 'reference_slip')]
     fastest = float(np.abs(fit.spans.channels.rate).max())
     terms += [CauseTerm('clock_rate'),
               *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
@@ -540,8 +533,7 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
     steps = _find_steps(fit, fit_with, (), false_alarm_rate)
     found, candidates = list(steps), _propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in candidates
-               if not each.is_single_event and each.cause != SINE_RESPONSE.name}
+    columns = {each.cause: each for each in candidates if each.cause != SINE_RESPONSE.name}
     rich = [*columns.values(), *(each.cause_term for each in steps)]
     # of a log with fewer spans than columns, the noise is that without them
     rich_fit = (fit_with(*rich)
@@ -714,13 +706,9 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     places = list(map(slice, [0, *ends], ends))
     evidences = _term_evidences(data, columns, places, terms,
                                 np.ones(len(data.observed), dtype=bool))
-    # single events are never established, and are not counted in the number of the others
-    lasting = sum(not each.is_single_event for each in terms)
-    p_values = [min(evidence.chance * (len(terms) if each.is_single_event else lasting), 1.0)
-                for each, evidence in zip(terms, evidences)]
+    p_values = [min(evidence.chance * len(terms), 1.0) for evidence in evidences]
     strongest = min(range(len(terms)), key=lambda place: (p_values[place], place))
-    level = false_alarm_rate * (1.0 if terms[strongest].is_single_event else SUSPECTED_RATE_FACTOR)
-    if p_values[strongest] > level:
+    if p_values[strongest] > SUSPECTED_RATE_FACTOR * false_alarm_rate:
         return None
     # with one variance for all, as similar causes scatter alike
     likelihoods = [each.gain * each.variance_ratio / evidences[strongest].variance_ratio
@@ -751,8 +739,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
         {name: gain - likelihoods[place] for name, place in best_of.items()}).items()
         if name in equivalent}
     established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
-                   and selected == 1.0 and not terms[simplest].is_single_event
-                   and evidences[simplest].stretches >= MIN_STRETCHES)
+                   and selected == 1.0 and evidences[simplest].stretches >= MIN_STRETCHES)
     return FoundCause(terms[simplest], max(p_values[simplest], MIN_PROBABILITY), predicted,
                       selected, established, probability)
 

@@ -20,16 +20,16 @@ then, and neither can a slip.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import HEADING_TREATMENT, MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.candidates import effect_candidate
-from gyro_calibration.diagnosis.causes import CAUSES, make_finding
+from gyro_calibration.diagnosis.causes import CAUSES, sized_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
-from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
+from gyro_calibration.diagnosis.findings import Finding, MIN_PROBABILITY
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (
@@ -51,29 +51,6 @@ _MOTION_EFFECTS = ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_no
                    'heading_sensitivity')
 #: Least variance of a response by its prior, over that by the noise.
 _MIN_RATIO = 0.01
-
-
-@dataclass(frozen=True)
-class FollowedReference:
-    """A motion that follows its reference, and what is reported of it."""
-
-    replays: tuple[Replay, ...]  # the logs, with the motion that follows as the reference
-    lag: Estimate  # mean delay of the motion, s
-    # limits of acceleration away from and towards a rate of 0, rad/s², median of the logs, or inf
-    limits: Array
-
-    def finding(self) -> Finding:
-        """Return the finding of the lag."""
-        away, towards = self.limits.tolist()
-        limited = (f', accelerates by at most {away:.3g} rad/s² and slows down by at most '
-                   f'{towards:.3g} rad/s²' if math.isfinite(away + towards) else '')
-        return make_finding(
-            'reference_lag', {'reference_lag': self.lag},
-            max(float(2.0 * norm.sf(abs(self.lag.estimate) / self.lag.deviation)),
-                MIN_PROBABILITY),
-            evidence=f'the motion is {1e3 * self.lag.estimate:.0f} ms behind the reference rate '
-            f'on average{limited}; the output is compared with the motion that follows',
-            remedy='use a measured rate or heading as the reference')
 
 
 def is_late(fit: RegressionFit) -> bool:
@@ -99,26 +76,34 @@ def follows_rate(replays: Sequence[Replay]) -> bool:
                for each in replays)
 
 
-def follow_reference(replays: Sequence[Replay], is_command: bool) -> FollowedReference:
+def follow_reference(replays: Sequence[Replay],
+                     is_command: bool) -> tuple[tuple[Replay, ...], list[Finding]]:
     """
-    Return the motion that follows the reference rate of logs.
+    Return logs with the motion that follows their reference rate, and the finding of its lag.
 
-    Raises `DataRefused` where this is a command and no scale factor error can be known beside the
-    response.
+    There is none if the lag may be 0. Raises `DataRefused` where the rate is a command and no
+    scale factor error can be known beside the response.
     """
-    followed, lags, limits = zip(*(_follow(each, is_command) for each in replays))
-    weights = np.array([each.deviation for each in lags]) ** -2
-    mean = float(np.average([each.estimate for each in lags], weights=weights))
-    return FollowedReference(followed, Estimate.from_half_width(
-        mean, NORMAL_QUANTILE_975 * float(weights.sum() ** -0.5), 's'),
-        np.median(limits, axis=0))
+    followed, lags, deviations, limits = zip(*(_follow(each, is_command) for each in replays))
+    weights = np.array(deviations) ** -2
+    mean, deviation = float(np.average(lags, weights=weights)), float(weights.sum() ** -0.5)
+    away, towards = np.median(limits, axis=0).tolist()
+    limited = (f', accelerates by at most {away:.3g} rad/s² and slows down by at most '
+               f'{towards:.3g} rad/s²' if math.isfinite(away + towards) else '')
+    half = NORMAL_QUANTILE_975 * deviation
+    return followed, [] if abs(mean) <= half else [sized_finding(
+        'reference_lag', mean, half, max(float(2.0 * norm.sf(abs(mean) / deviation)),
+                                         MIN_PROBABILITY),
+        evidence=f'the motion is {1e3 * mean:.0f} ms behind the reference rate on average'
+        f'{limited}; the output is compared with the motion that follows',
+        remedy='use a measured rate or heading as the reference')]
 
 
-def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
+def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Array]:
     """
-    Return a log with the motion that follows, its mean delay, s, and limits of acceleration.
+    Return a log with the motion that follows, its mean delay, s, its deviation, and two limits.
 
-    It is fitted with effects of the gyro along the motion, and with the noise that a first
+    These are of acceleration away from and towards a rate of 0, rad/s², or inf. The motion is fitted with effects of the gyro along the motion, and with the noise that a first
     response leaves.
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
@@ -176,9 +161,8 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
             'the motion follows its command late, and what it does then has the same effect as a '
             'scale factor error, as in a swing that repeats: turn at several rates for several '
             'seconds each, with rests, or use a measured rate or heading as the reference')
-    return (moved, Estimate.from_half_width(
-        float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's'),
-        limits if chosen else np.full(2, math.inf))
+    return (moved, float(response @ lags), fitted.lag_deviation,
+            limits if chosen else np.full(2, math.inf))
 
 
 def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Array:

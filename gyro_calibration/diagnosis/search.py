@@ -613,7 +613,6 @@ class Selection:
     alternatives: Sequence[Sequence[Scored]]
     unnamed: Causes  # structure without a name, and causes whose names it withdraws
     suspected: Causes
-    refuted: Causes  # causes that are not confirmed, and not suspected
 
 
 def confirm_causes(search: Search, causes: Causes) -> Selection:
@@ -632,8 +631,7 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
                           and each.cause not in {other.cause for other in selected} and p_value(
                               each.cause, likelihood - score)
                           < SUSPECTED_RATE_FACTOR * search.rate)[:1]
-    return Selection(named, alternatives, unnamed, suspected,
-                     tuple(each for each in removed if not _is_lasting(each)))
+    return Selection(named, alternatives, unnamed, suspected)
 
 
 def _remove_unconfirmed(search: Search, causes: Causes,

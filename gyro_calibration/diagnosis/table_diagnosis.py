@@ -33,7 +33,7 @@ from gyro_calibration.calibration.selection import (
     BASIC_EFFECTS, distinguishing_rate, FALSE_ALARM_RATE, find_supported_effects,
     MIN_DISTINGUISHING_SIGMAS, resolve_confounders, TECHNOLOGY_EFFECTS, try_fit, try_replace)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies, Cause, CAUSES, make_finding, REFERENCES, untestable_causes)
+    add_remedies, Cause, CAUSES, make_finding, REFERENCES, sized_finding, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     ambiguity_notes, gain_from_squares, HEADING_WINDOW, previous_origins, widen_range)
@@ -166,9 +166,8 @@ def _outlier_findings(fit: Calibration) -> Iterator[Finding]:
     sigmas = np.abs(fit.residual[outlying]) / np.sqrt(np.diag(fit.prediction_covariance(dwells)))
     chance = min(1.0, len(fit.dwells) * 2.0 * float(student.sf(sigmas.max(), freedom)))
     if chance < 0.05 * FALSE_ALARM_RATE:
-        yield make_finding(
-            'outliers', {'outliers': Estimate.from_half_width(float(len(dwells)), 0.0, '1')},
-            chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
+        yield sized_finding(
+            'outliers', len(dwells), 0.0, chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
             evidence=f'{len(dwells)} of {len(fit.dwells)} dwells are up to '
             f'{sigmas.max():.0f} sigma from the others: {format_list(dwells.location)}',
             along='rate')
