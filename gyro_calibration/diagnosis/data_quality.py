@@ -336,16 +336,9 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     resampled = resample_reference(log)
     output, rate = require_output(log), reference_rate(resampled)
     has_output, heading = np.isfinite(output), resampled.reference_heading
+    if log.time is not None and log.reference_rate is None and heading is not None:
+        rate = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
     line = None if rate is None else fit_line(log.time, rate, output)
-    if (rate is not None and line is not None and log.time is not None
-            and log.reference_rate is None and heading is not None):
-        # A smooth rate of a heading errs at the ends of a log and at corners of the motion, and
-        # that by splines by the noise of the heading: the one closer to the output is used.
-        sharp = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
-        off_sharp, off = (float(np.nanmean((output - line.factor * each - line.offset) ** 2))
-                          for each in (sharp, rate))
-        rate = sharp if off_sharp <= off else rate
-        line = fit_line(log.time, rate, output) or line
     units = []
     if rate is not None and line is not None:
         # a factor in addition to the scale factor of the model

@@ -559,20 +559,19 @@ def _unexplained_structures(search: Search, fit: RegressionFit,
         name = (CAUSES[known.cause].along if is_named(known)
                 else unnamed_variable(known))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-    least = _residual_variance(search, causes)
-    most = _residual_variance(search, fit.causes)
+
+    def residual_variance(some: Sequence[Candidate]) -> float:
+        """Return the variance of the residual of some causes at the grid points."""
+        left = fit_causes(search.problem, some).unbiased_residuals
+        return float(np.var(np.concatenate([each.resample(rest) for each, rest
+                                            in zip(search.problem.replays, left)])))
+
+    least, most = residual_variance(causes), residual_variance(fit.causes)
     structures = []
     for name, places in variables.items():
-        without = _residual_variance(
-            search, [known for place, known in enumerate(causes) if place not in places])
+        without = residual_variance(
+            [known for place, known in enumerate(causes) if place not in places])
         chance = min(p_value(causes[place].cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures
-
-
-def _residual_variance(search: Search, causes: Sequence[Candidate]) -> float:
-    """Return the variance of the residual of some causes at the grid points."""
-    left = fit_causes(search.problem, causes).unbiased_residuals
-    return float(np.var(np.concatenate([each.resample(rest) for each, rest
-                                        in zip(search.problem.replays, left)])))
