@@ -395,7 +395,7 @@ def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[st
     if not lost.any() or chance >= FALSE_ALARM_CHANCE:
         return [], remarks
     return [sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
-                           evidence=stamps.loss_remarks[0].rstrip('.'))], remarks
+                          evidence=stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
 def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroModel | None,
@@ -432,7 +432,8 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
         chance = float(np.exp(-min(codes.counts.sum() * codes.alignment ** 2, 700.0)))
         findings.append(sized_finding(
             'quantization', codes.step, NORMAL_QUANTILE_975 * codes.step_deviation, chance,
-            evidence=f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
+            evidence=f'the output has {len(codes.values)} codes, '
+            f'{codes.step / DEGREE:.4g} deg/s apart, '
             f'where its white noise is {noise / DEGREE:.3g} deg/s'))
     limit = min(-low, high)
     if math.isfinite(limit) and not is_in_model('saturation', limit):

@@ -103,8 +103,8 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Arr
     """
     Return a log with the motion that follows, its mean delay, s, its deviation, and two limits.
 
-    These are of acceleration away from and towards a rate of 0, rad/s², or inf. The motion is fitted with effects of the gyro along the motion, and with the noise that a first
-    response leaves.
+    These are of acceleration away from and towards a rate of 0, rad/s², or inf. The response is
+    fitted with effects of the gyro along the motion, and with the noise that a first one leaves.
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
     longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]

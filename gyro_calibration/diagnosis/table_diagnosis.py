@@ -168,7 +168,8 @@ def _outlier_findings(fit: Calibration) -> Iterator[Finding]:
     chance = min(1.0, len(fit.dwells) * 2.0 * float(student.sf(sigmas.max(), freedom)))
     if chance < 0.05 * FALSE_ALARM_RATE:
         yield sized_finding(
-            'outliers', len(dwells), 0.0, chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
+            'outliers', len(dwells), 0.0, chance,
+            cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
             evidence=f'{len(dwells)} of {len(fit.dwells)} dwells are up to '
             f'{sigmas.max():.0f} sigma from the others: {format_list(dwells.location)}',
             along='rate')
