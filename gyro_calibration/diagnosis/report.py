@@ -46,13 +46,10 @@ _THINNED_PARTS = 90
 _METHOD_TEXT = (
     '{logs} replayed through the simulation, with motion and temperature as recorded. The '
     'residual, measured less simulated output, was compared with every cause of the catalogue, '
-    'under a noise of angle random walk, flicker and rate random walk that was fitted together '
-    'with the causes. A cause is named if its evidence exceeds that of the strongest of all '
-    'causes in noise that was simulated for this log, so that {share} of logs without any cause '
-    'give an alarm. Causes were added one at a time, refined, exchanged, and removed if another '
-    'one explains more. Causes that explain the data equally well are given as a set, of which '
-    'the simplest is in the model. Bias and scale factor are fitted in any case. The gain was '
-    'measured on held-out parts; intervals are of 95 %.')
+    'under a grid of noises. Causes were added one at a time, the strongest first, each if noise '
+    'alone is improbable: of logs without any cause, {share} give an alarm. Then they were '
+    'confirmed on held-out stretches. Of causes that explain the data equally well the simplest '
+    'is in the model. The gain was measured on held-out parts; intervals are of 95 %.')
 
 
 def render_report(diagnosis: Diagnosis) -> str:
