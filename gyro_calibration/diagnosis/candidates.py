@@ -137,6 +137,14 @@ def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidat
                    penalty=candidate.penalty)
 
 
+def depends_on_rate(candidate: Candidate) -> bool:
+    """Tell whether the columns of a candidate depend on the rate that the gyro senses."""
+    if not is_named(candidate):
+        return bool({'rate', 'rate_change'} & {*unnamed_variable(candidate).split(' and ')})
+    effect = CATALOGUE.get(candidate.cause)
+    return effect is None or effect.distortion is not None or 'rate' in effect.inputs
+
+
 def common_channels(replays: Sequence[Replay]) -> frozenset[str]:
     """Return the channels that all logs have."""
     return frozenset.intersection(*(each.available_channels for each in replays))

@@ -112,8 +112,7 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Arr
     plain = replace(replay, command=replay.channels.rate)
     grid, command = plain.held_command
     limits = _likely_limits(plain)
-    slower = _limit_acceleration(command, plain.interval, limits)[grid]
-    limited = replace(plain.with_motion(slower - plain.channels.rate), command=slower)
+    limited = plain.with_command(_limit_acceleration(command, plain.interval, limits)[grid])
     # at first, and after a hole, the motion follows commands that are not in the log
     time = plain.channels.time
     known = time[np.isfinite(plain.reference)]

@@ -21,14 +21,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 import math
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, effect_candidate, fitted_shape_indices, gaussian_pulse,
-    generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES, propose_candidates, smooth_shapes,
-    unnamed_variable, with_shape)
+    Candidate, candidate_transforms, depends_on_rate, effect_candidate, fitted_shape_indices,
+    gaussian_pulse, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
+    propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
     OnProgress, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
@@ -111,13 +112,20 @@ class Search:
         key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
-            self.columns_cache.clear()
-            parts = [candidate_transforms(each, fit.distorted) / self.problem.deviation
-                     for each in self.candidates]
-            ends = np.cumsum([len(part) for part in parts]).tolist()
-            self.columns_cache[key] = group_columns(
-                self.problem, np.concatenate([fit.rows[:0], *parts]),
-                [range(end - len(part), end) for end, part in zip(ends, parts)])
+            deviation = self.problem.deviation
+            if self.columns_cache:  # those for another rate
+                known = self.columns_cache.popitem()[1]
+                columns, groups = known.columns, known.groups
+                for each, own in zip(self.candidates, groups):
+                    if depends_on_rate(each):
+                        columns[own] = candidate_transforms(each, fit.distorted) / deviation
+            else:
+                parts = [candidate_transforms(each, fit.distorted) / deviation
+                         for each in self.candidates]
+                columns = np.concatenate([np.empty((0, len(deviation))), *parts])
+                ends = np.cumsum([len(part) for part in parts]).tolist()
+                groups = [range(end - len(part), end) for end, part in zip(ends, parts)]
+            self.columns_cache[key] = group_columns(self.problem, columns, groups)
         known = self.columns_cache[key]
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in known.groups])
         return column_evidence(fit, known) - penalty
@@ -418,10 +426,72 @@ def _select_forward(search: Search) -> Causes:
         if search.on_progress(None, f'search for causes, {len(named)} found'):
             break
         one_more = _find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
-        if one_more is None:
+        more = _with_several(search, named) if one_more is None else (*named, one_more)
+        if not more:
             break
-        named = _eliminate_backward(search, refine_jointly(search, (*named, one_more)))
+        named = _eliminate_backward(search, refine_jointly(search, more))
     return named
+
+
+def _with_several(search: Search, causes: Causes) -> Causes:
+    """
+    Return causes with several more, steps of the bias among them; nothing without them.
+
+    A random walk explains several steps, or steps and a drift, about as well as any one of them:
+    they are looked for in white noise, and must be significant together. A drift replaces the
+    steps that follow it.
+    """
+    # without generic terms nothing tells a part from another structure in time
+    if 'bias_step' not in search.scanned_causes or all(map(is_named, search.candidates)):
+        return ()
+    problem, grown, tried = search.problem, causes, []
+    white = replace(
+        search, columns_cache={}, step_cache={}, scanned_causes=frozenset(),
+        candidates=tuple(filter(_is_lasting, search.candidates)), problem=replace(
+            problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
+            log_determinants=problem.log_determinants[:1]))
+    while len(grown) < MAX_CAUSES:
+        step, evidence = max(_find_steps(fit_causes(white.problem, grown)),
+                             key=lambda each: each[1] - each[0].penalty)
+        # the first of a pair may not be significant alone
+        if len(grown) > len(causes) + 1 and p_value(
+                'bias_step', evidence - step.penalty) > search.rate:
+            break
+        grown = _refine_in_turn(white, (*grown, step), len(causes))
+        tried.append(grown)
+    for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
+                           key=lambda each: each[0].penalty - each[1])[:3]:
+        tried.append(_eliminate_backward(
+            white, _refine_in_turn(white, (*grown, drift), len(causes))))
+
+    def evidence_of(several: Causes) -> float:
+        """Return the evidence for several in place of the causes beyond that of noise alone."""
+        score, before = (fit_causes(problem, some).log_likelihood
+                         - sum(map(complexity_penalty, some)) for some in (several, causes))
+        more = max(len(several) - len(causes), 1)
+        return score - before - 0.5 * float(chi2.isf(search.rate / len(tried), more))
+
+    def are_apart(several: Causes) -> bool:
+        """Tell whether no steps of opposite signs are as near as the ends of a pulse, or a gap."""
+        steps = [each for each in several if each.cause == 'bias_step']
+        return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
+                   or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
+                   >= problem.replays[one.log_index or 0].duration
+                   for one, other in combinations(steps, 2))
+
+    best = max(filter(are_apart, tried), key=evidence_of, default=())
+    if not best or evidence_of(best) < 0.0:
+        return ()
+    best = _eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
+    return best if len(best) > len(causes) + 1 else ()
+
+
+def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
+    """Refine the shape of each cause from a first on, given the others, and then all together."""
+    for place in range(first, len(causes)):
+        fit = fit_causes(search.problem, _without(causes, place))
+        causes = (*causes[:place], refine_shape(fit, causes[place])[0], *causes[place + 1:])
+    return refine_jointly(search, causes)
 
 
 def _without(causes: Sequence[Candidate], place: int) -> Causes:

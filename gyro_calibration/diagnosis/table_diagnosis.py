@@ -38,8 +38,7 @@ from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     ambiguity_notes, gain_from_squares, HEADING_WINDOW, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
-    Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, NOT_OFFERED, OnProgress,
-    Unexplained)
+    Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
 from gyro_calibration.diagnosis.gates import check_gates, mismatch_diagnosis, refuse_unusable
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -119,7 +118,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
         _error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
-                 *_remarks(dwells, model, named, structures, withdrawn, offered)),
+                 *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
         method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE), gates=gates)
 
 
@@ -375,14 +374,17 @@ def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
 
 
 def _remarks(dwells: Dwells, model: GyroModel | None, named: _NamedCauses,
-             structures: Sequence[Unexplained], withdrawn: Collection[Effect],
+             structures: Sequence[Unexplained], withdrawn: Collection[Effect], gain: Gain | None,
              offered: bool) -> Iterator[str]:
     scatter = named.fit.scatter
     if withdrawn:
         yield (f'Not named: {", ".join(sorted(each.name for each in withdrawn))}: along the same '
                'variable, much structure is left without a name.')
     if named.causes and not offered:
-        yield NOT_OFFERED
+        yield ('The errors of the extended model for left-out dwells are larger than those of the '
+               'simulation; it is not offered.')
+    if gain is not None:
+        yield (f'Heading errors are the errors of dwells integrated over {HEADING_WINDOW:g} s.')
     if any(each.along == 'single_rates' for each in structures):
         yield ('Errors that repeat at single rates may belong to the table, or to the position '
                'within a sweep if all sweeps have the same order.')
