@@ -31,6 +31,7 @@ import random
 import struct
 import tempfile
 from typing import Any
+from unittest import mock
 import zlib
 
 from fake_port import SETTINGS
@@ -233,7 +234,8 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
     """Check that a log is refused in a line, or read the same whole, in blocks, and rewritten."""
     path = _file(data, suffix)
     log = _read(read_log, LogError, path)
-    blocks = _read(lambda path: list(read_log_blocks(path, rows=2)), LogError, path)
+    with mock.patch('gyro_calibration.logs.log.BLOCK_ROWS', 2):
+        blocks = _read(lambda path: list(read_log_blocks(path)), LogError, path)
     assert (log is None) == (blocks is None), 'refused as a whole or in blocks only'
     if log is None:
         return False

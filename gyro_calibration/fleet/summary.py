@@ -425,27 +425,14 @@ def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
     units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
     drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
               for each in of_type if each.drives]
-    dates = []  # values of logs, less those of their units, over their dates
-    for each in values if len(summary.dates) > 1 else ():
-        measure, factor = display_unit(each.unit, each.name)
-        label, dated = readable_name(each.name), [one for one in each.records if one['date']]
-        place = np.array([summary.dates.index(one['date']) + 1.0 for one in dated])
-        difference: Array = np.array([
-            one['values'][each.name]['value'] - each.units[one['unit']].value for one in dated])
-        dates.append(Chart(
-            f'{key}-{each.name}-dates', f'{label} less that of the unit',
-            f'dates: {", ".join(summary.dates)}', 'date', '', place, label, measure,
-            [Line('log', 'measured', factor * difference, draw_dots=True)],
-            x_names=summary.dates))
     for heading, charts, text, more in (
             ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
              of_units),
             ('drives', drives, 'An error that all units of a drive have in common is assigned to '
-             'its reference or to the vehicle.', None),
-            ('over time', dates, '', None)):
+             'its reference or to the vehicle.', None)):
         if charts or more:
             yield element('section', element('h2', f'{name}: {heading}'),
-                          element('p', text, class_='quiet') if text else None,
+                          element('p', text, class_='quiet'),
                           element('div', *map(draw_chart, charts), class_='pairs'), more)
 
 

@@ -155,9 +155,8 @@ class DriverNode(Node):
             self._last_problem = ''
             found = self._connection
             assert found.protocol is not None  # it is known before samples come
-            detected = f' ({found.detected})' if found.detected else ''
             self._report.event = (f'samples of {found.protocol.name} come on {found.path} at '
-                                  f'{found.baud} bit/s{detected}')
+                                  f'{found.baud} bit/s')
             self.get_logger().info(self._report.event)
         elif state.problem:
             return
@@ -228,7 +227,7 @@ class DriverReport:
         return level, message, {
             'port': self._port, 'device': connection.path, 'state': state.name,
             'protocol': protocol.name if protocol else '', 'baud': connection.baud,
-            'detected': connection.detected, 'reopened': max(0, connection.open_count - 1),
+            'reopened': max(0, connection.open_count - 1),
             'waiting_s': f'{state.retry_delay:.1f}',
             'waited_s': f'{connection.waited_duration:.1f}',
             'last_error': connection.last_error, **vars(counts), 'rate_hz': f'{self._rate:.1f}',

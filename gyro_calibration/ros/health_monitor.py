@@ -336,13 +336,13 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
         math.sqrt(of_noise + noise.mean_change_variance(duration, duration)))
 
 
-def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise, age: float,
-                    level: float = 1e-3) -> str:
+def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise,
+                    age: float) -> str:
     """
     Return a sentence on the change of a calibration after some time, s, beyond noise, or ''.
 
-    The noise is that of the model, for the drift of the bias; the level is the probability of a
-    false report. An infinite variance is that of an unknown value.
+    The noise is that of the model, for the drift of the bias. False reports have a probability of
+    0.001. An infinite variance is that of an unknown value.
     """
     if previous.covariance is None or current.covariance is None:
         return ''
@@ -355,7 +355,7 @@ def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: 
             ('bias', turned, f'{turned / DEGREE:.4f} deg/s',
              bias + noise.mean_change_variance(age, REST_DURATION))):
         sigmas = float(np.abs(size) / np.sqrt(variance))
-        if math.erfc(sigmas / math.sqrt(2.0)) < 0.5 * level:
+        if math.erfc(sigmas / math.sqrt(2.0)) < 0.5e-3:
             found.append(f'the {name} changed by {text} ({sigmas:.1f} sigma)')
     return (f'{" and ".join(found)}, more than the model predicts; '
             'if this occurs again, diagnose a log' if found else '')

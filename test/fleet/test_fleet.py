@@ -385,7 +385,7 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
 
 
 def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
-    """Over age all drift alike; the values less those of their units are drawn over the dates."""
+    """Over age all drift alike."""
     generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
     slopes = 1e-4 * (2.0 + generator.standard_normal(8))
     logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '', 'slow': {},
@@ -408,7 +408,6 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
     (row, *_) = csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines())
     assert float(row['temperature_slope_low']) == ends[0, 0]
     text = render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
-    assert 'bias less that of the unit' in text and f'dates: {", ".join(found.dates)}' in text
     assert '>drift</th>' in text
 
 

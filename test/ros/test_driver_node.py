@@ -36,7 +36,7 @@ from sensor_msgs.msg import Imu, Temperature
 
 KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
         'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',
-        'device', 'state', 'protocol', 'baud', 'detected', 'reopened', 'waiting_s', 'waited_s',
+        'device', 'state', 'protocol', 'baud', 'reopened', 'waiting_s', 'waited_s',
         'last_error', 'period_ms', 'nominal_period_ms', 'jitter_before_ms', 'jitter_after_ms'}
 
 
