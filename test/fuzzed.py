@@ -450,7 +450,7 @@ def check_arguments(data: bytes) -> bool:
 _ARGUMENTS = (
     'fit table.csv --out model.yaml --polynomial 3,2 --technology mems', 'turn table.csv --json',
     'diagnose a.csv --model b.yaml --out c',
-    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --window 0.2 --rest',
+    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --rest',
     'allan rest.csv --rate 100 --sensitivity 1e-3',
     'self-calibrate run.csv --turns -5 --marking 1 --reference-drift 1e-3',
     'emulate --protocol csv --model m.yaml --speed 2 --repeat',

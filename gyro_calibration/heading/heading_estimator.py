@@ -116,11 +116,6 @@ class HeadingEstimator:
         self.is_calibrated_this_run = False
         self._restart(now)
 
-    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
-        """Use other settings of the tracker."""
-        self._settings = settings
-        self.tracker.configure(settings)
-
     def reset(self) -> None:
         """Set the heading to zero."""
         self.heading_before_resets += self.tracker.heading

@@ -209,15 +209,10 @@ class ThresholdFilter:
         variance = sum(each * each for each in rates) / len(rates) - mean * mean
         return rate if 0.0 < explained < variance * (time - window[0][0]) else 0.0
 
-    def apply_to_block(self, time: Array, rate: Array) -> Array:
-        """Return the rates of the next samples, rad/s, shape (n,)."""
+    def apply_to_all(self, time: Array, rate: Array) -> Array:
+        """Return the rates of the next n samples, rad/s, or zeros, shape (n,)."""
         return rate if not self.settings.rate else np.array(
             [self.apply(*each) for each in zip(time.tolist(), rate.tolist())])
-
-
-def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
-    """Return what `ThresholdFilter` makes of a whole log, rad/s, shape (n,)."""
-    return ThresholdFilter(settings).apply_to_block(time, rate)
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
@@ -267,7 +262,7 @@ class BlockIntegrator:
         """
         if not len(time):
             return rate, rate, rate
-        filtered = self._filter.apply_to_block(time, rate)
+        filtered = self._filter.apply_to_all(time, rate)
         kept = (filtered == rate).astype(float)
         carried = len(self._recent[0])
         recent = np.append(self._recent[0], time), np.append(self._recent[1], rate)

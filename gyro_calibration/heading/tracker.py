@@ -112,7 +112,7 @@ class HeadingTracker:
         self.refused_count = self.outlier_count = self.rebuild_count = 0
         self._rebuild_message, self._settings = '', settings
         self._initialize(noise, covariance, age)
-        self.configure(settings)
+        self._configure()
 
     def _initialize(self, noise: Noise, covariance: Array, age: float | None, heading: float = 0.0,
                     variance: float = 0.0) -> None:
@@ -149,11 +149,9 @@ class HeadingTracker:
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
 
-    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
-        """Go on with other settings."""
-        self._settings = settings
-        self._state = self._state.with_added_variance(HEADING_INDEX, self._filtered_turn ** 2)
-        self._filtered_turn = 0.0
+    def _configure(self) -> None:
+        """Go on with the noise of another calibration."""
+        settings = self._settings
         self._detects_rest = (settings.false_alarms > 0.0
                               and self._model_noise.angle_random_walk > 0.0)
         self._energy.configure(self._model_noise, settings.false_alarms)
@@ -191,7 +189,7 @@ class HeadingTracker:
         self._energy.clear()
         self._sensitivity_slope = sensitivity_slope
         self._use_state(noise, covariance, heading, variance, age)
-        self.configure(self._settings)
+        self._configure()
 
     def reset(self) -> None:
         """Set the heading to zero, without uncertainty."""
@@ -910,7 +908,7 @@ class HeadingTracker:
         self.rebuild_count += 1
         self._rebuild_message = ('the state was not finite and was initialized again; '
                                  'the heading error may be up to a full turn')
-        self.configure(self._settings)
+        self._configure()
 
     def _corrected_angle(self, part: RateIntegral) -> float:
         """Return the integral of the rates less their error as estimated at rest, rad."""

@@ -60,7 +60,6 @@ _MAX_LOG_VALUES = 1 << 29
 
 #: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
 MAX_TIME = 1e12
-_ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes where they are not `MAX_MAGNITUDE`: a single larger one decides a fit, degC.
 _MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
@@ -171,10 +170,6 @@ def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None
             path, allow_pipes=True) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
-        if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
-            raise LogError('is a recording of ROS 1; wanted a log file or a ROS 2 recording: '
-                           'convert it, by pip install rosbags and '
-                           f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
         table, first_line = _read_header(_limit_length(lines), columns, axis)
         if table.delimiter == ' ':  # of which there may be several

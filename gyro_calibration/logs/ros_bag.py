@@ -69,8 +69,6 @@ class Contents:
     #: Topic -> message type; type with known quantities -> definition.
     topics: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
-    #: Types of which the recording has no definition.
-    undefined: set[str] = field(default_factory=set)
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -84,8 +82,6 @@ class Contents:
         if kind not in self.definitions and encoding == 'cdr':
             with suppress(MessageError):
                 definition = DEFINITIONS.get(kind, definition)
-                if not definition:
-                    self.undefined.add(kind)
                 if parse_layout(definition).quantities:
                     self.definitions[kind] = definition
         return (topic, kind) if encoding == 'cdr' and kind in self.definitions else None
@@ -227,22 +223,22 @@ def _read_mcap(source: Path, path: Path, contents: Contents,
                               'and was read up to there')
 
 
-def _iter_records(stream: BinaryIO, end: int, contents: Contents,
-                  wanted: tuple[_RecordCode, ...] = _USED_RECORDS) -> Iterator[tuple[int, bytes]]:
+def _iter_records(stream: BinaryIO, end: int,
+                  contents: Contents) -> Iterator[tuple[int, bytes]]:
     """Give code and content of the records of a file or a chunk, also of a truncated chunk."""
     while len(head := stream.read(9)) == 9:
         code, length = struct.unpack('<BQ', head)
         left = end - stream.tell()
-        if code == _RecordCode.CHUNK in wanted and left < length <= MAX_RECORD_BYTES:
+        if code == _RecordCode.CHUNK and left < length <= MAX_RECORD_BYTES:
             yield code, stream.read()
             return
         if length > left or code == 0:
             stream.seek(-9, io.SEEK_CUR)
             return
-        if code in wanted and length <= MAX_RECORD_BYTES:
+        if code in _USED_RECORDS and length <= MAX_RECORD_BYTES:
             yield code, stream.read(length)
             continue
-        contents.skipped_parts += code in wanted
+        contents.skipped_parts += code in _USED_RECORDS
         stream.seek(length, io.SEEK_CUR)
         if code == _RecordCode.DATA_END:
             yield code, b''
@@ -287,10 +283,12 @@ class _McapReader:
                 self._channels[number] = self._contents.add_topic(
                     topic, kind, _read_text(body, place)[0], definition)
             elif code == _RecordCode.METADATA:
-                name, pairs = _parse_metadata(body)
-                if name == METADATA_NAME:  # written by this program
-                    self._contents.recorder_notes += [
-                        _to_short_line(f'{key}: {value}') for key, value in pairs.items()]
+                name, place = _read_text(body, 0)
+                place += 4
+                while name == METADATA_NAME and place < len(body):  # written by this program
+                    key, place = _read_text(body, place)
+                    value, place = _read_text(body, place)
+                    self._contents.recorder_notes.append(_to_short_line(f'{key}: {value}'))
         except (_DamagedPart, struct.error):
             self._contents.skipped_parts += 1
 
@@ -304,27 +302,6 @@ def _read_text(body: bytes, offset: int) -> tuple[str, int]:
     if end > len(body):
         raise _DamagedPart
     return body[offset + 4:end].decode(errors='replace'), end
-
-
-def _parse_metadata(body: bytes) -> tuple[str, dict[str, str]]:
-    name, place = _read_text(body, 0)
-    pairs, place = {}, place + 4
-    while place < len(body):
-        key, place = _read_text(body, place)
-        pairs[key], place = _read_text(body, place)
-    return name, pairs
-
-
-def read_metadata(path: str | Path) -> dict[str, str]:
-    """Return the pairs of all undamaged metadata records of an MCAP file."""
-    found: dict[str, str] = {}
-    with open_regular_file(path) as file:
-        if file.read(len(_MAGIC)) == _MAGIC:
-            for code, body in _iter_records(file, os.fstat(file.fileno()).st_size, Contents(),
-                                            (_RecordCode.METADATA,)):
-                with suppress(_DamagedPart, struct.error):
-                    found |= _parse_metadata(body)[1] if code == _RecordCode.METADATA else {}
-    return found
 
 
 def _pack_record(code: _RecordCode, *content: bytes) -> bytes:

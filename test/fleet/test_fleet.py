@@ -16,7 +16,6 @@ from datetime import date, timedelta
 import json
 import os
 from pathlib import Path
-import struct
 import subprocess
 import sys
 
@@ -39,7 +38,6 @@ from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 import pytest
-from recordings import MCAP, record, text
 
 DEGREE = np.pi / 180.0
 
@@ -116,13 +114,10 @@ def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_p
         'b.csv': '7', 'x/bag': '', 'c.csv': '', '.mcap': ''}
 
 
-def test_notes_metadata_and_names_say_what_a_table_does_not(tmp_path):
-    pairs = b''.join(map(text, ('unit', '9', 'Drive', 'm', 'temperature', '21.5 degC')))
-    metadata = record(0x0C, text('gyro') + struct.pack('<I', len(pairs)) + pairs)
+def test_notes_and_names_say_what_a_table_does_not(tmp_path):
     written = {
         'plain.csv': b'# Movella DOT unit 1, RTK course; drive h, 2024\ntime_s,gyro_dps\n',
-        'keyed.csv': b'# unit: SN-12, type: DOT\n# date: 2026-03-01\ntime_s,gyro_dps\n',
-        'bag.mcap': MCAP + record(1, bytes(8)) + metadata,
+        'keyed.csv': b'# unit: SN-12, type: DOT\n# date: 2026-03-01, temperature: 21.5 degC\ntime_s,gyro_dps\n',
         'rc_car_h_unit3.csv': b'time_s,gyro_dps\n', 'aimless.csv': b'# a drive in town\nx\n'}
     for name, content in written.items():
         (tmp_path / name).write_bytes(content)
@@ -131,8 +126,7 @@ def test_notes_metadata_and_names_say_what_a_table_does_not(tmp_path):
         found = describe_log(FleetLog(str(tmp_path / name)), named)
         return found.unit, found.type, found.drive, found.date, found.temperature
     assert of('plain.csv') == ('1', '', 'h', '', None)
-    assert of('keyed.csv') == ('SN-12', 'DOT', '', '2026-03-01', None)
-    assert of('bag.mcap') == ('9', '', 'm', '', 21.5)
+    assert of('keyed.csv') == ('SN-12', 'DOT', '', '2026-03-01', 21.5)
     assert of('rc_car_h_unit3.csv') == ('3', '', 'rc_car_h', '', None)
     assert of('rc_car_h_unit3.csv', compile_file_pattern('{type}_{drive}_unit{unit}')) == (
         '3', 'rc', 'car_h', '', None)

@@ -78,7 +78,6 @@ REFUSED = {
     'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000,
                            'cannot be read as a log'),
     'binary': (bytes(range(256)), 'cannot be read as a log'),
-    'ROS 1': (b'#ROSBAG V2.0\nE\0\0\0\r\0\0\0index_pos=\xf1\x82', 'rosbags-convert --src'),
     'Latin-1': ('Zeit;Drehrate [°/s]\n0;1\n'.encode('latin-1'), 'iconv -f WINDOWS-1252 -t UTF-8'),
     'UTF-16': ('time_s,gyro_dps\n0,1\n'.encode('utf-16'), 'iconv -f UTF-16 -t UTF-8'),
     'beyond a gyro': (

@@ -14,7 +14,6 @@ import contextlib
 from dataclasses import replace
 import json
 import shutil
-import sqlite3
 import sys
 
 from gyro_calibration.logs.cdr import (
@@ -184,10 +183,6 @@ def test_an_imu_in_the_message_of_a_driver_serves_where_its_topic_is_named(
     assert log.specific_force[5] == 9.8
     with pytest.raises(LogError, match='select driver with --topic'):
         read_recording(path)
-    with sqlite3.connect(next(path.glob('*.db3'))) as file:  # as before ROS 2 Iron
-        file.execute('DROP TABLE message_definitions')
-    with pytest.raises(LogError, match='no definition; convert it by ros2 bag .* my_msgs is'):
-        read_recording(path, Topics('driver'))
 
 
 @pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])

@@ -233,11 +233,11 @@ def test_a_turn_while_one_value_is_held_for_a_short_time_is_in_the_variance(
 
 # Rest
 
-def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp_path):
+def test_the_threshold_filter_deletes_rates_at_rest_unless_it_is_switched_off(tmp_path):
     rig = Rig(tmp_path, model='')
     assert rig.feed(np.full(50, 0.1 * DEGREE))[-1].heading == 0.0
     assert rig.pipeline.estimator.tracker.deleted_heading > 0.03 * DEGREE
-    rig.set(stationary_threshold=0.0)
+    rig = Rig(tmp_path / 'off', model='', stationary_threshold=0.0)
     assert rig.feed([0.1 * DEGREE] * 2)[-1].rate == pytest.approx(0.1 * DEGREE)
 
 
