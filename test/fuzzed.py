@@ -203,8 +203,7 @@ def check_clock(data: bytes) -> int:
         for stamp in stamps:
             assert math.isfinite(stamp) and stamp > last, (stamp, last)
             last = stamp
-    assert (math.isfinite(clock.period) and clock.period > 0.0
-            and math.isfinite(sum(clock.jitter)))
+    assert math.isfinite(clock.period) and clock.period > 0.0
     assert isinstance(clock.lost_count, int) and clock.lost_count >= 0, clock.lost_count
     return len(data)
 

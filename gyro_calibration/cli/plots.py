@@ -117,14 +117,6 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
         shown = (line > lowest) & (line < highest)
         axes.loglog(times[shown], line[shown] * hour, linestyle=style, linewidth=1.2,
                     color='0.25', label=names[each.term.symbol])
-        symbol, along, up = each.term.symbol, times[shown], line[shown] * hour
-        # IEEE Std 952 reads angle random walk at 1 s; the others are named along their line
-        at = (int(np.argmin(np.abs(along - 1.0))) if symbol == 'N'
-              else len(along) * (1 if symbol in 'BQ' else 2) // 3)
-        # below lines that rise or are close to the sum
-        axes.annotate(symbol, (along[at], up[at]),
-                      xytext={'N': (-9, -16), 'K': (10, -14), 'R': (10, -14)}.get(symbol, (0, 6)),
-                      textcoords='offset points', fontsize=13, weight='bold', ha='center')
     axes.set(xlabel='averaging time [s]', ylabel='Allan deviation [deg/h]',
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
@@ -179,21 +171,16 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
                                   ('static bias only', 'the model and its static bias')):
         dots = _draw_dots(axes, errors.turns.rate / DEGREE, error / DEGREE, temperature)
         limit = 1.15 * float(np.abs(error).max()) / DEGREE or 1e-3
-        axes.axvspan(-min_rate / DEGREE, min_rate / DEGREE, facecolor='none', edgecolor='0.7',
-                     hatch='///', linewidth=0)
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set(xlabel='rate [deg/s]', ylabel='error [deg per turn]', ylim=(-limit, limit),
                  title=f'Error of a turn of 360 deg with {words}: '
                  f'largest {np.abs(error).max() / DEGREE:.3g} deg')
-        percent = axes.secondary_yaxis(
-            'right', functions=(lambda degrees: degrees / 3.6, lambda percents: percents * 3.6))
-        percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
     return _save_figure(figure, path, 'Shades of grey: temperature. A step between the senses: '
                         'scale factor error; a curve: nonlinearity; growth towards '
-                        'slow turns: bias or noise. Hatched: slower than '
-                        f'{min_rate / DEGREE:g} deg/s, left out. Scales differ.')
+                        'slow turns: bias or noise. Turns slower than '
+                        f'{min_rate / DEGREE:g} deg/s are left out. Scales differ.')
 
 
 def draw_diagnosis(path: str | Path | None, diagnosis: Diagnosis) -> Any:

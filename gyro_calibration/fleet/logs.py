@@ -64,11 +64,9 @@ _ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 _LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
-#: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
+#: Notes and names, such as "unit: 7" and rc_car_h_unit1.csv.gz.
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)
-_WORDED_NOTE = re.compile(r'\b(unit|drive) (\w*\d\w*|[a-z](?=[,;.)]|$))',
-                          re.IGNORECASE | re.MULTILINE)
 _FILE_NAME_PATTERNS = {
     'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
     'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
@@ -247,9 +245,8 @@ def _read_notes(path: str) -> dict[str, str]:
             return {}
     lines = takewhile(lambda line: line.startswith('#'),
                       data.decode(errors='replace').splitlines())
-    text = '\n'.join(lines)
-    return {name.lower(): value for notes in (_WORDED_NOTE, _KEYED_NOTE)
-            for name, value in reversed(notes.findall(text))}
+    return {name.lower(): value
+            for name, value in reversed(_KEYED_NOTE.findall('\n'.join(lines)))}
 
 
 # the record of a log

@@ -70,6 +70,7 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'attitude': ('reference_heading', _NO_UNIT),
 }
 
+
 class Column(NamedTuple):
     """Column of a quantity in a file, and its conversion to SI: ``factor * value + offset``."""
 
@@ -111,7 +112,7 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                                  f'{", ".join(units)}{suggest_nearest(unit, units)}')
             if column not in header:
                 raise InputError(f'{name}={given}: there is no column {column} among '
-                                 f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
+                                 f'{excerpt(",".join(header))}{suggest_nearest(column, header)}')
             offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
             found[part] = Column(header.index(column), units[unit], offset)
     asked = {column.position for column in found.values()}
@@ -124,7 +125,7 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                              f'the {quantity}; keep one of them')
         found[quantity] = Column(index, factor)
     if not {'output', 'counts'} & set(found):
-        raise InputError(f'no gyro column among {_shorten(",".join(header))}; wanted a header '
+        raise InputError(f'no gyro column among {excerpt(",".join(header))}; wanted a header '
                          'with gyro_dps, gyro_rad_s or gyro_counts, and # before the lines above '
                          'it, or other names, as by --columns time=NAME:s,gyro=NAME:deg/s')
     return found
@@ -141,5 +142,6 @@ def find_delimiter(line: str) -> str:
     return max(',;\t', key=line.count)
 
 
-def _shorten(text: str) -> str:
-    return to_printable(text[:100])[:100]
+def excerpt(text: str) -> str:
+    """Return the first 100 characters of a text of a file, for a message."""
+    return to_printable(text[:100])

@@ -34,9 +34,10 @@ import zlib
 
 from gyro_calibration.files import (
     describe_error, format_rows, InputError, MAX_EXPANSION_RATIO, MAX_MAGNITUDE,
-    MIN_EXPANSION_BYTES, open_regular_file, open_replacement, to_printable)
+    MIN_EXPANSION_BYTES, open_regular_file, open_replacement)
 from gyro_calibration.logs.columns import (
-    ATTITUDE, AXES, Column, COLUMNS, DEGREE, find_columns, find_delimiter, QUANTITIES, ROTATIONS)
+    ATTITUDE, AXES, Column, COLUMNS, DEGREE, excerpt, find_columns, find_delimiter, QUANTITIES,
+    ROTATIONS)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -375,11 +376,6 @@ def mask_invalid(values: Array, quantity: str) -> Mask:
     """Tell which values a log cannot hold: beyond the limit, or nan where it may not be lost."""
     valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
-
-
-def excerpt(text: str) -> str:
-    """Return the first 100 characters of a text of a file, for a message."""
-    return to_printable(text[:100])
 
 
 def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,

@@ -40,7 +40,8 @@ import zlib
 
 from gyro_calibration.files import describe_error, open_regular_file, remedy, to_printable
 from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
-from gyro_calibration.logs.log import excerpt, ExpansionBudget, LogError
+from gyro_calibration.logs.columns import excerpt
+from gyro_calibration.logs.log import ExpansionBudget, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
 MAX_RECORD_BYTES = 1 << 28

@@ -234,9 +234,7 @@ class DriverReport:
             'longest_gap_s': f'{connection.longest_gap:.3f}', 'clock_steps': self._clock_steps,
             **({} if clock is None or protocol is None else {
                 'period_ms': f'{1e3 * clock.period:.6g}',
-                'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
-                'jitter_before_ms': f'{1e3 * clock.jitter[0]:.3g}',
-                'jitter_after_ms': f'{1e3 * clock.jitter[1]:.3g}'}),
+                'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}'}),
             **({} if last is None else {'temperature_degc': f'{last:.2f}'}),
             **{name: f'{value:.4g}' for name, value in self._health.items()},
             'last_event': self.event,

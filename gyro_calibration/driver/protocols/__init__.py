@@ -28,8 +28,8 @@ import pkgutil
 from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
 from gyro_calibration.files import suggest_nearest
 
-__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find_protocol',
-           'recognize_protocol']
+__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings',
+           'find_protocol', 'recognize_protocol']
 
 #: The formats by name.
 PROTOCOLS = {
