@@ -51,7 +51,9 @@ _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
-_HEADER_WAIT = 3.0  # s, of the header of a log for values that come seldom
+#: Time, s, for which the header of a log waits for values that come seldom: with and without a
+#: temperature so far.
+_HEADER_WAITS = 1.0, 3.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -273,8 +275,9 @@ class CsvRecorder(_Recorder):
 
     def flush(self, is_due: bool = False) -> None:
         """Write the rows so far; the first ones after some seconds, when the columns are known."""
+        wait = _HEADER_WAITS['temperature_degc' not in self._held_values]
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
-                                  - self._rows[0][0] > _HEADER_WAIT * NSEC_PER_SEC):
+                                  - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
         text = ''
         if not self._columns:
