@@ -297,7 +297,7 @@ def drive_errors(generator: np.random.Generator) -> Array:
     fits = (fit_heading(time[run], output[run], CALIBRATION_MOTION),
             fit_likelihood(time[run], output[run], CALIBRATION_MOTION, 0.1))
     rates = [output, *(to_model_record(fit, '', '', None).correct(output) for fit in fits)]
-    filtered = [[ThresholdFilter(settings).apply_to_all(time, rate) for settings in FILTERS.values()]
+    filtered = [[ThresholdFilter(each).apply_to_all(time, rate) for each in FILTERS.values()]
                 for rate in rates]
     known = np.where(FULL_MOTION.rate_at(time) == 0.0, 0.0, output)
     drive = time >= CALIBRATION_MOTION.duration

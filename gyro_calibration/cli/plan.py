@@ -22,7 +22,6 @@ from gyro_calibration.calibration.motion_design import (
     CalibrationForecast, can_follow, find_best_motion, plain_motion, Prediction, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.plots import draw_motion
 from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
@@ -55,7 +54,6 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
-    verb.add_picture_option(parser, 'the motion')
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
@@ -88,8 +86,6 @@ def run(given: argparse.Namespace) -> Answer:
             'plain': forecast.predict(plain_motion(robot, given.seconds)), 'built_in': built_in}
     if given.out:
         write_motion(given.out, plan.motion)
-    if given.picture:
-        draw_motion(given.picture, plan.motion, robot.rate)
     is_built_in_feasible = can_follow(robot, CALIBRATION_MOTION)
     angle, time = plan.motion.heading / DEGREE, plan.motion.time
     rate, planned, plain = plan.motion.rate_at(time), rows['planned'], rows['plain']
@@ -116,7 +112,7 @@ def run(given: argparse.Namespace) -> Answer:
             'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,
             'heading_gain': heading_gain, 'drive_s': given.drive, 'seed': given.seed,
             'out': given.out}
-    return Answer(lines, data, (given.picture, given.out))
+    return Answer(lines, data, (given.out,))
 
 
 def _read_limits(path: str) -> RobotLimits:

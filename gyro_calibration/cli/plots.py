@@ -31,7 +31,6 @@ from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.files import open_replacement
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.motion import Motion
 import numpy as np
 
 if TYPE_CHECKING:
@@ -82,20 +81,6 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
                         'The lower panels show the difference about its mean, each on its own '
                         'scale. A slope is bias; what follows the turns is scale factor error; an '
                         'even band is the resolution of the reference.')
-
-
-def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
-    """Draw a motion profile with the rate limit of the robot, rad/s."""
-    figure, ((above,), (below,)) = _panels(2, 1, (9, 6.5), (1, 1))
-    time = np.union1d(np.linspace(0.0, motion.duration, 1000), motion.time)
-    above.plot(time, motion.rate_at(time) / DEGREE, color='black')
-    for sign in (-1.0, 1.0):
-        above.axhline(sign * limit / DEGREE, color='black', linestyle=':', linewidth=1)
-    above.set(ylabel='rate [deg/s]', title=f'Motion of {motion.duration:.3g} s to calibrate by')
-    below.plot(time, motion.heading_at(time) / DEGREE, color='black')
-    below.set(xlabel='time [s]', ylabel='heading [deg]')
-    return _save_figure(figure, path, 'Dotted: rate limit of the robot. Turns both ways separate '
-                        'scale factor error and bias; rests show the bias.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,

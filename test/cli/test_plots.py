@@ -16,10 +16,9 @@ from functools import cache
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects, MIN_TURN_RATE
 from gyro_calibration.cli.plots import (
-    draw_headings, draw_motion, draw_reference, draw_residuals, draw_turn_errors)
+    draw_headings, draw_reference, draw_residuals, draw_turn_errors)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
-from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
 
@@ -73,8 +72,7 @@ PICTURES = {
     'turns without temperature': lambda path: draw_turns(path, without_temperature()),
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
-    'headings': draw_drive, 'encoder': draw_encoder,
-    'motion': lambda path: draw_motion(path, CALIBRATION_MOTION, 1.0)}
+    'headings': draw_drive, 'encoder': draw_encoder}
 
 
 @pytest.fixture(scope='module')
