@@ -22,11 +22,10 @@ from gyro_calibration.heading.bias_table import BiasTable, Entry
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
+from gyro_calibration.model.effects import BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
-from gyro_calibration.ros.health_monitor import describe_change
 import numpy as np
 import pytest
 
@@ -168,19 +167,6 @@ def test_the_tracker_begins_anew_where_it_is_warm_and_the_heading_does_not_jump(
     assert steps.max() < 0.5 * INTERVAL and abs(gyro.error) < 3.0 * gyro.deviation
 
 
-def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_it():
-    deviations = []
-    for days, temperature in ((0.0, 25.0), (300.0, 25.0), (0.0, 45.0)):
-        live = begun(now=NOW + 86400.0 * days, temperature=temperature)
-        live.add(0.1, 0.0, NOW + 86400.0 * days)
-        assert ('let the robot rest, or calibrate again' in live.calibration_message
-                and f'{temperature:.1f} degC' in live.calibration_message)
-        deviations.append(math.sqrt(live.covariance[-1, -1]) / DEGREE)
-    on, old, far = deviations
-    # deg/s; a gyro that was turned off and on is at least 0.05 deg/s off
-    assert 0.05 < on < old < far
-
-
 def test_a_gyro_that_was_without_power_may_have_another_bias():
     gyro = Gyro(begun()).go(40.0)
     gyro.live.use_calibration(MODEL, gyro.now + gyro.time)
@@ -191,15 +177,6 @@ def test_a_gyro_that_was_without_power_may_have_another_bias():
     gyro.go(40.0).go(10.0, 0.3)
     assert (len({each.run for each in gyro.live.table.entries}) == 2
             and abs(gyro.error) < 3.0 * gyro.deviation)
-
-
-def test_a_calibrated_model_takes_the_bias_of_earlier_runs():
-    model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE)
-    table = BiasTable(model, entries=[Entry(25.0, 0.003, 1e-10, NOW - 100.0, 0)])
-    live = begun(model, table)
-    live.add(0.1, 0.0, NOW)
-    assert (live.current_model.self_calibration.bias == pytest.approx(0.003, abs=1e-4)
-            and live.model.self_calibration is None)
 
 
 def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_known():
@@ -237,31 +214,6 @@ def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(ter
     assert not gyro.live.tracker.is_resting
     gyro.go(40.0, 0.3, 35.0)
     assert abs(gyro.error - before) < 2.0 * DEGREE
-
-
-@pytest.mark.parametrize('known', [False, True], ids=['unknown coefficient', 'known coefficient'])
-def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
-    entries = [Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0)
-               for degc in range(15, 45)] if known else []
-    live = begun(table=BiasTable(MODEL, entries=entries))
-    live.add(0.1, 0.0, NOW)
-    live.use_calibration(MODEL, NOW)
-    assert live.current_calibration.bias == pytest.approx(CALIBRATED.bias)
-    for index in range(100):
-        live.add_temperature(INTERVAL * index, 35.0)
-        live.add(INTERVAL * index, 0.4 * DEGREE, NOW)
-    warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
-    assert (not describe_change(live.current_calibration, warm, NOISE, 300.0)
-            and describe_change(CALIBRATED, warm, NOISE, 300.0))
-    assert (bool(describe_change(live.current_calibration, replace(warm, bias=0.1 * DEGREE), NOISE,
-                                 300.0)) == known)
-
-
-def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
-    gyro = Gyro(begun()).go(12.0)
-    assert not gyro.live.table.entries
-    gyro.live.update_table(gyro.now + gyro.time, ending=True)
-    assert len(gyro.live.table.entries) == 1
 
 
 def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():
