@@ -13,7 +13,7 @@
 import math
 
 from chance import RARE, rms_bounds
-from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, smooth_states)
 from gyro_calibration.heading.stationary import (
@@ -105,15 +105,6 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
             for state in later] == pytest.approx(variance, rel=1e-4, abs=1e-12)
 
 
-def test_the_variance_after_a_calibration_is_that_of_the_noise():
-    """What a log's integration is told by a formula and the filter by its steps is one thing."""
-    state = initial_state(XV3500, np.diag([0.0, 0.0]), age=0.0)
-    for duration in (1.0, 10.0, 100.0, 1000.0):
-        after = state.propagate(RateIntegral(duration, 0.0, np.array([0.0, -duration])))
-        assert after.covariance[HEADING_INDEX, HEADING_INDEX] == pytest.approx(
-            XV3500.heading_variance(duration), rel=1e-6)
-
-
 # rest and motion
 
 @pytest.mark.parametrize('motion, before, share, runs', [
@@ -136,36 +127,6 @@ def test_rests_determine_the_bias_as_well_as_stated(motion, before, share, runs)
     assert np.median(deviations) < share * before
     low, high = rms_bounds(runs)
     assert low < math.sqrt(np.mean(np.square(errors))) < high, errors
-
-
-@pytest.mark.parametrize('sigmas', [0.5, 1.5, 3.0])
-def test_a_first_rest_is_kept_whatever_the_bias_of_a_quiet_gyro(sigmas):
-    """Samples deviate from the unknown bias by many times their noise."""
-    quiet, wide = Noise(0.001 * DEGREE), np.diag([SCALE ** 2, (0.5 * DEGREE) ** 2])
-    time = np.arange(0.0, 10.0, INTERVAL)
-    rate = sigmas * 0.5 * DEGREE + simulate_noise(quiet, len(time), INTERVAL,
-                                                  np.random.default_rng(8))
-    tracker = HeadingTracker(quiet, wide, TrackerSettings())
-    for at, value in zip(time, rate):
-        tracker.add(at, value, np.array([-value, -1.0]), still=np.array([0.0, -1.0]))
-    assert tracker.is_resting and tracker.bias[0] == pytest.approx(sigmas * 0.5 * DEGREE, rel=0.01)
-    assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
-
-
-@pytest.mark.parametrize('slow', [0.2, -0.4, 0.7])
-def test_a_slow_turn_before_the_first_rest_does_not_fix_the_bias(slow):
-    """The robot has begun to drive with a bias that is hardly known, and rests for 2 s later."""
-    wide = np.diag([SCALE ** 2, (0.5 * DEGREE) ** 2])
-    parts = [(3, 20), (1.2, slow), *[(3, -20), (5, 10), (2, 0), (3, 20)] * 10]
-    motion = constant_rate_motion(parts)
-    for seed in range(3):
-        noise = Noise(0.005 * DEGREE)
-        time, _, heading, rate = gyro(motion, np.random.default_rng([9, seed]), noise, bias=0.0)
-        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, wide,
-                      TrackerSettings(), still=np.array([0.0, -1.0]))
-        error = (found.heading - heading)[::20]
-        assert np.all(error ** 2 < 16.0 * found.variance[::20] + (0.05 * DEGREE) ** 2)
-        assert abs(error[-1]) < 1.0 * DEGREE
 
 
 @pytest.mark.parametrize('slow, wheels', [(0.1, None), (0.05, True), (0.02, True)],
@@ -206,19 +167,6 @@ def test_a_slow_turn_until_the_wheels_stop_is_no_bias(after):
                     True if index < turning else after)
     assert tracker.is_resting and abs(tracker.bias[0]) < 1e-4 * DEGREE
     assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(4.0 * DEGREE, abs=0.01 * DEGREE)
-
-
-def test_the_deviation_includes_what_the_threshold_filter_deletes():
-    """10 min at 0.1 deg/s, below the threshold; the verb and the tracker state the same."""
-    time, _, heading, rate = gyro(constant_rate_motion([(5, 20), (600, 0.1), (5, -20)]),
-                                  np.random.default_rng(15))
-    sensitivity, threshold = -np.vstack([rate, np.ones(len(rate))]), Threshold()
-    live = follow(time, rate, TrackerSettings(0.0, threshold))
-    _, written, deviation = BlockIntegrator(threshold, XV3500, KNOWN).add(time, rate, sensitivity)
-    assert abs(live.heading[-1] - heading[-1]) > 30.0 * DEGREE
-    for error, stated in ((live.heading - heading, np.sqrt(live.variance)),
-                          (written - heading, deviation)):
-        assert 0.5 < abs(error[-1]) / stated[-1] < 2.0
 
 
 def test_the_slowest_turn_that_is_noticed_is_noticed():
