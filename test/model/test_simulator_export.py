@@ -16,7 +16,7 @@ import xml.etree.ElementTree as ElementTree
 
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.model.effects import CATALOGUE
-from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.simulator_export import (
     export_model, fit_gauss_markov, simulator_parameters, SIMULATORS)
@@ -70,15 +70,6 @@ def test_a_random_walk_stays_one_and_no_wander_stays_none(span):
     assert fit_gauss_markov(Noise(7e-4), 0.01, span)[0].density == 0.0
 
 
-def test_the_bias_is_the_output_at_rest_at_the_temperature():
-    model = GyroModel((term('bias', 1e-3), term('scale_factor_error', 0.05),
-                       term('bias_temperature', 25.0, 1e-5), term('warm_up', 60.0, 0.2)),
-                      self_calibration=SelfCalibration(0.01, 2e-3, ((1e-6, 0.0), (0.0, 4e-8))))
-    held, _ = simulator_parameters(model, 100.0, 35.0, 3600.0)
-    assert held.bias == pytest.approx(1e-3 + 1e-4 + 1.05 * 2e-3, rel=1e-9)
-    assert held.bias_deviation == pytest.approx(2e-4)
-
-
 @pytest.mark.parametrize('simulator', SIMULATORS)
 def test_each_effect_is_held_or_listed(simulator):
     for name, effect in CATALOGUE.items():
@@ -90,15 +81,6 @@ def test_each_effect_is_held_or_listed(simulator):
         assert listed or f'{0.011:.9g}' in text.rpartition('-->')[2], name
         assert all(each in text for each in left_out), name
         assert not any(each.endswith('0.011 1') for each in left_out), 'a number has no unit'
-
-
-def test_isaac_is_given_python():
-    model = GyroModel((term('bias', 1e-3),), noise=NOISE)
-    text, left_out = export_model(
-        simulator_parameters(model, 100.0, 25.0, 3600.0)[0], model, 'isaac')
-    compile(text, 'isaac', 'exec')
-    assert 'mean=0.001' in text and 'std=0.007' in text
-    assert any(each.startswith('bias_instability: 0.0002 rad/s') for each in left_out)
 
 
 def test_mujoco_limits_and_delays_as_the_model():
