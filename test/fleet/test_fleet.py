@@ -29,7 +29,7 @@ from gyro_calibration.fleet.logs import (
     compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
 from gyro_calibration.fleet.pooling import (
     find_changes, find_outlying_groups, Observations, PooledValue)
-from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
     build_models, count_effects, data, describe_type, render_fleet_page, summarize_types,
     table_files)
@@ -469,20 +469,3 @@ def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
     assert 'class="sortable"' in text and '1 more logs are excluded' in text
     # drives stand by name below charts, at whole places only
     assert '>k</text>' in text and '>1.5</text>' not in text
-
-
-def test_tables_hold_a_row_for_each_log_and_for_each_value_of_a_unit():
-    logs = records()
-    content = table_files(summarize_types(logs), logs)
-    rows = list(csv.DictReader(content['units.csv'].decode().splitlines()))
-    assert [row['unit'] for row in rows if row['value'] == 'bias'] == list('01234')
-    assert len(content['logs.csv'].decode().splitlines()) == 1 + len(logs)
-
-
-def test_a_cluster_gives_what_processes_give():
-    distributed = pytest.importorskip('distributed')
-    with distributed.LocalCluster(
-            n_workers=1, processes=False, dashboard_address=None,
-            protocol='tcp') as local, cluster_executors(local.scheduler_address) as create:
-        assert dict(run_tasks(abs, range(-3, 3), 2, create)) == {
-            number: abs(number) for number in range(-3, 3)}
