@@ -51,6 +51,11 @@ def test_the_matrix_is_given_with_a_polynomial(run, table):
     assert code == 0 and len(text.partition('C of eq. 11')[2].splitlines()) == 4
 
 
+def test_a_model_that_lacks_an_effect_is_reported(run, table):
+    code, text, _ = run('fit', table, '--effects', 'bias,scale_factor_error')
+    assert code == 0 and 'the model lacks an effect' in ' '.join(text.split())
+
+
 def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     # the record player of the blog, an L3G4200D at 70 mdps a count, turned clockwise
     (tmp_path / 'player.csv').write_text(
