@@ -231,6 +231,7 @@ def test_an_unplugged_port_is_lost_and_closed(terminal):
     master, path = terminal
     port = SerialPort(path, 115200)
     port.open()
+    assert port.read() == b'', 'nothing has come'
     os.close(master)
     with pytest.raises(PortError, match=f'^lost {path}: the device was disconnected: plug it '
                                         'in again$'):
