@@ -22,7 +22,7 @@ from gyro_calibration.heading.bias_table import BiasTable, Entry
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import BIAS_TEMPERATURE, CATALOGUE
+from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
@@ -177,6 +177,15 @@ def test_a_gyro_that_was_without_power_may_have_another_bias():
     gyro.go(40.0).go(10.0, 0.3)
     assert (len({each.run for each in gyro.live.table.entries}) == 2
             and abs(gyro.error) < 3.0 * gyro.deviation)
+
+
+def test_a_calibrated_model_takes_the_bias_of_earlier_runs():
+    model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE)
+    table = BiasTable(model, entries=[Entry(25.0, 0.003, 1e-10, NOW - 100.0, 0)])
+    live = begun(model, table)
+    live.add(0.1, 0.0, NOW)
+    assert (live.current_model.self_calibration.bias == pytest.approx(0.003, abs=1e-4)
+            and live.model.self_calibration is None)
 
 
 def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_known():
