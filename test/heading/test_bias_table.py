@@ -15,7 +15,7 @@ import math
 
 from bias_table import (
     answers, CALIBRATION, carried_answers, coverage, cubic, learn, learned, linear, MODEL, NOISE,
-    simulate, WHITE)
+    OWN, simulate, WHITE)
 from gyro_calibration.heading.bias_table import (
     BiasTable, Entry, Jump, MAX_ENTRIES, model_digest, read_bias_table, write_bias_table)
 from gyro_calibration.logs.log import DEGREE
@@ -138,6 +138,16 @@ def growth(calibration, table, *given):
     """Return by how much the variance of its bias grows, (rad/s)²."""
     now, _ = table.propagate_calibration(calibration, *given)
     return now.covariance[1][1] - calibration.covariance[1][1]
+
+
+@pytest.mark.parametrize('age,temperature,words', [
+    (400 * DAY, 20.0, '400 days, 0:00:00 ago at 20.0 degC, and now it is 20.0 degC'),
+    (60.0, 45.0, '0:01:00 ago at 20.0 degC, and now it is 45.0'),
+    (7 * 3600.0, None, '7:00:00 ago at a temperature that is not known')])
+def test_age_and_distance_are_reported_where_they_matter(age, temperature, words):
+    now, message = BiasTable(MODEL).propagate_calibration(CALIBRATION, age, 500 * DAY, temperature)
+    assert (words in message and now.covariance[1][1] > 2.0 * OWN ** 2
+            and now.bias == CALIBRATION.bias)
 
 
 def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not():
