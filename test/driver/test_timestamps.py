@@ -312,6 +312,14 @@ def test_what_is_lost_while_the_clock_is_set_is_a_gap_of_its_own_length(step, lo
     assert np.diff(times).max() == pytest.approx((lost + 1) * INTERVAL, abs=1e-6)
 
 
+@pytest.mark.parametrize('step', [0.12, -0.12, 0.2, -1.0])
+@pytest.mark.parametrize('gap, waited', [(0.15, 0.0005), (0.05, 0.15), (0.2, 0.33), (0.3, 0.18)])
+def test_a_gap_with_late_arrivals_after_a_step_keeps_its_length(step, gap, waited):
+    times, _, stamps, _ = driven(step)
+    after = stamps.convert_sample(5.0 + INTERVAL * 199 + step + gap, times[-1], INTERVAL, waited)
+    assert after - times[-1] == pytest.approx(gap)
+
+
 def test_a_clock_that_is_slewed_is_not_set_and_an_old_step_explains_no_jump_of_the_stamps():
     stamps = HostTimeConverter()
     assert stamps.convert_message(-50.0, 200.0) == -50.0
