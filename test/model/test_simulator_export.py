@@ -16,7 +16,7 @@ import xml.etree.ElementTree as ElementTree
 
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.model.effects import CATALOGUE
-from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.simulator_export import (
     export_model, fit_gauss_markov, simulator_parameters, SIMULATORS)
@@ -68,6 +68,15 @@ def test_a_random_walk_stays_one_and_no_wander_stays_none(span):
     process, error = fit_gauss_markov(Noise(7e-4, 0.0, 1e-5), 0.01, span)
     assert process.density == pytest.approx(1e-5, rel=0.02) and error < 0.01
     assert fit_gauss_markov(Noise(7e-4), 0.01, span)[0].density == 0.0
+
+
+def test_the_bias_is_the_output_at_rest_at_the_temperature():
+    model = GyroModel((term('bias', 1e-3), term('scale_factor_error', 0.05),
+                       term('bias_temperature', 25.0, 1e-5), term('warm_up', 60.0, 0.2)),
+                      self_calibration=SelfCalibration(0.01, 2e-3, ((1e-6, 0.0), (0.0, 4e-8))))
+    held, _ = simulator_parameters(model, 100.0, 35.0, 3600.0)
+    assert held.bias == pytest.approx(1e-3 + 1e-4 + 1.05 * 2e-3, rel=1e-9)
+    assert held.bias_deviation == pytest.approx(2e-4)
 
 
 @pytest.mark.parametrize('simulator', SIMULATORS)
