@@ -25,7 +25,6 @@ from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model import presets
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_track import track
@@ -355,7 +354,7 @@ def simulated(parts, seed=0, bias=-0.2):
 
 def followed(parts, bias=0.5, hindsight=False, seed=0, true_bias=-0.2):
     """Return error and stated deviation of the heading, deg, with a prior of the bias, deg/s."""
-    model = read_model({
+    model = gyro_calibration.read_model({
         'effects': {'bias': {'bias': 0.0}}, 'covariance': [[(bias * DEGREE) ** 2]],
         'noise': vars(NOISE)})
     time, output, true = simulated(parts, seed, true_bias)
