@@ -519,6 +519,17 @@ def _folder(path, name):
     return path / name
 
 
+def test_stamps_that_leap_by_less_than_a_gap_are_in_the_variance(tmp_path):
+    rig = rested(tmp_path)
+    begin, stamp = len(rig.outputs) - 1, rig.stamp
+    rig.turn(0.7, 3.0)
+    rig.stamp = lambda reading: stamp(reading) + 9 * 10 ** 8
+    rig.go(3.0)
+    last = rig.outputs[-1]
+    off = last.heading - rig.outputs[begin].heading - rig.truth[last.stamp]
+    assert 0.5 < off < 3.0 * math.sqrt(last.heading_variance), off
+
+
 # The monitor of noise and bias
 
 @pytest.mark.parametrize('moved, parameters', [(0.15 * DEGREE, {}), (1.0 * DEGREE, {}),
