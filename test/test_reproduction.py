@@ -10,7 +10,6 @@
 
 """The sources reproduced: numbers of contradictions follow by hand, and verdicts can fail."""
 
-from dataclasses import replace
 from functools import cache
 import json
 from pathlib import Path
@@ -22,7 +21,6 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
-each_source = pytest.mark.parametrize('source', SOURCES)
 #: One source; the others, which take some seconds, are run as evidence.
 one_source = pytest.mark.parametrize('source', [
     pytest.param(source, marks=[] if source == 'ojeda' else pytest.mark.evidence)
@@ -34,19 +32,14 @@ FEW, MANY = 25, 200
 
 
 @cache
-def reproduced(source, runs=FEW):
+def reproduced(source, runs):
     return SOURCES[source](np.random.default_rng(0), runs)
 
 
-def ours(source, quantity, runs=FEW):
-    found, = (each for each in reproduced(source, runs).comparisons if each.quantity == quantity)
-    return found
-
-
-def numbers(source, words, runs=FEW):
+def numbers(source, words):
     """Return the numbers of the contradiction whose sentence holds these words."""
     found, = (each.numbers
-              for each in reproduced(source, runs).contradictions if words in each.sentence)
+              for each in reproduced(source, FEW).contradictions if words in each.sentence)
     return found
 
 
@@ -62,40 +55,9 @@ def test_a_verdict_is_what_the_last_digit_allows(published, value, verdict):
     if verdict == 'differs':
         assert (Comparison('', '', value, published, own_figures=True).verdict
                 == 'contradicts itself')
-
-
-def test_the_uncertainty_of_ours_counts():
-    assert (Comparison('', '', 5.0, '4.8', uncertainty=0.2).is_reproduced
-            and not Comparison('', '', 5.0, '4.8', uncertainty=0.1).is_reproduced)
+    # of ours, the uncertainty counts
+    assert Comparison('', '', 5.0, '4.8', uncertainty=0.2).is_reproduced
     assert not Comparison('', '', 1.9, '< 2', uncertainty=0.2).is_reproduced
-
-
-@one_source
-def test_a_wrong_published_value_does_not_come_out(source):
-    wrong = [replace(each, published=f'{3.0 * each.published_value + 7.0:.3f}')
-             for each in reproduced(source, FEW).comparisons
-             if each.verdict == 'reproduced' and each.published[0] not in '<~']
-    assert len(wrong) >= 2 and not [each for each in wrong if each.is_reproduced]
-
-
-@pytest.mark.parametrize('source, contradicting', [
-    ('ojeda', ['data sets, every 10 deg/s and 2 K']),
-    ('hong_park',
-     ['drift in 30 min, root of the sum of squares', 'off pure integration, self-calibration']),
-    ('bot_thoughts', ['SF, mean of the slopes']),
-])
-def test_what_contradicts_itself(source, contradicting):
-    assert [each.quantity for each in reproduced(source, FEW).comparisons
-            if each.verdict == 'contradicts itself'] == contradicting
-
-
-@each_source
-def test_every_number_of_a_contradiction_is_in_its_sentence(source):
-    for contradiction in reproduced(source, FEW).contradictions:
-        assert (contradiction.numbers
-                and all(np.isfinite(value) for value in contradiction.numbers.values()))
-        assert not [name for name in contradiction.numbers
-                    if f'{{{name}:' not in contradiction.pattern], contradiction.pattern
 
 
 # the verb and its page

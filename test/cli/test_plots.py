@@ -133,18 +133,3 @@ def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(pyp
     text = (tmp_path / 'picture.svg').read_text()
     assert '<svg' in text and 'deg' in text and text.rstrip().endswith('</svg>')
     assert pyplot.get_fignums() == before
-
-
-def test_residuals_are_those_of_the_calibration_and_outlying_ones_do_not_set_the_scale(figure_of):
-    figure, kept = figure_of(lambda path: draw_residuals(path, warm())), warm().scatter.inliers
-    outlying = np.flatnonzero(~kept)
-    assert set(outlying) >= {20, 50}
-    for axes in figure.axes[:4]:
-        assert axes.get_legend().get_texts()[0].get_text().startswith(f'{len(outlying)} outlying')
-        assert max(map(abs, axes.get_ylim())) < 10.0, (
-            'the scale is that of a dwell that is off by 30 deg/s')
-    before, after = (figure.axes[place].collections[0].get_offsets() for place in (1, 2))
-    np.testing.assert_allclose(before, np.column_stack(
-        [MEASURED.temperature, (MEASURED.output - MEASURED.rate) / DEGREE])[kept])
-    np.testing.assert_allclose(after,
-                               np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)

@@ -222,13 +222,6 @@ def test_a_file_that_is_there_is_never_written_to(tmp_path):
     assert (tmp_path / 'a.mcap').read_text() == 'precious'
 
 
-def test_a_recording_of_nothing_leaves_no_file(tmp_path):
-    for recorder in recorders(tmp_path):
-        recorder.flush()
-        recorder.close()
-    assert not list(tmp_path.iterdir())
-
-
 def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
     recorder = CsvRecorder(str(tmp_path / 'a.csv'), notes)
     for number in range(400):
@@ -306,20 +299,6 @@ def test_wrong_use_is_one_sentence_and_leaves_no_file(run, tmp_path, monkeypatch
     code, out, error = run('record', *words)
     assert (code, out) == (2, '') and sentence in error and error.count('\n') == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_angles_at_another_rate_are_reported(run, tmp_path):
-    """After 4 s, when the period of the samples is known."""
-    samples = (Sample(0.1, 25.0, time=number / 100.0) for number in range(10 ** 6))
-    with Emulator(find_protocol('kvh_1750'), samples, Settings(sample_rate=100.0),
-                  link=tmp_path / 'gyro'):
-        code, out, error = run('record', '--port', tmp_path / 'gyro', '--protocol', 'kvh_1750',
-                               '--seconds', 6, '--out', tmp_path / 'a.csv', '--json')
-    log, remarks = read(tmp_path / 'a.csv'), ' '.join(json.loads(out)['remarks'])
-    assert code == 0 and log.output == pytest.approx(1.0, rel=1e-6), error
-    assert 'but angles are converted to rates by 1000: set sample_rate.' in remarks
-    assert any(note.startswith('sensitivity: 1000.0 rad/s a unit of the device')
-               for note in log.notes), log.notes
 
 
 def test_a_port_that_is_not_there_is_reported_and_leaves_no_file(run, tmp_path):

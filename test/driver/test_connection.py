@@ -17,7 +17,6 @@ import os
 import random
 import termios
 import threading
-import time
 import tty
 
 from fake_port import Reading, SETTINGS, World
@@ -127,15 +126,6 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
 
 # Silence
 
-def test_a_gyro_that_falls_silent_is_opened_again():
-    world = World(20.0)
-    world.gyro('csv', end=5.0)
-    world.gyro('csv', begin=12.0)
-    reading = Reading(world, 'csv')
-    assert reading.names == ['reading', *(len(reading.names) - 2) * ['failed'], 'reading']
-    assert reading.problems[0] == NOTHING and reading.times[1] == pytest.approx(7.0, abs=0.2)
-    assert reading.connection.open_count > 1
-
 
 @pytest.mark.parametrize('period', [1.5, 10.0])
 def test_a_slow_gyro_is_silent_after_three_of_its_periods(period):
@@ -189,16 +179,6 @@ def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
     assert reading.problems == [NOTHING]
 
 
-def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():
-    """The rest of the frame is no bytes of another format."""
-    world = World(10.0)
-    world.gyro('kvh_dsp3000', end=4.0)
-    world.send(iter([b'       0.015733   1'[:9]]), begin=4.0, end=4.01)
-    reading = Reading(world)
-    assert (reading.connection.protocol is find_protocol('kvh_dsp3000')
-            and reading.problems[0] == NOTHING)
-
-
 # Counts and stamps
 
 def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
@@ -246,21 +226,11 @@ def holds(port, count):
     return port._port.in_waiting == count
 
 
-def test_what_is_there_is_read_at_once(terminal, wait_until):
-    master, path = terminal
-    port = SerialPort(path, 115200)
-    port.open()
-    assert port.read() == port.read() == b''
-    os.write(master, b'x' * 1000)
-    wait_until(lambda: holds(port, 1000))
-    assert port.read() == b'x' * 1000
-    port.close()
-
-
 def test_an_unplugged_port_is_lost_and_closed(terminal):
     master, path = terminal
     port = SerialPort(path, 115200)
     port.open()
+    assert port.read() == b'', 'nothing has come'
     os.close(master)
     with pytest.raises(PortError, match=f'^lost {path}: the device was disconnected: plug it '
                                         'in again$'):
@@ -365,31 +335,6 @@ def read_all(path, protocol, enough=None, settings=None, until=lambda received: 
     finally:
         port.close()
     return received
-
-
-@pytest.mark.parametrize('speed', [1.0, 10.0])
-def test_samples_come_at_their_times(speed):
-    """Where a busy machine holds them up, the next ones come at their times again."""
-    arrivals = []
-
-    def is_in_time(received):
-        arrivals.append(time.monotonic())
-        sent = (received[-1].time - received[0].time) / speed
-        return (sent > 0.5 and arrivals[-1] - arrivals[0] == pytest.approx(sent, abs=0.05)
-                or arrivals[-1] - arrivals[0] > 20.0)
-
-    with Emulator(find_protocol('csv'), samples(rate=100.0), speed=speed,
-                  wait_for_reader=True) as emulator:
-        read_all(emulator.path, 'csv', 1, until=is_in_time)
-    assert arrivals[-1] - arrivals[0] < 20.0
-
-
-def test_bytes_that_are_not_read_are_lost_in_real_time(wait_until):
-    with Emulator(find_protocol('csv'), samples(rate=1000.0)) as emulator:
-        wait_until(lambda: emulator.lost_bytes > 1000)
-        assert emulator.sent_bytes == 0
-        first = read_all(emulator.path, 'csv', enough=1)[0]
-    assert first.time > 5.02
 
 
 def test_a_replay_waits_for_its_reader():

@@ -17,13 +17,10 @@ Any bytes, in any pieces, are decoded in test_fuzz.py: alike, and right again af
 from dataclasses import replace
 import itertools
 import math
-from pathlib import Path
 import random
 import struct
-import time
 
 from fake_port import SETTINGS
-from gyro_calibration.driver import protocols
 from gyro_calibration.driver.protocols import (
     BAUDS, find_protocol, PROTOCOLS, recognize_protocol, Sample, Settings)
 import pytest
@@ -60,12 +57,6 @@ VECTORS = [
     ('csv', Settings(columns=('sequence', 'gyro_dps', 'voltage')), b'x,90,?\r', 90.0),
     ('csv', Settings(full_scale=100.0), b'0.1,5000.0,20.0\n', 5000.0),
 ]
-
-
-def test_each_module_of_the_folder_is_a_format_and_describes_itself():
-    modules = {path.stem for path in Path(protocols.__file__).parent.glob('*.py')}
-    assert len(PROTOCOLS) == len(modules - {'__init__', 'protocol'}) > 0
-    assert all(protocol.text.strip() for protocol in PROTOCOLS.values())
 
 
 def opened(name, settings=None):
@@ -159,34 +150,6 @@ def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
     frames[3] = frames[3][:2] + b'\x55' + frames[3][4:]
     frames[4] = frames[4][:3] + b'\x55' + frames[4][3:]
     assert [sample.missing for sample in decoder.feed(b''.join(frames))] == [0, 0, 0, 2, 0, 0]
-
-
-LENGTH = 300_000
-HOSTILE = {
-    'noise': random.Random(6).randbytes(LENGTH),
-    'line ends': b'\r\n' * (LENGTH // 2),
-    **{f'{byte!r} again and again': byte * LENGTH for byte in (b'\0', b' ', b',', b'1', b'\x80')},
-    'headers of frames': (b'\xfe\x81\xff\x55' * 100 + b'\xdd' * 400 + b'\x55\x52' * 200) * (
-        LENGTH // 1200),
-    'almost frames of the ecore': b'\x80' + b'\x01\x00\x00\x00\x00\x00\x00\x80' * (LENGTH // 8),
-    'almost lines of the razor': b'#YPRAG=1,1,1,1,1,1,1,1,\n' * (LENGTH // 24),
-    'a long number': b'#YPRAG=' + b'1' * 200 + b'\n',
-}
-
-
-@pytest.mark.parametrize('kind', sorted(HOSTILE))
-def test_anything_is_decoded_in_less_time_than_it_takes_to_come(kind):
-    """Eight decoders, in one piece and bytewise, take less than the 3.3 s of 921600 baud."""
-    begin = time.process_time()
-    for name in ALL:
-        whole, pieces = opened(name), opened(name)
-        received = whole.feed(HOSTILE[kind])
-        small = [sample for start in range(0, 10_000)
-                 for sample in pieces.feed(HOSTILE[kind][start:start + 1])]
-        assert (received[:len(small)] == small
-                and all(math.isfinite(sample.output) for sample in received))
-        assert len(whole._splitter._tail) <= 1024
-    assert time.process_time() - begin < LENGTH / 92160
 
 
 @pytest.mark.parametrize(('name', 'data', 'counts'), [
@@ -400,18 +363,6 @@ def test_each_value_of_fizoptika_comes_in_two_frames(number, raw, temperature, h
     assert first == (None, {})
     assert second == (temperature if temperature is None else pytest.approx(temperature, abs=0.01),
                       pytest.approx(health, abs=1e-4))
-
-
-def test_all_values_of_an_emulated_fizoptika_come_round_and_are_good():
-    encode = FIZOPTIKA.encoder(ONE_COUNT)
-    found = values(*(encode(Sample(0.0, -12.5, sequence=number)) for number in range(16)))
-    assert ([temperature for temperature, _ in found if temperature is not None]
-            == pytest.approx([-12.5] * 2, abs=0.01))
-    health = {name: value for _, each in found for name, value in each.items()}
-    assert health == pytest.approx(
-        {'supply_v': 5.0, 'source_current_a': 0.1, 'diagnostic_v': 1.0}, abs=1e-4)
-    assert health.keys() == FIZOPTIKA.normal_ranges.keys()
-    assert all(low < health[name] < high for name, (low, high) in FIZOPTIKA.normal_ranges.items())
 
 
 @pytest.mark.parametrize('count', [1, 2, 3])

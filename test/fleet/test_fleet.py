@@ -27,7 +27,7 @@ from gyro_calibration.fleet.logs import (
     compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
 from gyro_calibration.fleet.pooling import (
     find_changes, find_outlying_groups, Observations, PooledValue)
-from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
     build_models, count_effects, data, describe_type, log_table, render_fleet_page,
     summarize_types)
@@ -461,12 +461,3 @@ def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
 def test_a_table_holds_a_row_for_each_log():
     logs = records()
     assert len(log_table(logs).splitlines()) == 1 + len(logs)
-
-
-def test_a_cluster_gives_what_processes_give():
-    distributed = pytest.importorskip('distributed')
-    with distributed.LocalCluster(
-            n_workers=1, processes=False, dashboard_address=None,
-            protocol='tcp') as local, cluster_executors(local.scheduler_address) as create:
-        assert dict(run_tasks(abs, range(-3, 3), 2, create)) == {
-            number: abs(number) for number in range(-3, 3)}

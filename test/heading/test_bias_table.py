@@ -57,43 +57,6 @@ def test_outliers_are_held_back_and_reported():
     assert found >= 5 and held >= 0.8 * found and wrong <= 0.02 * kept
 
 
-def test_a_single_run_at_one_temperature_determines_the_offset_alone():
-    table, empty = BiasTable(MODEL), BiasTable(MODEL)
-    for number in range(20):
-        assert not table.add(20.0, 1.0 * DEGREE, WHITE, 60.0 * number)
-    bias, variance = table.predict(20.0, 1200.0)
-    assert (bias == pytest.approx(1.0 * DEGREE, abs=1e-4 * DEGREE)
-            and math.sqrt(variance) < 0.02 * DEGREE)
-    for there in (10.0, 21.0, 60.0):
-        change, of_change = table.bias_difference(20.0, there, 1200.0)
-        assert (change == pytest.approx(0.0, abs=1e-12) and of_change == pytest.approx(
-            empty.bias_difference(20.0, there, 1200.0)[1], rel=1e-6))
-
-
-def test_the_variance_grows_with_the_distance_and_with_the_age():
-    table = learned(
-        simulate(np.random.default_rng(1), linear(np.random.default_rng(2)), runs=3), 3)
-    low = min(each.temperature for each in table.entries)
-    high = max(each.temperature for each in table.entries)
-    by_distance = [table.predict(high + distance, 3 * DAY)[1]
-                   for distance in (0.0, 3.0, 10.0, 30.0)]
-    by_age = [table.predict(0.5 * (low + high), 3 * DAY + age)[1]
-              for age in (0.0, DAY, 100 * DAY, 1000 * DAY)]
-    assert by_distance == sorted(by_distance) and by_age == sorted(by_age)
-    assert by_distance[-1] > 2.0 * by_distance[0]
-
-
-def test_the_scatter_of_turning_on_is_learned():
-    deviations = {}
-    for scatter in (0.01, 0.3):
-        generator = np.random.default_rng(3)
-        tables = [learned(simulate(generator, linear(generator), turn_on=scatter * DEGREE,
-                                   outliers=0.0), 6) for _ in range(4)]
-        deviations[scatter] = np.mean(
-            [math.sqrt(table.predict(22.0, 6 * DAY)[1]) for table in tables])
-    assert deviations[0.01] < 0.05 * DEGREE and 0.15 * DEGREE < deviations[0.3] < 0.6 * DEGREE
-
-
 def jumped():
     """Return a table whose bias jumped by 0.5 deg/s, its reports, and the curve it knew."""
     history = simulate(np.random.default_rng(8), linear(np.random.default_rng(9)), runs=4,
@@ -177,15 +140,6 @@ def growth(calibration, table, *given):
     return now.covariance[1][1] - calibration.covariance[1][1]
 
 
-def test_a_fresh_calibration_is_used_as_it_is():
-    given = CALIBRATION, 0.0, DAY, 20.0, True
-    now, message = BiasTable(MODEL).propagate_calibration(*given)
-    assert now.bias == CALIBRATION.bias and not message
-    assert now.covariance[1][1] - OWN ** 2 == pytest.approx(
-        NOISE.mean_change_variance(10.0, 10.0), rel=1e-6)
-    assert now.covariance[0] == pytest.approx(CALIBRATION.covariance[0])
-
-
 @pytest.mark.parametrize('age,temperature,words', [
     (400 * DAY, 20.0, '400 days, 0:00:00 ago at 20.0 degC, and now it is 20.0 degC'),
     (60.0, 45.0, '0:01:00 ago at 20.0 degC, and now it is 45.0'),
@@ -194,16 +148,6 @@ def test_age_and_distance_are_reported_where_they_matter(age, temperature, words
     now, message = BiasTable(MODEL).propagate_calibration(CALIBRATION, age, 500 * DAY, temperature)
     assert (words in message and now.covariance[1][1] > 2.0 * OWN ** 2
             and now.bias == CALIBRATION.bias)
-
-
-def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
-    table = BiasTable(MODEL)
-    table.add(20.0, 0.0, WHITE, 1000.0)
-    table.begin_run()
-    stored = replace(CALIBRATION, bias=0.0)
-    near, far = (growth(stored, table, DAY - made, DAY, 20.0) for made in (1060.0, 20000.0))
-    alone = growth(stored, BiasTable(MODEL), DAY - 1060.0, DAY, 20.0)
-    assert far < 0.7 * alone < 0.75 * near
 
 
 def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not():

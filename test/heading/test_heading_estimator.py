@@ -167,19 +167,6 @@ def test_the_tracker_begins_anew_where_it_is_warm_and_the_heading_does_not_jump(
     assert steps.max() < 0.5 * INTERVAL and abs(gyro.error) < 3.0 * gyro.deviation
 
 
-def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_it():
-    deviations = []
-    for days, temperature in ((0.0, 25.0), (300.0, 25.0), (0.0, 45.0)):
-        live = begun(now=NOW + 86400.0 * days, temperature=temperature)
-        live.add(0.1, 0.0, NOW + 86400.0 * days)
-        assert ('let the robot rest, or calibrate again' in live.calibration_message
-                and f'{temperature:.1f} degC' in live.calibration_message)
-        deviations.append(math.sqrt(live.covariance[-1, -1]) / DEGREE)
-    on, old, far = deviations
-    # deg/s; a gyro that was turned off and on is at least 0.05 deg/s off
-    assert 0.05 < on < old < far
-
-
 def test_a_gyro_that_was_without_power_may_have_another_bias():
     gyro = Gyro(begun()).go(40.0)
     gyro.live.use_calibration(MODEL, gyro.now + gyro.time)
@@ -236,13 +223,6 @@ def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(ter
     assert not gyro.live.tracker.is_resting
     gyro.go(40.0, 0.3, 35.0)
     assert abs(gyro.error - before) < 2.0 * DEGREE
-
-
-def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
-    gyro = Gyro(begun()).go(12.0)
-    assert not gyro.live.table.entries
-    gyro.live.update_table(gyro.now + gyro.time, ending=True)
-    assert len(gyro.live.table.entries) == 1
 
 
 def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():

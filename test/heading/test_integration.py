@@ -89,35 +89,6 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
     assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)
 
 
-@pytest.mark.parametrize('settings', [Threshold(), Threshold(0.0)], ids=['threshold', 'pure'])
-@pytest.mark.parametrize('offset', [0.0, 1.7e9], ids=['from zero', 'stamps since 1970'])
-def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
-    model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
-    time, rate = (np.delete(values[:3000], np.r_[900:905, 1300, 2000:2020])
-                  for values in noisy_robot())
-    sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
-    tracker = HeadingTracker(XV3500, uncertainty_covariance(model),
-                             TrackerSettings(false_alarms=0.0, threshold=settings))
-    headings, variances = [], []
-    for index in range(len(time)):
-        assert not tracker.add(float(time[index]) + offset, float(rate[index]),
-                               sensitivity[:, index])
-        headings.append(tracker.heading)
-        variances.append(tracker.variance)
-    integrator = BlockIntegrator(settings, XV3500, uncertainty_covariance(model))
-    _, heading, deviation = integrator.add(time, rate, sensitivity)
-    assert integrator.intervals.lost_samples == tracker.intervals.lost_samples == 26
-    # Stamps near 1e9 s have steps of 0.1 us.
-    assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
-    # the tracker counts the calibration's part once a second
-    around_the_gap = slice(1980, 2000)
-    assert deviation[around_the_gap] ** 2 == pytest.approx(variances[around_the_gap], rel=1e-2)
-    tracker.finish()
-    assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
-    deleted = integrate(time, rate)[-1] - heading[-1]
-    assert tracker.deleted_heading == pytest.approx(deleted, abs=1e-5)
-
-
 # Lost samples: how many, what they leave unknown of the heading, and rests across them. The stated
 # variance is compared with the difference to the heading with all samples, over many drives.
 
@@ -159,18 +130,6 @@ def intervals_of(stamps):
     for step in np.diff(stamps).tolist():
         intervals.add(step)
     return intervals
-
-
-@pytest.mark.parametrize('jitter', [0.0, 0.1])
-@pytest.mark.parametrize('interval', [0.001, 0.01, 0.1])
-def test_lost_samples_are_counted_where_stamps_are_even_or_jitter(interval, jitter):
-    generator = np.random.default_rng(1)
-    comes = kept(3000, 0.1, 5, generator)
-    stamps = interval * (np.arange(3000) + jitter * generator.uniform(-1.0, 1.0, 3000))[comes]
-    intervals = intervals_of(stamps)
-    assert (intervals.lost_samples == (~comes).sum()
-            and intervals.usual_interval == pytest.approx(interval, rel=0.05 + jitter))
-    assert intervals.longest_gap == pytest.approx(np.diff(stamps).max())
 
 
 def test_samples_that_come_late_or_in_bursts_are_not_lost():

@@ -12,12 +12,10 @@
 
 from dataclasses import replace
 
-from conftest import operations
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
 from gyro_calibration.logs.log import Log, read_log
 from gyro_calibration.model.channels import channels_from_log
-from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import simulate_gyro_output
@@ -68,15 +66,6 @@ def test_blocks_are_compensated_as_the_whole(size):
     np.testing.assert_allclose(sensitivities, sensitivity, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize('size', [700, 18000])
-def test_a_heading_that_nobody_measured_is_found_meanwhile(size):
-    model = model_of(HEADING | {'scale_factor_error': (0.01,)})
-    log = replace(drive(model), reference_heading=None)
-    assert in_blocks(model, log, size)[0] == pytest.approx(log.reference_rate, abs=1e-8)
-    plain = compensate_log(model_of({'scale_factor_error': (0.01,)}), log)
-    assert np.abs(plain - log.reference_rate).max() > 1e-3, 'the heading did not matter'
-
-
 @pytest.mark.parametrize('size', [500, 700, 5000, 18000])
 def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_blocks_as_in_one_piece(
         size):
@@ -104,17 +93,6 @@ def test_rows_without_output_are_left_out(tmp_path, compensate):
                           equal_nan=True)
 
 
-def test_the_uncertainty_of_a_time_constant_goes_into_the_rate():
-    """Compare with models whose time constants differ by one standard deviation."""
-    model = model_of({'thermal_lag': (120.0, -2e-3)}, covariance=np.diag([4.0, 0.0]))
-    log = drive(model)
-    result, sensitivity = LogCompensation(model).add(log)
-    other = compensate_log(model_of({'thermal_lag': (122.0, -2e-3)}), log)
-    deviation = np.sqrt(quadratic_form(uncertainty_covariance(model), sensitivity))
-    assert deviation == pytest.approx(np.abs(other - result.rate), rel=0.03, abs=2e-6)
-    assert deviation.max() > 1e-4
-
-
 def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(compensate):
     model = model_of({'supply_sensitivity': (5.0, 1e-4), 'time_offset': (0.02,),
                       'heading_sensitivity': (0.0, 0.0), 'saturation': (1.0,)})
@@ -140,10 +118,3 @@ def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_t
     assert (np.abs(done.columns['rate_rad_s'] - rate)[inside].max() < 1e-4
             < np.abs(log.output - rate).max())
     assert np.ptp((done.columns['heading_rad'] - done.log.reference_heading)[inside]) < 5e-4
-
-
-def test_a_log_is_compensated_without_a_loop_over_its_samples():
-    time = np.arange(10 ** 5) * 0.01
-    log = Log(output=np.sin(time), time=time, temperature=25.0 + np.sin(time / 500.0))
-    model = model_of({'thermal_lag': (120.0, -2e-3), 'warm_up': (300.0, 0.004)} | HEADING)
-    assert operations(lambda: compensate_log(model, log)) < 0.6 * len(time)

@@ -185,25 +185,6 @@ def test_an_imu_in_the_message_of_a_driver_serves_where_its_topic_is_named(
         read_recording(path)
 
 
-@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
-def test_other_kinds_serve_where_they_are_named(make, tmp_path, turning, storage):
-    time, rate, heading = turning
-    types = make.store.types
-    topics = {
-        'rate': [(at, types['geometry_msgs/msg/Vector3Stamped'](make.header(at), make.vector(r)))
-                 for at, r in zip(time, rate)],
-        'pose': [(at, types['geometry_msgs/msg/PoseWithCovarianceStamped'](
-            make.header(at), make.odometry(at, h, 0.0).pose)) for at, h in zip(time, heading)]}
-    path = write(tmp_path / 'bag', topics, storage)
-    log = read_recording(path, Topics('rate', 'pose'))
-    np.testing.assert_array_equal(log.output, rate)
-    np.testing.assert_allclose(log.reference_heading, heading, atol=1e-9)
-    with pytest.raises(LogError, match='no message of sensor_msgs/msg/Imu'):
-        read_recording(path)
-    with pytest.raises(LogError, match='--topic wants sensor_msgs/msg/Imu'):
-        read_recording(path, Topics('pose'))
-
-
 def write_chunks(path, compression, count, chunked=True):
     writing = pytest.importorskip('mcap.writer', reason='mcap is not installed')
     with open(path, 'wb') as file:
@@ -460,11 +441,17 @@ def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
               'pose': [(at, make.pose(at, h)) for at, h in zip(time, heading)],
               'twist': [(at, make.twist(at, r)) for at, r in zip(time, rate)],
               'without rate': [(at, make.odometry(at, h, 0.0)) for at, h in zip(time, heading)],
-              'bare': gyro(make, time, rate)}
+              'bare': gyro(make, time, rate),
+              'vector': [(at, make.vector_stamped(at, r)) for at, r in zip(time, rate)],
+              'covariance': [(at, make.pose_with_covariance(at, h))
+                             for at, h in zip(time, heading)]}
     path = write(tmp_path / 'bag', topics)
+    np.testing.assert_array_equal(read_recording(path, Topics('vector', 'pose')).output, rate)
+    with pytest.raises(LogError, match='--topic wants sensor_msgs/msg/Imu'):
+        read_recording(path, Topics('pose'))
     for name, has_heading, has_rate in (('odom', 1, 1), ('other', 1, 1), ('pose', 1, 0),
-                                        ('twist', 0, 1), ('without rate', 1, 0),
-                                        ('bare', 0, 1)):
+                                        ('twist', 0, 1), ('without rate', 1, 0), ('bare', 0, 1),
+                                        ('covariance', 1, 0)):
         log = read_recording(path, Topics('imu', name))
         assert ((log.reference_heading is not None, log.reference_rate is not None)
                 == (has_heading, has_rate)), name
@@ -472,17 +459,6 @@ def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
             np.testing.assert_allclose(log.reference_heading, heading, atol=1e-9)
         if has_rate:
             np.testing.assert_allclose(log.reference_rate, rate, atol=1e-9)
-
-
-def test_a_reference_at_its_own_times_lies_on_the_line_between_its_values(make, tmp_path):
-    time = np.arange(500) / RATE
-    own = np.arange(0.003, 4.9, 0.04)
-    topics = {'imu': gyro(make, time, np.full(500, 0.5)),
-              'pose': [(at, make.pose(at, 0.5 * at)) for at in own]}
-    log = read_recording(write(tmp_path / 'bag', topics), Topics(reference='pose'))
-    inside = (time >= own[0]) & (time <= own[-1])
-    np.testing.assert_allclose(log.reference_heading[inside], 0.5 * time[inside], atol=1e-9)
-    assert np.isnan(log.reference_heading[~inside]).all()
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])

@@ -15,13 +15,12 @@ from pathlib import Path
 
 from chance import mean_bound
 from gyro_calibration.allan.deviation import allan_deviation
-from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION, constant_rate_motion, motion_from_headings, MotionError, NAMED_MOTIONS,
-    read_motion, ROBOT_MOTION, simulate)
+    CALIBRATION_MOTION, MotionError, NAMED_MOTIONS, read_motion, ROBOT_MOTION, simulate)
 from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
@@ -37,31 +36,6 @@ def test_the_heading_is_the_integral_of_the_rate(name):
     rate = motion.rate_at(time)
     heading = np.concatenate([[0.0], np.cumsum((rate[1:] + 4 * middle + rate[:-1]) / 6 / 20.0)])
     assert motion.heading_at(time) == pytest.approx(heading, abs=1e-12)
-
-
-def test_the_calibration_takes_20_s_turns_both_ways_at_two_speeds_and_comes_back():
-    rate = CALIBRATION_MOTION.rate_at(np.arange(-100, 2201) / 100.0) / DEGREE
-    assert (CALIBRATION_MOTION.duration == 20.0
-            and CALIBRATION_MOTION.heading[-1] == pytest.approx(0.0, abs=1e-12))
-    assert all((np.abs(rate - speed) < 1e-9).mean() > 0.1 for speed in (-45, -30, 0, 30, 45))
-    assert not rate[:100].any() and not rate[-100:].any(), 'before and after it stands'
-
-
-def test_the_robot_drives_160_s_and_stands_for_half_of_them():
-    """Hong and Park, section 4.1: a trajectory of 160 s."""
-    rate = ROBOT_MOTION.rate_at(np.arange(16001) / 100.0)
-    assert (ROBOT_MOTION.duration == pytest.approx(160.0)
-            and (rate == 0.0).mean() == pytest.approx(0.5, abs=0.05))
-    assert (ROBOT_MOTION.heading_at(np.array([-5.0, 165.0])).tolist()
-            == [0.0, ROBOT_MOTION.heading[-1]])
-
-
-def test_known_headings_are_met_and_joined_by_lines_and_known_rates_turn_by_their_duration():
-    motion = motion_from_headings(np.array([10.0, 11.0, 13.0]), np.array([5.0, 6.0, 6.5]))
-    assert (motion.heading_at(np.array([0.0, 0.5, 1.0, 2.0, 3.0])).tolist()
-            == [0.0, 0.5, 1.0, 1.25, 1.5])
-    assert (constant_rate_motion([(1, 0), (4, 45), (1, 0)]).heading[-1]
-            == pytest.approx(4 * 45 * DEGREE))
 
 
 @pytest.mark.parametrize('prefix', ['', 'reference_'])
@@ -91,10 +65,8 @@ REFUSED = {
     'a reference lost everywhere': ('time_s,reference_rate_dps\n0,nan\n1,nan\n2,1\n',
                                     'at least two rows'),
     'empty': ('', 'the columns are nothing'),
-    'no time': ('rate_dps\n1\n2\n', 'wanted time_s'),
     'two motions': ('time_s,rate_dps,heading_deg\n0,1,1\n1,1,1\n', 'wanted time_s and one of'),
     'time stands': ('time_s,rate_dps\n0,1\n0,1\n', 'time_s must increase'),
-    'inf': ('time_s,rate_dps\n0,1\ninf,1\n', 'column time_s'),
     'binary': (bytes(range(256)), 'cannot be read'),
     'beyond': ('time_s,rate_dps\n0,1\n1,1e300\n', 'column rate_dps'),
     'large': (b'\n' * 17_000_000, 'more than 16000000 bytes'),
@@ -126,16 +98,6 @@ def test_a_log_holds_the_motion_and_what_equation_1_of_hong_and_park_makes_of_it
     assert log.output == pytest.approx(0.9 * log.reference_rate + 0.01, abs=1e-12)
     noise = simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0)).output - log.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
-
-
-def test_the_verb_simulates_what_a_gyro_makes_of_time_and_heading(tmp_path, run):
-    (tmp_path / 'model.yaml').write_text('effects: {warm_up: {warm_up: 0.01, time_constant: 5}, '
-                                         'quantization: {quantization: 1e-3}}')
-    code, *_ = run('simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest',
-                   '--out', tmp_path / 'log.csv')
-    log = read_log(tmp_path / 'log.csv')
-    assert code == 0 and log.output == pytest.approx(
-        1e-3 * np.round(10.0 * np.exp(-log.time / 5.0)), abs=1e-12)
 
 
 # Simulated noise has the Allan deviation of IEEE Std 952: N/sqrt(tau), 0.664 B, K sqrt(tau/3)

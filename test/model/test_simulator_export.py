@@ -92,15 +92,6 @@ def test_each_effect_is_held_or_listed(simulator):
         assert not any(each.endswith('0.011 1') for each in left_out), 'a number has no unit'
 
 
-def test_isaac_is_given_python():
-    model = GyroModel((term('bias', 1e-3),), noise=NOISE)
-    text, left_out = export_model(
-        simulator_parameters(model, 100.0, 25.0, 3600.0)[0], model, 'isaac')
-    compile(text, 'isaac', 'exec')
-    assert 'mean=0.001' in text and 'std=0.007' in text
-    assert any(each.startswith('bias_instability: 0.0002 rad/s') for each in left_out)
-
-
 def test_mujoco_limits_and_delays_as_the_model():
     mujoco = pytest.importorskip('mujoco')
     model = GyroModel((term('saturation', 1.5), term('time_offset', 0.013)), noise=NOISE)

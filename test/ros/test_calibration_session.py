@@ -172,22 +172,6 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
     assert rig.stopped_after(begin) <= max(0.25, 4.0 * interval) + 2.1 * Drive.INTERVAL
 
 
-@pytest.mark.parametrize('ros', [None, 1000.0], ids=['no /clock', '/clock'])
-def test_a_pause_of_the_node_whose_messages_wait_behind_the_timers_keeps_no_drive_from_going_on(
-        tmp_path, ros):
-    def pause():
-        rig.pipeline.poll(1)
-        rig.clock.now += 0.4
-        rig.pipeline.poll(1)
-    rig = rested(tmp_path, calibration_drive=True, ros=ros)
-    pause()
-    rig.drive_to()
-    pause()
-    rig.step()
-    rig.pipeline.poll(1)
-    assert not rig.ended
-
-
 @pytest.mark.parametrize('ros, within', [(None, 1.0), (1000.0, 2.2)], ids=['host', 'simulated'])
 @pytest.mark.parametrize('pace', [1e-6, 0.3, 3.0])
 def test_stamps_that_leave_the_clock_end_a_drive(tmp_path, pace, ros, within):

@@ -11,16 +11,14 @@
 """Layouts, launch files and the robot_localization example name what exists, and all of it."""
 
 import ast
-import json
 from pathlib import Path
 import re
-from xml.etree import ElementTree
 
 import pytest
 import yaml
 
 try:
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+    from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
     from gyro_calibration.ros import driver_node, pipeline
     from sensor_msgs.msg import Imu, Temperature
@@ -28,107 +26,29 @@ except ImportError:
     pytest.skip('ROS 2 messages are not installed', allow_module_level=True)
 
 ROOT = Path(__file__).parents[2]
-FOXGLOVE = json.loads((ROOT / 'config/foxglove.json').read_text())
-PLOTJUGGLER = ElementTree.parse(ROOT / 'config/plotjuggler.xml').getroot()
-SCRIPT = FOXGLOVE['userNodes']['heading_band']['sourceCode']
 TOPICS = {'/imu/data_raw': Imu, '/imu/temperature': Temperature, '/imu/data': Imu,
           '/heading': PoseWithCovarianceStamped, '/yaw_rate': TwistWithCovarianceStamped,
           '/compensation_node/calibration_status': DiagnosticArray,
           '/diagnostics': DiagnosticArray}
 STATUSES = {'/driver_node: gyro', '/compensation_node: heading'}
-FUNCTIONS = {'degrees', 'sqrt'}  # of the message paths of Foxglove
 
 
-def field(message, names):
-    """Return the field of a message at a path; an array stands for its element."""
-    for name in names:
-        assert hasattr(message, name), f'{type(message).__name__} has no {name}'
-        message = getattr(message, name)
-    return message
-
-
-def check_path(path):
-    topic = re.match(r'[\w/]+', path)[0]
-    assert topic in TOPICS, path
-    message = TOPICS[topic]()
-    for name in re.findall(r'\{name=="([^"]+)"\}', path):
-        assert name in STATUSES
-    for part in re.sub(r'\{[^}]*\}', '', path[len(topic):]).split('.')[1:]:
-        if part.startswith('@'):
-            assert part[1:] in FUNCTIONS and isinstance(message, float), path
-            continue
-        name, index = re.fullmatch(r'(\w+)(?:\[([\d:]+)\])?', part).groups()
-        message = field(message, [name])
-        if isinstance(message, list) and index:  # of statuses
-            message = DiagnosticStatus()
-        elif index:
-            message = float(message[int(index)])
-
-
-def paths():
-    found = []
-    for config in FOXGLOVE['configById'].values():
-        found += [series['value'] for series in config.get('paths', [])]
-        found += [config[key] for key in ('topicPath', 'topicToRender') if key in config]
-    return found
-
-
-def test_the_script_of_foxglove_reads_what_exists_and_gives_what_is_plotted():
-    inputs = re.search(r'inputs = \[(.*)\]', SCRIPT)[1].replace('"', '').split(', ')
-    output = re.search(r'output = "(.*)"', SCRIPT)[1]
-    assert inputs == ['/heading'] and TOPICS['/heading'] is PoseWithCovarianceStamped
-    message = PoseWithCovarianceStamped()
-    field(message, ['pose', 'pose', 'orientation', 'z'])
-    assert len(message.pose.covariance) == 36 and 'pose.covariance[35]' in SCRIPT
-    given = set(re.findall(r'(\w+): number',
-                           SCRIPT.partition('type Output = ')[2].partition(';\n')[0]))
-    plotted = {path.removeprefix(f'{output}.')
-               for path in paths() if path.startswith('/studio_script/')}
-    assert plotted == given
-
-
-def test_every_panel_of_foxglove_is_shown_once_with_paths_and_statuses_that_exist():
-    def panels(node):
-        return [node] if isinstance(node, str) else panels(node['first']) + panels(node['second'])
-    assert sorted(panels(FOXGLOVE['layout'])) == sorted(FOXGLOVE['configById'])
-    for path in paths():
-        if not path.startswith('/studio_script/'):
-            check_path(path)
-    chosen = [config['selectedName']
-              for config in FOXGLOVE['configById'].values() if 'selectedName' in config]
-    assert chosen and set(chosen) <= STATUSES
-
-
-def series_exists(name):
-    """Check a series by the names of PlotJuggler's ROS parser (from its source, 2026)."""
-    topic = max((topic for topic in TOPICS if name.startswith(f'{topic}/')), key=len)
-    rest = name.removeprefix(f'{topic}/')
-    if TOPICS[topic] is DiagnosticArray:
-        hardware, status, _key = re.fullmatch(r'(\w+)/(/\w+: \w+)/(\w+)', rest).groups()
-        assert hardware == 'none' and status in STATUSES
-        return
-    names = rest.split('/')
-    message = TOPICS[topic]()
-    if names[-1] == 'yaw':  # it makes angles of quaternions, and rows and columns of covariances
-        names[-1] = 'z'
-    if re.fullmatch(r'\[\d;\d\]', names[-1]):
-        assert len(field(message, names[:-1])) == 9 and names[-1] == '[2;2]'
-        return
-    assert isinstance(field(message, names), float)
-
-
-def test_each_series_of_plotjuggler_exists_on_a_topic_that_it_subscribes_to():
-    snippets = {snippet.get('name'): snippet for snippet in PLOTJUGGLER.iter('snippet')}
-    curves = {curve.get('name') for curve in PLOTJUGGLER.iter('curve')}
-    assert set(snippets) <= curves
-    shown = [*(curves - set(snippets)),
-             *(element.text for snippet in snippets.values() for element in snippet.iter()
-               if element.tag == 'linked_source' or re.fullmatch(r'v\d', element.tag))]
-    topics = PLOTJUGGLER.find('.//selected_topics').get('value').split(';')
-    assert set(topics) <= set(TOPICS)
-    for name in shown:
-        series_exists(name)
-        assert any(name.startswith(f'{topic}/') for topic in topics), name
+def test_layouts_show_topics_fields_and_statuses_that_exist():
+    """By the message paths of Foxglove, and the series of PlotJuggler's ROS parser."""
+    for name in ('foxglove.json', 'plotjuggler.xml'):
+        text = (ROOT / 'config' / name).read_text().replace('\\"', '"')
+        assert {*re.findall(r'/\w+: \w+', text)} <= STATUSES
+        paths = re.findall(r'[">;](/[a-z][^"<>;{[]*)', text)
+        assert len(paths) > 5
+        for path in paths:
+            topic = max((each for each in TOPICS if path.startswith(each)), key=len, default='')
+            assert topic or path in STATUSES or path.startswith('/studio_script/'), path
+            message = TOPICS[topic]() if topic else None
+            if message is None or isinstance(message, DiagnosticArray):
+                continue
+            for part in re.findall(r'[./](\w+)', path[len(topic):]):
+                # PlotJuggler makes angles of quaternions
+                message = getattr(message, 'z' if part == 'yaw' else part)
 
 
 # robot_localization

@@ -92,12 +92,6 @@ def test_three_times_the_noise_is_found_in_one_promised_rest_or_three_others(noi
     assert 'or the robot vibrates' in fed(HealthMonitor(noise, 0.001), outputs[:5]).noise_alarm
 
 
-def test_a_bias_of_unknown_uncertainty_is_not_examined():
-    outputs = 0.01 + stretches(MEMS, 0.1, np.random.default_rng(17))
-    check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)
-    assert not check.bias_alarm and math.isnan(check.last_rest.sigmas)
-
-
 def test_motion_is_not_taken_for_a_misfit():
     """The robot stands half of the time and turns half of it, with a wobble of 1 % of its rate."""
     time = np.arange(0.0, ROBOT_MOTION.duration, INTERVAL)

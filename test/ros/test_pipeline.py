@@ -20,7 +20,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.inputs import (
-    AlternateTurns, COASTING_DURATION, COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels)
+    COASTING_DURATION, COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels)
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -241,15 +241,6 @@ def test_the_threshold_filter_deletes_rates_at_rest_unless_it_is_switched_off(tm
     assert rig.feed([0.1 * DEGREE] * 2)[-1].rate == pytest.approx(0.1 * DEGREE)
 
 
-@pytest.mark.parametrize('late, moving', [(0.5, False), (2.0, None)])
-def test_odometry_that_is_late_does_not_show_that_the_robot_stands(tmp_path, late, moving):
-    rig = Rig(tmp_path, model=KNOWN, wheels='odom')
-    for _ in range(100):
-        rig.feed([BIAS])
-        rig.pipeline.add_odometry(rig.fed - round(1e9 * late), 0.0, Velocity())
-    assert rig.pipeline.wheels.is_moving(rig.clock.now) is moving
-
-
 def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill(
         tmp_path, reported):
     rig = rested(tmp_path, seconds=60.0, wheels='odom')
@@ -395,21 +386,6 @@ def test_every_other_sample_of_another_gyro_is_a_warning_and_the_heading_claims_
     assert ('every other sample' in rig.pipeline.find_obstacle()) == warns
 
 
-@pytest.mark.parametrize('rate', [10, 20, 400])
-def test_the_samples_of_a_gyro_that_vibrates_and_turns_fast_do_not_alternate(rate):
-    """Also of one whose samples come in pairs, at 4 rad/s and 20 rad/s²."""
-    generator, turns = np.random.default_rng(rate), AlternateTurns()
-    time = np.arange(0.0, 300.0, 1.0 / rate)
-    swing = np.clip(10.0 * np.sin(0.9 * time), -4.0, 4.0)
-    vibration = 0.5 * np.sin(2.0 * np.pi * 0.49 * rate * time)
-    pairs = time - np.where(np.arange(len(time)) % 2, 0.8 / rate, 0.0)
-    for stamps in (time, pairs):
-        for stamp, value in zip(stamps, swing + vibration + 0.1 * generator.standard_normal(
-                len(time))):
-            turns.add(stamp, value)
-            assert not turns.is_contradictory
-
-
 def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     """As of a relay that joins two topics: the stamps increase, and the graph shows one node."""
     rig = Rig(tmp_path, model='')
@@ -455,25 +431,6 @@ def test_a_turn_between_two_rests_while_two_publishers_send_is_in_the_variance(t
     rig.go(5.0)
     error, deviation = rig.error(begin)
     assert not rig.pipeline.conflict and 2.0 < abs(error) < 3.0 * deviation, (error, deviation)
-
-
-STARTED_AGAIN = {  # pause, s, samples after it and interval, s
-    'soon': [(0.4, 400, INTERVAL)], 'faster': [(1.5, 667, 0.006)], 'slower': [(1.5, 80, 0.05)],
-    'late at first': [(1.5, 1, INTERVAL), (0.04, 1, INTERVAL), (0.0, 3, 3e-4),
-                      (0.0, 100, INTERVAL)]}
-
-
-@pytest.mark.parametrize('pieces', STARTED_AGAIN.values(), ids=STARTED_AGAIN)
-def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path, pieces):
-    """Its dead predecessor is listed for up to 20 s; the stamps show that one alone sends."""
-    rig = Rig(tmp_path, model='')
-    rig.feed(np.full(300, 0.5))
-    rig.publishers = ['/driver_node', '/driver_node']
-    rig.pipeline.update_publishers(rig.publishers)
-    for pause, count, interval in pieces:
-        rig.skip(pause)
-        rig.feed(np.full(count, 0.5), interval=interval)
-    assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
 
 
 @pytest.mark.parametrize('names', [('/a', '/b'), ('/a', '/a')], ids=['two names', 'one name'])
@@ -525,15 +482,6 @@ def test_a_temperature_that_leaps_is_used_where_it_stays_and_is_possible(tmp_pat
         rig.feed(noisy(1.0), SLOW)
     assert rig.pipeline.estimator.temperature == used
     assert rig.journal.counts['refused_temperatures'] >= given.count(60.0)
-
-
-def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
-    rig = Rig(tmp_path, model=THERMAL)
-    rig.feed(np.full(10, 0.5))
-    rig.pipeline.add_temperature(2_145_916_800 * 10 ** 9, 25.0)
-    assert not rig.pipeline.estimator.is_temperature_lost
-    rig.feed(np.full(1100, 0.5))
-    assert rig.pipeline.estimator.is_temperature_lost
 
 
 # Clocks
@@ -676,15 +624,6 @@ def test_a_turn_while_stamps_advance_unevenly_for_a_time_is_a_warning_and_in_the
     assert level == WARN and 'the heading may be off by' in message
     rig.pipeline.reset_heading()
     assert not rig.pipeline.stamp_fault
-
-
-def test_neither_a_clock_that_drifts_nor_a_busy_computer_is_uneven_stamps(tmp_path):
-    rig = Rig(tmp_path)
-    rig.pace_stamps(1.03)
-    rig.hold_up_samples(lambda: 20.0 < rig.clock.now - 1000.0 < 23.0)
-    for rate in (0.5, -1.0, 0.7):
-        rig.turn(rate, 20.0)
-    assert rig.pipeline._stamp_delay.unknown_turn < 0.1 * DEGREE
 
 
 @pytest.mark.parametrize('pace, warns', [(1e-6, True), (0.9, True), (1.1, True), (2.0, True),
