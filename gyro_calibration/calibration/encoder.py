@@ -11,9 +11,8 @@
 """
 Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
 
-The input is a log in time with a reference heading. There are three methods: the likelihood of the
-headings, the regression of a course over ground, and the regression of the encoder's rate on the
-gyro, sample by sample.
+The input is a log in time with a reference heading. There are two methods: the likelihood of the
+headings, and the regression of a course over ground.
 
 The error of an encoder is constant while its reading is, and known where the reading changes by a
 step; so readings are used at their steps. An error of step / sqrt(12) at each sample would give
@@ -52,7 +51,7 @@ from gyro_calibration.calibration.run_faults import (
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects)
 from gyro_calibration.calibration.self_calibration import (
-    DRIVE_DURATION, fit_rate, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
+    DRIVE_DURATION, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -116,7 +115,7 @@ class EncoderCalibration:
     Attributes
     ----------
     model : scale factor error and bias with their covariance, valid ranges and temperature
-    method : 'likelihood', 'course' or 'rate'
+    method : 'likelihood' or 'course'
     fit : the same with noise and time offset, as found
     reference : its headings over time, s since it began
     residual_before, residual_after : the residual heading without calibration and with it
@@ -144,8 +143,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
     ----------
     log : with time, output and reference heading, or a reference rate, which is integrated;
         samples without a number count as lost
-    method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
-        encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
+    method : 'likelihood', or 'course' for a course over ground; None for 'course' where the
+        reference is one, else 'likelihood'
     technology : of the gyro, one of `heading_regression.TECHNOLOGY_PRIORS`; with 'course' its
         prior decides what a drive leaves open
 
@@ -179,7 +178,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         refuse_dead(output)
         fit = fit_course(log, technology)
     else:
-        fit, bounds = _fit_encoder(time, output, motion, crossing, method, technology)
+        fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
         (Term(BIAS, (fit.bias,)), Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
         fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())),
@@ -188,7 +187,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         degc = log.temperature
         model = replace(model, temperature_range=(float(degc.min()), float(degc.max())),
                         reference_temperature=float(degc.mean()))
-    on_reference = time - np.nan_to_num(fit.time_offset)
+    on_reference = time - fit.time_offset
     lost = count_lost_samples(time)
     return EncoderCalibration(
         model, method, fit, motion, _heading_residual(on_reference, output, motion),
@@ -198,9 +197,9 @@ def calibrate_encoder(log: Log, method: str | None = None,
         (*chosen, *repeated, *jumps, *_list_remarks(fit, motion, method, technology)))
 
 
-def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
+def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
-    """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
+    """Return the fit by the likelihood, or refuse it, and the bounds of its noise."""
     limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET, max_heading_error=15.0 * DEGREE)
     if hole := _find_turn_in_hole(time, output, motion):
         raise DataRefused(f'{hole}: use --method course, or fit the log before or after it (--to, '
@@ -209,12 +208,10 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     refuse_dead(output)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
-    fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
-           fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
-                          lag_deviation=(_GYRO_LAG_DEVIATION if has_steps
-                                         else _SMOOTHING_DEVIATION),
-                          cross_rotation=crossing, bias_wanders=True))
-    if motion.rate is not None and method == 'likelihood':
+    fit = fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
+                         lag_deviation=_GYRO_LAG_DEVIATION if has_steps else _SMOOTHING_DEVIATION,
+                         cross_rotation=crossing, bias_wanders=True)
+    if motion.rate is not None:
         # the variance of the times by which a motion is late is seldom above their mean squared
         exact = fit.scale_factor_error
         fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
@@ -231,7 +228,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     elif fit.shaft_error.size:
         motion = replace(motion, heading=correct_shaft(motion.heading, fit.shaft_error))
     drift = _estimate_drift(motion, _heading_residual(
-        time - np.nan_to_num(fit.time_offset), corrected, motion).heading, fit.bias, technology)
+        time - fit.time_offset, corrected, motion).heading, fit.bias, technology)
     # a bias within chance that could make a heading worse
     if (drift.deviation * DRIVE_DURATION > limits.max_heading_error
             and abs(drift.bias) < stats.norm.ppf(0.975) * drift.deviation):
@@ -249,8 +246,6 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
                           f'wanted {100 * limits.max_scale_deviation:g} %: '
                           'turn further, faster, or more often')
     fit = replace(fit, covariance=fit.covariance + np.diag([response_variance, 0.0]))
-    if method == 'rate':
-        return replace(fit, angle_random_walk=drift.angle_random_walk), {}
     # the steps of an encoder hide white noise
     if has_steps:
         return replace(fit, angle_random_walk=min(fit.angle_random_walk, drift.walk_bounds[1])), {}
@@ -442,31 +437,6 @@ def _find_turn_in_hole(time: Array, output: Array, motion: Motion) -> str:
     return ''
 
 
-def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:
-    """Fit by the rate of the encoder; the stamps are taken as exact."""
-    noise, interval = white_noise_deviation(output), float(np.median(np.diff(time)))
-    at = motion.time[(motion.time >= time[0]) & (motion.time <= time[-1])]
-    heading = motion.heading_at(at)
-    if motion.rate is None:
-        # differences of headings are means of rates, which the output is averaged to as well: by
-        # the trapezoid rule with the next term of Euler and Maclaurin
-        angle = integrate(time, output) - interval ** 2 / 12.0 * np.gradient(output, time)
-        output, rate = (np.gradient(each, at) for each in (np.interp(at, time, angle), heading))
-        noise *= math.sqrt(interval / (2.0 * float(np.median(np.diff(at)))))
-    else:
-        output, rate = np.interp(at, time, output), motion.rate_at(at)
-    fit = fit_rate(at, output, Motion(at, heading, rate))
-    scale = 1.0 / (1.0 + fit.scale_factor_error)
-    offset = -fit.bias / (1.0 + fit.scale_factor_error)
-    columns = np.column_stack([output, np.ones(len(output))])
-    scores = columns * (columns @ (scale, offset) - rate)[:, None]
-    jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
-    influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
-    # the noise of the output, the regressor, biases the scale factor error by its share
-    return replace(fit, influence=np.column_stack([influence, at]), time_offset=math.nan,
-                   response_deviation=noise ** 2 / float(np.var(output)))
-
-
 def _number_pieces(time: Array) -> NDArray[np.intp]:
     """Return the piece of the log of each time: 8 to 64 pieces, of 5 s or more if above 8."""
     since = (time - time[0]) / (time[-1] - time[0])
@@ -482,9 +452,8 @@ class _Drift:
     bias: float
     deviation: float
     wander_deviation: float  # of the mean bias less the bias at the beginning, rad/s
-    # rad/√s, over times longer than a piece of the log, and its 95 % bounds if nothing else moves
-    # the heading from piece to piece
-    angle_random_walk: float
+    # 95 % bounds of the angle random walk if nothing else moves the heading from piece to piece,
+    # rad/√s
     walk_bounds: tuple[float, float]
 
 
@@ -536,7 +505,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
     return _Drift(bias + float(found.values[0]), float(found.deviations[0]),
-                  math.sqrt(found.unobservable_variance), found.size('angle_random_walk'),
+                  math.sqrt(found.unobservable_variance),
                   (math.sqrt(squares / stats.chi2.ppf(0.975, len(white) - 1)),
                    math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))
 
@@ -552,8 +521,7 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence, turned)
     slope = scatter[0, 1] / scatter[1, 1]
     # the drift is that of a heading with the scale of the fit, whose error is one of the bias too
-    own_variance = max(float(np.nan_to_num(fit.covariance[0, 0]))
-                       - fit.response_deviation ** 2, 0.0)
+    own_variance = max(float(fit.covariance[0, 0]) - fit.response_deviation ** 2, 0.0)
     of_scale = fit.covariance[0, 1] / math.sqrt(own_variance) if own_variance else 0.0
     widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation, of_scale)
                          / math.sqrt(scatter[1, 1])])
@@ -565,7 +533,7 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
         covariance[0, 0] = max(covariance[0, 0],
                                _scatter_between(place, fit.influence, turned)[0, 0])
     # the components of a misalignment scatter as the scale factor error does
-    widening = covariance[0, 0] / np.nan_to_num(fit.covariance[0, 0], nan=math.inf)
+    widening = covariance[0, 0] / fit.covariance[0, 0]
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
                    + float(slope) * (drift.bias - fit.bias), covariance=covariance,
                    misalignment_covariance=max(widening, 1.0) * fit.misalignment_covariance)
@@ -607,7 +575,7 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
         yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
-    if method != 'rate' and fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
+    if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
         yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag of '
                'the reference or the gyro, as where it has one frequency, or a period that is not '
                f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
@@ -655,11 +623,6 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                'in which an error once in a revolution, as of an eccentric encoder, may have the '
                'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
                'not include what the likelihood does not show: turn further')
-    if method == 'rate':
-        yield ('the regression of rates fits no time offset, and noise of the gyro biases its '
-               'scale factor error by up to '
-               f'{100.0 * fit.response_deviation:.2g} %, which the interval includes; compare it '
-               'with the method likelihood')
 
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.

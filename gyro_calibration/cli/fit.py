@@ -44,10 +44,10 @@ import numpy as np
 def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
-    parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
+    parser.add_argument('--method', choices=['dwells', 'likelihood', 'course'],
                         help='dwells: means at constant rates; likelihood: by the reference '
-                        'heading; course: by a course over ground; rate: by the rate of the '
-                        'reference heading. Default: by the columns of the log')
+                        'heading; course: by a course over ground. Default: by the columns of the '
+                        'log')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
