@@ -204,8 +204,7 @@ class _RunAlignment:
     """A run and a motion, aligned at any time offset and lag."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
-                 slip_deviation: float, excess_turn: tuple[float, float] | None,
-                 cross_rotation: Array, bias_wanders: bool):
+                 slip_deviation: float, cross_rotation: Array, bias_wanders: bool):
         self._time, self._rate = time, rate
         self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
@@ -214,7 +213,7 @@ class _RunAlignment:
         self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
-                                                excess_turn, cross_rotation)
+                                                cross_rotation)
         self.shaft_error: Array = np.zeros(2)  # in the columns of the shaft, rad
         self.has_shaft = self.is_measured and not cross_rotation.size
 
@@ -358,13 +357,12 @@ def block_duration(motion: Motion) -> float:
 
 
 def _select_reference_points(motion: Motion, block: float, slip_deviation: float,
-                             excess_turn: tuple[float, float] | None,
                              cross_rotation: Array) -> _ReferencePoints:
     """Return where a motion is known: at its samples, or for an encoder where it steps."""
     if motion.rate is not None:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
-                                *tracking_error_columns(motion, time, slip_deviation, excess_turn))
+                                *tracking_error_columns(motion, time, slip_deviation))
     step = encoder_step(motion.heading)
     if cross_rotation.size:  # an attitude, which has no shaft
         ones = np.ones(cross_rotation.shape[1])
@@ -415,9 +413,8 @@ _PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
 _SHAFT_ERROR_DEVIATION = math.radians(1.0)
 
 
-def tracking_error_columns(
-        motion: Motion, time: Array, slip_deviation: float,
-        excess_turn: tuple[float, float] | None = None) -> tuple[Array, Array, Array]:
+def tracking_error_columns(motion: Motion, time: Array,
+                           slip_deviation: float) -> tuple[Array, Array, Array]:
     """
     Return the deviations from a profile that scale, bias, delay and lag do not describe.
 
@@ -429,8 +426,6 @@ def tracking_error_columns(
     ----------
     time : s, shape (n,)
     slip_deviation : largest standard deviation of the slip of a turn, as a fraction of it
-    excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides the
-        profile; None without one
 
     Returns
     -------
@@ -469,10 +464,6 @@ def tracking_error_columns(
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(heading_change), axis=0))
         deviations.append(np.array([ASYMMETRY_DEVIATION]))
-        prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
-    if excess_turn is not None:
-        columns.append(np.minimum(time, excess_turn[0])[:, None])
-        deviations.append(np.array([excess_turn[1]]))
         prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
     return np.hstack(columns), np.concatenate(deviations), prior_factors
 
@@ -759,7 +750,6 @@ def _nonzero_scale(scale: float) -> float:
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
                    lag_deviation: float = LAG_DEVIATION, slip_deviation: float = 0.0,
-                   excess_turn: tuple[float, float] | None = None,
                    cross_rotation: Array | None = None,
                    bias_wanders: bool = False) -> ScaleBiasFit:
     """
@@ -788,8 +778,6 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         does not determine the lag, as a sine does not
     slip_deviation : largest standard deviation of the slip of each turn of a profile, as a
         fraction of it
-    excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides a profile;
-        the bias is then that of the rest after it. None without one
     cross_rotation : of the motion about the two axes across that of the reference, at the times of
         a measured motion, rad, shape (n, 2) or (n, 0); None where it is not known
     bias_wanders : whether it may do so by a random walk; it is then the mean over the motion
@@ -801,7 +789,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     """
     if cross_rotation is None:
         cross_rotation = np.empty((len(motion.time), 0))
-    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn,
+    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation,
                               cross_rotation, bias_wanders)
     offset, data, averages, averaged_covariance, estimate, response_deviation = _fit_offset(
         alignment, largest_time_offset)

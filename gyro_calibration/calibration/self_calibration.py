@@ -37,7 +37,7 @@ from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
-from gyro_calibration.model.motion import Motion, motion_from_rates
+from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
@@ -233,13 +233,12 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
-                    slip_deviation: float,
-                    excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
+                    slip_deviation: float) -> ScaleBiasFit:
     """Fit on the stamps, or on an even grid if that leaves less."""
     even_stamps = even_times(time)
     jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
     fit = min((fit_likelihood(stamps, rate, motion, largest_time_offset,
-                              slip_deviation=slip_deviation, excess_turn=excess_turn)
+                              slip_deviation=slip_deviation)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
     if motion.rate is not None:
@@ -408,13 +407,12 @@ class RestCheck:
 
 
 def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise(),
-               limits: RunLimits = RunLimits(), false_refusal_rate: float = 1e-3) -> RestCheck:
+               limits: RunLimits = RunLimits()) -> RestCheck:
     """
     Check a calibration by a rest after its run, and refuse it if the gyro still drifts.
 
     The rest lasts at least 75 % of the length in the limits. Without a known noise its white noise
-    is taken from the samples; `false_refusal_rate` tells how often a good calibration is refused,
-    if the noise is as given.
+    is taken from the samples.
     """
     duration = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     if duration < 0.75 * limits.rest_duration or len(time) < 10:
@@ -428,14 +426,10 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale, updated = 1.0 + fit.scale_factor_error, fit
     if np.isfinite(fit.covariance).all():
-        gain, covariance = combine_with_rest(fit.covariance, scale * mean, scale ** 2 * variance)
-        s, b = (gain * scale * mean + (fit.scale_factor_error, fit.bias)).tolist()
-        # run and rest may be on the same place of a step
-        covariance[1, 1] = max(covariance[1, 1], fit.rounding_variance)
-        updated = replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
+        updated = _add_rest(fit, scale * mean, scale ** 2 * variance)
+    # one good calibration in a thousand is refused, if the noise is as given
     check = RestCheck(mean, deviation, max(limits.max_rest_rate,
-                                           -float(ndtri(0.5 * false_refusal_rate)) * deviation),
-                      updated)
+                                           -float(ndtri(0.5e-3)) * deviation), updated)
     if half_difference > 2.0 * max(MAX_NOISE_SIGMAS * white_deviation, _MIN_DRIVING_RATE_CHANGE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
                           f'{half_difference / DEGREE:.2f} deg/s: leave it at rest after the run')
@@ -448,14 +442,12 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
 
 
 def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
-              noise: Noise = Noise(),
-              reference: ReferenceErrors | None = None) -> ScaleBiasFit:
+              noise: Noise = Noise()) -> ScaleBiasFit:
     """
     Return a calibration by a profile whose log has too short a rest after it for `check_rest`.
 
     A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
-    bias. The samples after the motion show it, even where the robot still settles: its response
-    to the profile is fitted together with the rest. A turn that they do not show, of a prior
+    bias, which the samples after the motion show. A turn that they do not show, of a prior
     deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
     they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn. The fit
     is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
@@ -463,33 +455,15 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     the motion, or goes on turning after it.
     """
     limits = RunLimits()
-    reference = default_reference_errors(motion) if reference is None else reference
     end = motion.duration + max(fit.time_offset, 0.0)
-    duration = float(time[-1]) - end
+    duration, rest = float(time[-1]) - end, rate[time > end]
     if (motion.rate is None or motion.rate[-1] != 0.0 or motion.name != 'profile'
-            or not np.isfinite(fit.covariance).all() or np.count_nonzero(time > end) < 10
+            or not np.isfinite(fit.covariance).all() or len(rest) < 10
             or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
         return fit
-    with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
-                                  np.append(motion.rate, 0.0))
-    # the robot may turn on until the mean rate of the rest changes beyond white noise
-    turn_end, after, rest = end, time[time > end], rate[time > end]
-    count = np.arange(5, len(rest) - 4)
-    if len(count):
-        before = np.cumsum(rest)[count - 1]
-        changes = np.abs(before / count - (rest.sum() - before) / (len(rest) - count))
-        change_sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rest) - count))
-        best = int(np.argmax(change_sigmas))
-        if change_sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rest, 1):
-            turn_end = float(after[count[best]])
-    at_rest = _fit_likelihood(
-        time, rate, with_rest, limits.max_time_offset, reference.scale_deviation,
-        (turn_end - max(fit.time_offset, 0.0), limits.max_bias))
-    change = at_rest.bias - fit.bias
-    # the few increments of the rest may by chance have less than the noise of the gyro
-    known_ratio = max(noise.angle_random_walk / at_rest.angle_random_walk, 1.0)
-    variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
-                + float(noise.mean_change_variance(duration, duration)) + fit.rounding_variance)
+    change = float(rest.mean()) - fit.bias
+    variance = fit.rounding_variance + rest_variance(
+        noise, duration, _deviation_of_mean(rest), _half_difference(rest))
     sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
     stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
     if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
@@ -500,10 +474,17 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
             'standard deviations): the robot turned throughout the run, or still turned after '
             'it; run again and leave it at rest for '
             f'{SETTLING_TIME + limits.rest_duration:g} s after it')
+    fit = _add_rest(fit, change, variance)
+    fit.covariance[1, 1] += 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
+    return fit
+
+
+def _add_rest(fit: ScaleBiasFit, change: float, variance: float) -> ScaleBiasFit:
+    """Return a calibration with a mean at rest less its bias, rad/s, and the variance of that."""
     gain, covariance = combine_with_rest(fit.covariance, change, variance)
     s, b = (gain * change + (fit.scale_factor_error, fit.bias)).tolist()
-    # a turn that the rest does not show
-    covariance[1, 1] += 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
+    # run and rest may be on the same place of a step
+    covariance[1, 1] = max(covariance[1, 1], fit.rounding_variance)
     return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
 
 
