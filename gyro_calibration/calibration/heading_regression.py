@@ -45,7 +45,8 @@ import math
 from typing import Any, NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
+from gyro_calibration.calibration.likelihood import (
+    MIN_FIT_PROBABILITY, robust_residual, ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior,
     SharedNoise)
@@ -68,7 +69,6 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import expit
 from scipy.stats import t as student
-from scipy.stats import ttest_1samp
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
 TECHNOLOGY_PRIORS = {
@@ -179,7 +179,8 @@ class CauseTerm(NamedTuple):
         return max(len(effect.coefficients), 1) if effect is not None else 1
 
 
-_CLOCK_TERM, MISALIGNMENT_TERM = CauseTerm('clock_rate'), CauseTerm('axis_misalignment')
+_CLOCK_TERM, _DRIFT_TERM, MISALIGNMENT_TERM = map(
+    CauseTerm, ('clock_rate', 'reference_drift', 'axis_misalignment'))
 
 
 @dataclass(frozen=True)
@@ -259,7 +260,7 @@ class Spans:
     def all_causes(self, causes: Sequence[CauseTerm]) -> list[CauseTerm]:
         """Return causes, after those that are always fitted, misalignment and drift."""
         own = [MISALIGNMENT_TERM] * bool(self.cross_rotation.size)
-        own += [CauseTerm('reference_drift')] * bool(self.stands.any())
+        own += [_DRIFT_TERM] * bool(self.stands.any())
         return [*dict.fromkeys([*own, *causes])]
 
     def prior_deviations(self, causes: Sequence[CauseTerm]) -> Array:
@@ -417,7 +418,7 @@ class Spans:
                      / np.bincount(self.point_index) for each in self.cross_rotation.T]
             return np.pad(np.diff(means), ((0, 0), (0, len(self.rests)))).T * np.where(
                 self.is_measured, -1.0, 0.0)[:, None]
-        if cause.cause == 'reference_drift':
+        if cause == _DRIFT_TERM:
             return self.span_changes(self.time_in_motion)[:, None]
         if cause.cause == 'reference_slip':
             return self.span_changes((time >= cause.shapes[0]).astype(float))[:, None]
@@ -696,6 +697,20 @@ class SpanFit:
         """Return half the length of the interval of 95 % of a value."""
         deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
         return float(student.ppf(0.975, self.freedom[value_index])) * deviation
+
+    def p_value(self, value_index: int) -> float:
+        """Return the probability by chance of a value as far from 0, two-sided."""
+        deviation = math.sqrt(max(self.covariance[value_index, value_index], 1e-300))
+        return 2.0 * float(student.sf(abs(self.values[value_index]) / deviation,
+                                      self.freedom[value_index]))
+
+    @property
+    def reference_drift(self) -> tuple[float, float] | None:
+        """Return the drift in motion and its half width, rad/s; None if it stands in no rest."""
+        if _DRIFT_TERM not in self.causes:
+            return None
+        place = self.value_slice(_DRIFT_TERM).start
+        return float(self.values[place]), self.half_width(place)
 
     @property
     def normal_covariance(self) -> Array:
@@ -1100,13 +1115,10 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     axes = (fit.value_slice(MISALIGNMENT_TERM) if MISALIGNMENT_TERM in fit.causes
             else slice(0))
     scale, bias, delay = fit.values[:len(BASE_VALUES)].tolist()
-    drift = None
-    if spans.stands.any():
-        place = fit.value_slice(CauseTerm('reference_drift')).start
-        drift = float(fit.values[place]), fit.half_width(place)
     return ScaleBiasFit(scale, bias, covariance[:2, :2], delay,
                         fit.noise_size('angle_random_walk'), fit.noise_size('reference'),
-                        time_offset_deviation=math.sqrt(covariance[2, 2]), reference_drift=drift,
+                        time_offset_deviation=math.sqrt(covariance[2, 2]),
+                        reference_drift=fit.reference_drift,
                         # a course may be lost in the rests before and after the drive alone
                         reference_adds_up=spans.adds_up and bool(spans.stands.all()),
                         misalignment=fit.values[axes],
@@ -1117,61 +1129,16 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     """
     Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
 
-    The bias that the motion shows is compared with that of the rests in which the reference
-    stands. Either may change steadily with time, and what depends on the rate is not of the
-    reference. None without such rests, or where both agree (Welch's test, at 1 %), as a whole or
-    in the ways from rest to rest, each compared with the rests around it: the bias may wander.
+    It is that of a regression with the rests in which the reference stands, a ramp of the bias,
+    and an asymmetry, which are of the gyro. None without two such rests, or within chance.
     """
     spans = lay_out_spans(log)
-    rests = spans.rests[spans.stands]
-    if len(rests) < 2:
+    if np.count_nonzero(spans.stands) < 2 or len(spans.time) < _MIN_SPANS:
         return None
-    time, output = np.asarray(spans.log.time), np.asarray(spans.log.output)
-    halves = [half for first, last in rests
-              for half in np.array_split(np.arange(first, last + 1), 2)]
-    middle, means = 0.5 * time[-1], np.array([output[half].mean() for half in halves])
-    spans = spans.with_corrected_rate(np.array([0.0, means.mean(), 0.0]))
-    rows = np.column_stack([spans.observed, design_matrix(
-        spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])])
-    rows = -rows[:len(spans.time) - 1]
-    rows = rows[rows[:, 2] > 0.0]
-    in_motion = np.insert(rows[:, [2, 1, 3, 6]], 1, rows[:, 5] - middle * rows[:, 2], axis=1)
-    at_rest = np.array([(1.0, time[half].mean() - middle) for half in halves])
-    if any(len(each) <= each.shape[1] for each in (in_motion, at_rest)):
-        return None
-    of_motion, one, freedom_of_one, left = _weighted_fit(in_motion, rows[:, 0], 1.0 / rows[:, 2])
-    of_rests, other, freedom_of_other, _ = _weighted_fit(
-        at_rest, means, np.array([len(half) for half in halves], dtype=float))
-    freedom = (one + other) ** 2 / (one ** 2 / freedom_of_one + other ** 2 / freedom_of_other
-                                    + 1e-300)
-    drift = of_rests[0] - of_motion[0]
-    deviation = math.hypot(math.sqrt(one + other), spans.rest_rounding)
-    if abs(drift) <= student.ppf(0.995, freedom) * deviation:
-        return None
-    # the bias on each way from rest to rest, and that of the rests around it
-    way = np.searchsorted(time[rests[:, 0]], in_motion[:, 1] / in_motion[:, 0] + middle) - 1
-    ways = len(rests) - 1
-    inside = (way >= 0) & (way < ways)
-    turned, duration = (np.bincount(way[inside], each[inside], ways) for each in (
-        in_motion[:, :2] @ of_motion[:2] + left, in_motion[:, 0]))
-    of_each = means.reshape(-1, 2).mean(axis=1)
-    known = duration > 0.0
-    differences = (turned[known] / duration[known]
-                   - 0.5 * (of_each[1:] + of_each[:-1])[known])
-    if len(differences) < 3 or ttest_1samp(differences, 0.0).pvalue > 0.01:
-        return None
-    return drift, float(student.ppf(0.975, freedom)) * deviation
-
-
-def _weighted_fit(columns: Array, observed: Array,
-                  weights: Array) -> tuple[Array, float, int, Array]:
-    """Return values, variance of the first, its degrees of freedom, and residual."""
-    root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
-    inverse = np.linalg.pinv(root[:, None] * columns)
-    values = inverse @ (root * observed)
-    left = observed - columns @ values
-    variance = float(weights @ left ** 2 / freedom * inverse[0] @ inverse[0])
-    return values, variance, freedom, left
+    fit = fit_spans(spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])
+    drift = fit.reference_drift
+    return drift if drift and fit.p_value(fit.value_slice(_DRIFT_TERM).start) < (
+        MIN_FIT_PROBABILITY) else None
 
 
 def is_noisy(log: Log) -> bool:
