@@ -99,21 +99,7 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
         remarks.append(f'Far beyond the noise, and left out: {outliers.size} single '
                        f'sample{"s" * (outliers.size > 1)}, the first at '
                        f'{stamps.time_at(outliers[0]):.3f} s.')
-    if (motion := _find_motion(rate, stamps)) is not None:
-        # the first part that is not refused; next to a motion a smaller one is hidden
-        for begin, end in motion[1]:
-            rows = (time >= begin) & (time <= end)
-            try:
-                build_rest_record(time[rows], output[rows], *(
-                    None if each is None else each[rows] for each in (moving, heading)))
-            except _Moved as smaller:
-                if smaller.rest is None:
-                    continue
-                begin, end = smaller.rest
-            except DataRefused:
-                continue
-            raise _Moved(motion[0], (begin, end))
-        raise _Moved(motion[0], None)
+    _refuse_motion(rate, stamps)
     if heading is not None and moving is None:
         _refuse_turning(time, output, heading)
     # long gaps are cut, since no window crosses them
@@ -151,23 +137,8 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
                 'rest by --from and --to, or record one')
 
 
-class _Moved(DataRefused):
-    """A record with motion; begin and end of its longest part that is not refused, s, or None."""
-
-    def __init__(self, motion: str, rest: tuple[float, float] | None):
-        self.rest = rest
-        super().__init__(motion + (
-            'record again at rest' if rest is None else 'use the longest part at rest, '
-            f'from {rest[0]:.1f} to {rest[1]:.1f} s, or record again'))
-
-
-def _find_motion(rate: Array,
-                 stamps: StampGrid) -> tuple[str, list[tuple[float, float]]] | None:
-    """
-    Return a sentence on means that change by more than noise, and the parts between, s.
-
-    The longest is first, and each is within its limits as printed. None without motion.
-    """
+def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
+    """Refuse a record whose means change by more than noise, and name its longest part at rest."""
     angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
@@ -186,13 +157,17 @@ def _find_motion(rate: Array,
         if change.max() > worst * scale:
             worst, over = float(change.max() / scale), size
     if not moved.any():
-        return None
-    rests = sorted(find_runs(~moved), key=lambda rest: rest.start - rest.stop)
-    return ('the gyro was moved, or its output jumped: from '
-            f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
-            f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard deviations: ',
-            [(math.ceil(10.0 * stamps.time_at(rest.start)) / 10.0,
-              math.floor(10.0 * stamps.time_at(rest.stop - 1)) / 10.0) for rest in rests])
+        return
+    rest = max(find_runs(~moved), key=lambda run: run.stop - run.start, default=slice(0, 0))
+    remedy = 'record again at rest'
+    if rest.stop - rest.start >= _MIN_ALLAN_SAMPLES:  # to a tenth of a second within it
+        begin, end = math.ceil(10.0 * stamps.time_at(rest.start)) / 10.0, math.floor(
+            10.0 * stamps.time_at(rest.stop - 1)) / 10.0
+        remedy = f'use the longest part at rest, from {begin:.1f} to {end:.1f} s, or record again'
+    raise DataRefused('the gyro was moved, or its output jumped: from '
+                      f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
+                      f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
+                      f'deviations: {remedy}')
 
 
 # lost samples

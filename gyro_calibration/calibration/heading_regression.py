@@ -48,8 +48,8 @@ from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.likelihood import (
     MIN_FIT_PROBABILITY, robust_residual, ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
-    bias_wander_columns, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior,
-    SharedNoise)
+    average_hypotheses, bias_wander_columns, carried_shares, fit_noise_grid, GridFit,
+    heading_noise, HierarchicalPrior, SharedNoise)
 from gyro_calibration.calibration.own_instants import (
     is_slow, keep_own_instants, MAX_ROUNDING_STEP, OwnInstants)
 from gyro_calibration.calibration.reference_noise import (
@@ -766,12 +766,11 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     likelier = wide if probability > 0.5 else usual
     if min(probability, 1.0 - probability) < 0.025:  # an interval of 95 % does not contain it
         return likelier
-    change = wide.values - usual.values
-    covariance = (probability * wide.normal_covariance
-                  + (1.0 - probability) * usual.normal_covariance
-                  + probability * (1.0 - probability) * np.outer(change, change))
+    values, covariance = average_hypotheses(
+        np.array([1.0 - probability, probability]), np.array([usual.values, wide.values]),
+        np.array([usual.normal_covariance, wide.normal_covariance]))
     widening = np.sqrt(np.diag(likelier.normal_covariance) / np.diag(likelier.covariance))
-    return replace(likelier, values=usual.values + probability * change,
+    return replace(likelier, values=values,
                    covariance=covariance / np.outer(widening, widening))
 
 

@@ -26,7 +26,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import math
 
-from gyro_calibration.calibration.noise_grid import bias_wander_columns, TridiagonalMatrix
+from gyro_calibration.calibration.noise_grid import (
+    average_hypotheses, bias_wander_columns, TridiagonalMatrix)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, robust_deviation
@@ -34,6 +35,7 @@ from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import helmert
+from scipy.special import softmax
 
 
 @dataclass(frozen=True)
@@ -667,10 +669,8 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
         if math.exp((logarithms[~has_error].max() - logarithms.max()) / repeated) > (
                 MIN_FIT_PROBABILITY):
             logarithms[has_error] = -math.inf
-    weights = np.exp(logarithms - logarithms.max())
-    weights /= weights.sum()
-    return (weights @ values, np.tensordot(weights, covariances, 1)
-            + np.cov(values.T, aweights=weights, ddof=0), estimates[int(weights.argmax())])
+    weights = softmax(logarithms)
+    return (*average_hypotheses(weights, values, covariances), estimates[int(weights.argmax())])
 
 
 def _repetition(data: _Increments, estimate: _Estimate) -> float:
@@ -988,10 +988,9 @@ def _average_over_stretch(
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
     other = _solve_weighted(widened, estimate.noise, estimate.noise.solve(widened.columns),
                             np.insert(estimate.prior_deviation, 4, EXCESS_RATE_DEVIATION))
-    probability, change = odds / (1.0 + odds), other.values[:2] - values
-    return values + probability * change, (
-        (1.0 - probability) * covariance + probability * other.covariance[:2, :2]
-        + probability * (1.0 - probability) * np.outer(change, change))
+    return average_hypotheses(
+        np.array([1.0, odds]) / (1.0 + odds), np.array([values, other.values[:2]]),
+        np.array([covariance, other.covariance[:2, :2]]))
 
 
 def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> DeviatingStretch:

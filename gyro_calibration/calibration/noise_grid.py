@@ -69,6 +69,7 @@ from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.special import logsumexp, softmax
 
 #: Points of the grid for each size, and passes: the first is over the whole range, each further
 #: one around the likely points.
@@ -129,18 +130,11 @@ class GridFit:
     sizes: Mapping[str, tuple[float, float, float]]
     # the size of each part at the point of the grid with the largest likelihood, by name
     likeliest_sizes: Mapping[str, float]
-    # there, with the values of flat prior integrated out; for models with the same columns of flat
-    # prior
-    log_likelihood: float
     # logarithm of the mean likelihood over the grid, to compare models with the same columns of
     # flat prior
     log_evidence: float
     # observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
     residual: Array
-    shared: Array  # estimates of u at the likeliest point, shape (q,)
-    # what the error of each observation adds to the values at the likeliest point, shape (n, m);
-    # sums over stretches of a log give a covariance that does not rely on the noise model
-    influence: Array
     # variance that the shared noise has in common with one of the values, as it is
     # `unobservable_variance`
     unobservable_variance: float
@@ -159,10 +153,6 @@ class GridFit:
     def whiten(self, columns: Array) -> Array:
         """Return columns, shape (n,) or (n, k), with independent banded noise of variance 1."""
         return self._noise.whiten(_quasi_differences(columns, self._carried))
-
-    def solve(self, columns: Array) -> Array:
-        """Return the inverse of the covariance of the likeliest banded noise, times columns."""
-        return self._noise.solve(columns)
 
 
 class TridiagonalMatrix:
@@ -405,8 +395,7 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
             for low, high in (part.size_range for part in regression.parts)]
     for remaining in reversed(range(_GRID_PASSES)):
         grid = _evaluate_grid(regression, axes)
-        weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
-        weights /= weights.sum()
+        weights = softmax(grid.log_likelihood)
         if remaining:
             axes = [_refine_axis(axis, grid.sizes[:, place], weights, part.size_range)
                     for place, (axis, part) in enumerate(zip(axes, regression.parts))]
@@ -461,15 +450,12 @@ def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
 
 def _average_grid(regression: _Regression, grid: _Grid, weights: Array, mean: Array,
                   noisy_column: int | None, unobservable_variance: float) -> GridFit:
-    values = weights @ grid.values
-    deviations = grid.values - values
-    covariance = (np.tensordot(weights, grid.covariance, 1)
-                  + (deviations * weights[:, None]).T @ deviations)
+    values, covariance = average_hypotheses(weights, grid.values, grid.covariance)
     best = int(grid.log_likelihood.argmax())
     banded, count = len(regression.banded), regression.value_count
     noise = regression.banded_covariance(grid.sizes[best, :banded])
     precisions = regression.prior_precisions(grid.sizes[best: best + 1, banded:])
-    _, (all_values,), (inverse,) = regression.solve(noise, precisions)
+    _, (all_values,), _ = regression.solve(noise, precisions)
     names = [part.name for part in regression.parts]
     likeliest_sizes = dict(zip(names, grid.sizes[best].tolist()))
     if noisy_column is not None:
@@ -478,14 +464,22 @@ def _average_grid(regression: _Regression, grid: _Grid, weights: Array, mean: Ar
         values = values + (corrected - all_values)[:count]
         all_values = corrected
     residual = regression.observed - regression.columns @ all_values
-    of_values = regression.observed - regression.columns[:, :count] @ all_values[:count]
-    influence = noise.solve(regression.columns) @ inverse * of_values[:, None]
     return GridFit(values + mean, covariance, {name: _interval_95(grid.sizes[:, place], weights)
                                                for place, name in enumerate(names)},
-                   likeliest_sizes, float(grid.log_likelihood[best]),
-                   float(np.log(np.mean(np.exp(grid.log_likelihood - grid.log_likelihood[best])))
-                         + grid.log_likelihood[best]),
-                   residual, all_values[count:], influence, unobservable_variance, noise)
+                   likeliest_sizes,
+                   float(logsumexp(grid.log_likelihood)) - math.log(len(weights)),
+                   residual, unobservable_variance, noise)
+
+
+def average_hypotheses(weights: Array, values: Array, covariances: Array) -> tuple[Array, Array]:
+    """
+    Return mean and covariance of values that hold with some probability, by total variance.
+
+    The shapes are (k,), (k, m) and (k, m, m).
+    """
+    mean = weights @ values
+    apart = values - mean
+    return mean, np.tensordot(weights, covariances, 1) + (apart * weights[:, None]).T @ apart
 
 
 def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:

@@ -42,6 +42,7 @@ from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
+from scipy.special import softmax
 from scipy.stats import t as student
 
 #: With fewer, the others do not determine a model without one of them.
@@ -340,7 +341,7 @@ class Uncertainty:
         log_determinant, misfit, offsets, inverses = (np.concatenate(each) for each in zip(*(
             _fit_values(dwells, deviation, columns / lengths, error, each) for each in sizes)))
         logarithm = -0.5 * (log_determinant + dof * np.log(misfit))
-        weights = np.exp(logarithm - logarithm.max()) * np.outer(*priors).ravel()
+        weights = softmax(logarithm) * np.outer(*priors).ravel()
         likely = weights > 1e-4 * weights.sum()
         weights = weights[likely] / weights[likely].sum()
         size = misfit[likely] / dof
