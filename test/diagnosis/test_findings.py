@@ -71,7 +71,7 @@ def shown(finding):
 
 
 #: Recordings of 25 min, which take most of a minute each, and the slower of two by hand.
-LONG = 'yaw_slow', 'pitch_slow', 'hand_slow'
+LONG = 'yaw_slow', 'yaw_fast', 'pitch_slow', 'hand_slow'
 
 
 @pytest.fixture
