@@ -176,8 +176,8 @@ def _integrate_angle(rate: Array) -> Array:
     """
     Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
 
-    Gaps get the mean over 5 gap lengths on each side. A line between the samples at both ends
-    would integrate their noise over the whole gap, which passes for a random walk.
+    Gaps get the mean over 5 gap lengths on each side: the noise of the samples at both ends,
+    integrated over a gap, would pass for a random walk.
     """
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
@@ -243,9 +243,8 @@ def allan_deviation(rate: Array, interval: float,
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Averaging
-    times, s, from an interval to half the record, are taken to the nearest whole number of
-    intervals; by default they are ten a decade, up to a third of the record. Raise `DataRefused`
-    for too few samples.
+    times, s, are taken to whole intervals; by default they are ten a decade, up to a third of the
+    record. Raise `DataRefused` for too few samples.
     """
     _refuse_few(int(np.isfinite(rate).sum()))
     samples = len(rate)
@@ -335,8 +334,7 @@ def covariance_form(samples: int, first: int, second: int,
 
     Angle quantization is white: only lags at which two of its samples coincide contribute. A ramp
     is no noise, but adds a mean m to values with the covariance c, and 4 m² c to the covariance of
-    their squares. With a process, its times in samples, the shape is (6, 6), with a coefficient of
-    1.
+    their squares. A process, its times in samples, adds a row and column.
     """
     counts = (samples + 1 - 2 * first, samples + 1 - 2 * second)
     area = float(first) ** 2 * float(second) ** 2

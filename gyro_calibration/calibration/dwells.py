@@ -82,9 +82,8 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     """
     Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
-    The log has an output, and a reference rate or heading. The name of a file is put before places
-    and remarks. `DataRefused` is raised where something is missing, in another unit, or where the
-    share of a log in time that is in dwells is smaller than `min_share`.
+    The name of a file is put before places and remarks. `DataRefused` is raised where something is
+    missing, in another unit, or where less than `min_share` of a log in time is in dwells.
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log, min_share)
     if log.time is not None and not name:  # several logs may have a rate each
@@ -159,11 +158,7 @@ def format_list(items: Sequence[str]) -> str:
 # rate tables
 
 def dwells_from_table(log: Log) -> Dwells:
-    """
-    Return the rows of a rate table, or raise `DataRefused` if none has output and reference rate.
-
-    The columns `sweep` (any text) and `deviation_dps` (of each mean) are used if present.
-    """
+    """Return the rows of a rate table that have output and reference rate."""
     output = require_output(log)
     if log.reference_rate is None:
         raise DataRefused('the rows have no time and no reference rate; a rate table needs the '
@@ -218,8 +213,8 @@ def _number_sweeps(rate: Array) -> Numbers:
     Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
 
     The rates of a sweep increase or decrease, or their absolute values do with changing sign, with
-    or without a rest between them. Where the order shows no sweeps, that is where the median of
-    them has less than four dwells, nine blocks of consecutive dwells are taken as sweeps.
+    or without a rest between them. Where the median sweep has less than four dwells, nine blocks
+    of consecutive dwells are taken as sweeps.
     """
     turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
     for used in (np.full(len(rate), True), turning) if turning.any() else ():
@@ -290,12 +285,7 @@ class NothingSteady(DataRefused):
 
 
 class _Samples(NamedTuple):
-    """
-    Samples with output and reference, arrays of shape (n,).
-
-    `heading` is that of the reference, or the integral of its `rate`; `step` is that of an
-    encoder, rad, and `scale` the approximate ratio of output to reference.
-    """
+    """Samples with output and reference, arrays of shape (n,)."""
 
     time: Array
     output: Array
@@ -319,7 +309,7 @@ class _Samples(NamedTuple):
         Return the mean rate of an angle over some samples, rad/s.
 
         It is the slope of a straight line through a heading, whose errors are those of single
-        samples, and the difference of both ends over the duration where a rate was integrated.
+        samples, and the difference of both ends over the duration of an integrated rate.
         """
         time = self.time[rows]
         return (fit_scale(angle, time)[1] if self.rate is None
@@ -360,11 +350,7 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
 # dwells of a log in time
 
 def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
-    """
-    Find the dwells of a log in time by its reference heading, or else by its reference rate.
-
-    `NothingSteady` is raised where the reference is never steady for long enough.
-    """
+    """Find the dwells of a log in time by its reference heading, or else by its reference rate."""
     samples, remarks = _select_samples(log)
     time, temperature = samples.time, samples.temperature
     parts = [np.arange(part.start, part.stop) for part in _find_straight(samples)
@@ -493,8 +479,8 @@ def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
     """
     Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
 
-    On a ramp the deviation of the heading is proportional to the square of time, so the ratio of
-    two deviations gives its beginning; a short ramp began later.
+    There the deviation is proportional to the square of time, so the ratio of two deviations gives
+    its beginning.
     """
     if len(deviation) <= _RAMP_BLOCKS:
         return 0
@@ -511,9 +497,9 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     Return the settling time of the output after a ramp, s.
 
     A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
-    over the dwells, which determines a response below the noise of one dwell: over all but the
-    shortest ones, and over the longest ones, which show a slower response. It is settled where it
-    is within four standard deviations of its last half; below 20 ppm it always is.
+    over all but the shortest dwells, and over the longest ones, which show a slower response. It
+    is settled where it is within four standard deviations of its last half; below 20 ppm it always
+    is.
     """
     durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
     interval, width, found = max(0.05, float(np.median(np.diff(time)))), 4, 0.0
@@ -575,9 +561,8 @@ def _average(samples: _Samples,
 
     Heading and integral of the output are averaged with the same weights, so that deviations of
     the table from its steady rate are the same in both. The deviation is that of four to twelve
-    batches of at least 0.75 s, in which a vibration of the table and the response of the gyro's
-    filter average out; nan where it is not known. The rounding of the output adds its own, and is
-    returned, too.
+    batches of at least 0.75 s, in which vibration and the response of a filter average out, and of
+    the rounding of the output, which is returned too; nan where it is not known.
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
     batches = np.clip(durations / 0.75, 4, 12).astype(int)
@@ -629,11 +614,10 @@ def dwell_rounding_covariance(rate: Array, output: Array, rounding: Array) -> Ar
     """
     Return the covariance of the means of dwells due to the steps of the output, shape (n, n).
 
-    The mean of a value x with normal noise of variance v, rounded to a step q, is a periodic
-    function of x. Where in a step x lies is not known, but how far two values lie apart is; the
-    mean product of their errors is `rounding_product`. Of two dwells, v is the mean, with half of
-    the variance of the distance: of the bias between dwells of nearly one rate, beyond the steps,
-    and of the scale, by the rounding of the fastest rate.
+    Where in a step a value lies is not known, but how far two values lie apart is; the mean
+    product of their errors is `rounding_product`. The variance of their noise is the mean, with
+    half of the variance of the distance: of the bias between dwells of nearly one rate, beyond the
+    steps, and of the scale, by the rounding of the fastest rate.
     """
     place, wander = _place_in_steps(rate, output, rounding)
     noise, apart = (rounding[:, 1] / rounding[:, 0]) ** 2, place[:, None] - place
@@ -673,10 +657,9 @@ def _shrink_variances(variance: Array, dof: Array) -> Array:
     """
     Shrink variances, shape (n,), toward their common value, by more if they agree.
 
-    A variance of twelve batches has a standard error of 40 %; weights computed from it would be
-    random, and the smallest variances would dominate the fit. Empirical Bayes: the logarithms are
-    shrunk by the part of their scatter that the degrees of freedom explain (Smyth 2004, section
-    6.2).
+    A variance of twelve batches has a standard error of 40 %; weights by it would be random.
+    Empirical Bayes: the logarithms are shrunk by the part of their scatter that the degrees of
+    freedom explain (Smyth 2004, section 6.2).
     """
     known = variance > 0.0  # 0 where it is not known
     if known.sum() < 3:

@@ -109,29 +109,16 @@ class HeadingResidual:
 
 @dataclass(frozen=True)
 class EncoderCalibration:
-    """
-    The calibration of a gyro by a log with a reference heading.
+    """The calibration of a gyro by a log with a reference heading."""
 
-    Attributes
-    ----------
-    model : scale factor error and bias with their covariance, valid ranges and temperature
-    method : 'likelihood' or 'course'
-    fit : the same with noise and time offset, as found
-    reference : its headings over time, s since it began
-    residual_before, residual_after : the residual heading without calibration and with it
-    lost_samples : number missing between the stamps, where these are regular enough to count them
-    remarks : on the result, one sentence each
-
-    """
-
-    model: GyroModel
-    method: str
-    fit: ScaleBiasFit
-    reference: Motion
-    residual_before: HeadingResidual
+    model: GyroModel  # scale factor error and bias with covariance and valid ranges
+    method: str  # 'likelihood' or 'course'
+    fit: ScaleBiasFit  # the same with noise and time offset, as found
+    reference: Motion  # its headings over time, s since it began
+    residual_before: HeadingResidual  # without calibration
     residual_after: HeadingResidual
-    lost_samples: int
-    remarks: tuple[str, ...]
+    lost_samples: int  # where the stamps are regular enough to count them
+    remarks: tuple[str, ...]  # one sentence each
 
 
 def calibrate_encoder(log: Log, method: str | None = None,
@@ -268,9 +255,7 @@ class HeadingJumps(NamedTuple):
 
 def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
     """
-    Return a log whose reference heading continues over its jumps as the gyro does, and a remark.
-
-    Also the jumps, if there are any.
+    Return a log whose reference heading continues over its jumps as the gyro does, remarks, jumps.
 
     A jump is a change from one value to the next beyond all rates of the gyro around it, and
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
@@ -336,10 +321,9 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
     """
     Return a log with a single reference over time, and remarks on what was left out.
 
-    Of a heading and a rate it is the heading, unless this is known for less than half as long: a
-    rate may be filtered, or a command, where a heading is what was turned. If a rate is preferred,
-    it is that where both turn alike. Where they contradict each other, and one is further from the
-    gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
+    Of a heading and a rate it is the heading, unless this is known for less than half as long, or
+    the rate is preferred and both turn alike. Where they contradict each other, and one is further
+    from the gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -465,15 +449,8 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     is at least what the step of the reference leaves, and at most all that the headings are apart.
     The bias has a normal prior about zero, of a tenth of the size that the technology has up to
     all of it: a bias of many standard deviations stays; one that the log hardly shows would only
-    harm a heading.
-
-    Parameters
-    ----------
-    motion : by the reference
-    error : of the heading after a fit, rad, shape (n,)
-    bias : of that fit, rad/s
-    technology : of the gyro, one of `TECHNOLOGY_PRIORS`
-
+    harm a heading. Given are the motion by the reference, and of the fit the error of the heading,
+    rad, shape (n,), and the bias, rad/s.
     """
     piece = _number_pieces(motion.time)
     counts = np.bincount(piece)
@@ -511,12 +488,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
 
 
 def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasFit:
-    """
-    Return the fit with the mean bias of the drift, and covariances by the scatter between pieces.
-
-    What repeats itself with the motion is not noise of the fit, and what is slower than a piece
-    shows in part only. What repeats itself at a place of the shaft shows between the places.
-    """
+    """Return the fit with the mean bias of a drift, and covariances by scatter between pieces."""
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence, turned)
     slope = scatter[0, 1] / scatter[1, 1]
@@ -543,8 +515,8 @@ def _scatter_between(group: NDArray[np.intp], influence: Array, turned: Array) -
     """
     Return the covariance of (s, b) by sums over groups of blocks, with Student's factor.
 
-    A few turns may determine s: what a group leaves is less by its share in the fit than what it
-    is in error (MacKinnon and White 1985), and the effective number of groups has the freedom.
+    What a group leaves is less by its share in the fit than what it is in error (MacKinnon and
+    White 1985), and the effective number of groups has the freedom.
     """
     leverage = np.array([np.gradient(turned) ** 2 + 1e-300, np.ones(len(turned))])
     shares = np.array([np.bincount(group, each) / each.sum() for each in leverage])
@@ -633,12 +605,7 @@ HEADING_ALONE = ('a reference heading determines bias and scale_factor_error onl
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
               technology: str | None = None) -> SelectedEffects | EncoderCalibration:
-    """
-    Calibrate by the dwells of logs, by their paths, or by the heading of a single log.
-
-    The options are those of `api.fit`. A log in time whose only reference is a heading is
-    calibrated by it, and so is one with a reference rate that is seldom steady.
-    """
+    """Calibrate by the dwells of logs, by their paths, or by the heading of one (`api.fit`)."""
     for log in logs.values():
         _refuse_own_reference(log)
     chosen = {path: choose_reference(log) for path, log in logs.items()}

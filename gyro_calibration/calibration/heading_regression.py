@@ -117,8 +117,8 @@ def lag_deviation(delay: float) -> float:
     """
     Return the prior standard deviation of the lag that a delay, s, may be, s².
 
-    The variance of the times by which gyro or reference is late, twice this, is from 0 to the
-    square of their mean, of a filter of first order, and at most that of a smoothed course.
+    The variance of the times by which gyro or reference is late, twice this, is up to the square
+    of their mean, of a filter of first order, and at most that of a smoothed course.
     """
     return min(0.5 * delay ** 2, _SMOOTHING_DEVIATION)
 
@@ -249,8 +249,8 @@ class Spans:
         """
         Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,).
 
-        If a motion repeats synchronously with the samples, the errors of an encoder repeat too.
-        Stretches in time would count them as independent.
+        The errors of an encoder repeat with the motion; stretches in time are not independent
+        then.
         """
         middle = self.point_means(np.asarray(self.channels.heading))
         sector = np.floor(0.5 * (middle[1:] + middle[:-1]) / (10.0 * DEGREE))
@@ -299,8 +299,8 @@ class Spans:
         """
         Return the angle that is turned in each span, rad, shape (n,).
 
-        It is 0 where a course is nearer to no turn than to that of the gyro, which is noise then.
-        As that is in the observations too, it would pass for a scale factor error of 1.
+        It is 0 where a course is nearer to no turn than to that of the gyro, which is noise then,
+        and in the observations too.
         """
         by_gyro = np.diff(self.point_means(np.asarray(self.channels.heading)))
         turns = np.diff(self.heading) * by_gyro > 0.5 * by_gyro ** 2
@@ -314,11 +314,7 @@ class Spans:
 
     @cached_property
     def rest_rounding(self) -> float:
-        """
-        Return the standard deviation of the mean output of all rests by its steps, rad/s.
-
-        Where the noise is small compared with a step, they have one code and one error.
-        """
+        """Return the standard deviation of the mean output of all rests by its steps, rad/s."""
         rows = mark_rows(self.rests, len(self.log))
         if not (self.output_step and rows.any()):
             return 0.0
@@ -335,11 +331,7 @@ class Spans:
         return (time + self.delay) / (1.0 + self.clock_rate)
 
     def point_means(self, values: Array, slopes: Array | None = None) -> Array:
-        """
-        Return the means of a signal at the points, corrected for the delay, shape (n + 1,).
-
-        Between samples it is a line, or a cubic with its slopes, if these are given.
-        """
+        """Return the means of a signal at the delayed points, linear or with slopes, (n + 1,)."""
         assert self.log.time is not None
         time = self.log.time
         # a change of code is the mean of two samples, between which the signal may be curved
@@ -390,8 +382,7 @@ class Spans:
         """
         Return the rate by a Wiener filter of its cosines, rad/s, shape (m,).
 
-        The changes of the rate from point to point, in which a delay shows, are mostly white noise
-        in a slow motion; as a column it would pass for information.
+        White noise in the changes of the rate, in which a delay shows, would pass for information.
         """
         return self._smooth(np.asarray(self.channels.rate))
 
@@ -452,8 +443,8 @@ class Spans:
         """
         Return the spans with the rate corrected for scale factor error, bias, delay and causes.
 
-        The causes are those that depend on the rate. The delay and the clock rate are added to
-        those of the spans.
+        These are the causes that depend on the rate. Delay and clock rate are added to those of
+        spans.
         """
         assert self.log.output is not None and self.log.time is not None
         errors, clock_rate = values[1], self.clock_rate
@@ -484,9 +475,8 @@ class Spans:
         Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
 
         The errors of the most likely heading given both are independent of the difference of both.
-        Columns computed from it are not correlated with the noise of the observations; those of
-        the reference alone are, which matters where it errs by degrees, and those of the gyro
-        alone, which matters if two columns are nearly the same.
+        Columns computed from the reference alone, or the gyro alone, would be correlated with the
+        noise of the observations.
         """
         if not self.treatment.errs_as_heading:
             return heading_change / (1.0 + self.reference_noise_ratio ** 2)
@@ -543,10 +533,10 @@ class Spans:
         Return the column of a lag without its noise, what others explain of it, both (n + r,).
 
         What scale factor error, bias and delay do not explain of a lag may be noise of the gyro,
-        which would make the lag too small. It is reduced to the share that the reference shows
-        too (regression calibration, Carroll and others 2006), if that is beyond chance. The error
-        of that share, and what noise in both columns and observations may do, is an error of the
-        lag, s², of this deviation, which the others take up.
+        which would make the lag too small. It is reduced to the share that the reference shows too
+        (regression calibration, Carroll and others 2006), if that is beyond chance. The error of
+        that share, and what noise in both columns and observations may do, is an error of the lag,
+        s².
         """
         assert self.log.time is not None and self.log.output is not None
         time, columns = self.log.time, self.base_columns()
@@ -586,8 +576,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     Divide a log with a reference of some kind into spans.
 
     The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
-    gyro was measured; beside a course, that of its technology is used as well. The instants are
-    those of the known values of a slow reference, by `keep_own_instants`.
+    gyro was measured. The instants are those of a slow reference, by `keep_own_instants`.
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
@@ -737,12 +726,10 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    Rests that the motion contradicts are left out where no causes are given.
-
-    Wheels of another size, or a wrong unit, may exceed what a gyro errs by. Beside a course, whose
-    errors otherwise take that up, the values are means under the prior of the technology and a
-    wide one, weighted by their probability given the drive, and the intervals contain both answers
-    where it does not decide. An error that a drive does not need lowers its evidence.
+    Rests that the motion contradicts are left out where no causes are given. Wheels of another
+    size, or a wrong unit, may exceed what a gyro errs by: beside a course the values are means
+    under the prior of the technology and a wide one, weighted by their probability given the
+    drive, and the intervals contain both answers where it does not decide.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
     corrected, point_variances = _correct_rate(spans, every)
@@ -942,9 +929,8 @@ def _reference_walk(spans: Spans,
     """
     Return how errors of odometry grow over each span, shape (n,), and their size.
 
-    They do not add up, grow in proportion to the time in motion, or to the angle turned by many
-    small slips, or a slip is a share of a whole turn, from a reversal to the next: whichever is
-    the likeliest. The spans of a turn may slip alike, so that the errors of whole turns count too.
+    They do not add up, grow with the time in motion, or with the angle turned by many small slips,
+    or a slip is a share of a whole turn, from a reversal to the next: whichever is the likeliest.
     """
     angles, independent = np.abs(spans.angles), np.zeros(len(spans.time) - 1)
     number = np.cumsum(np.diff(spans.angles > 0.0, prepend=spans.angles[0] > 0.0))
@@ -967,14 +953,12 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
 
-    Nor less than their mean square error under the widest prior, as a value that is drawn to 0 by
-    a narrower one may be as large as the technology allows.
-
-    Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958):
-    the few turning points of a swing at an even rate may determine a value and take up their
-    errors. The intervals of the first values are not wider than those of their priors; that of a
-    scale factor error that fewer than `MIN_STRETCHES` stretches determine is as wide, as it cannot
-    be separated from errors of the reference, unless the prior includes these.
+    Nor less than their mean square error under the widest prior, to which a narrower one draws a
+    value; nor than what they change by without each place of a shaft (jackknife, Tukey 1958), as
+    the few turning points of an even swing may determine a value. The intervals of the first
+    values are not wider than those of their priors; that of a scale factor error that fewer than
+    `MIN_STRETCHES` stretches determine is as wide, as it cannot be separated from errors of the
+    reference, unless the prior includes these.
 
     Also the effective number of stretches that determine each value, and the degrees of freedom.
     """
@@ -1029,8 +1013,7 @@ class WhitenedRegression:
     """
     A whitened regression, for which ordinary least squares is generalized least squares.
 
-    The m priors of the values and of the wandering bias are rows after those of the observations.
-    Each of them is a separate cluster.
+    The m priors of values and wandering bias are rows after the observations, each a cluster.
     """
 
     observed: Array  # shape (n + r + m,)
@@ -1052,8 +1035,8 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     """
     Return the regression of a log on causes, under the noise of a fit of the same log.
 
-    The noise may be of another fit, and its random walk the upper 95 % limit, as slow bias wander
-    may pass for a cause otherwise.
+    The random walk may be its upper 95 % limit, as slow bias wander may pass for a cause
+    otherwise.
     """
     spans, noise = fit.spans, (noise_fit or fit).fit
     waves, shared = spans.bias_wander()
@@ -1080,15 +1063,8 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset to a drive.
 
-    Parameters
-    ----------
-    log : with output, time and a course
-    technology : of the gyro, one of `TECHNOLOGY_PRIORS`
-
-    Raises
-    ------
-    DataRefused : the course is known for too short a time, or the gyro does not follow it
-
+    The log has output, time and a course. `DataRefused` is raised where the course is known for
+    too short a time, or the gyro does not follow it.
     """
     spans = lay_out_spans(log, technology=technology)
     length = spans.treatment.min_span
@@ -1141,11 +1117,7 @@ def find_drift(log: Log) -> tuple[float, float] | None:
 
 
 def is_noisy(log: Log) -> bool:
-    """
-    Tell whether a heading errs like a course.
-
-    It has no steps, is no attitude, and is as noisy from span to span; or it drifts in motion.
-    """
+    """Tell whether a heading drifts in motion, or has no steps and is as noisy as a course."""
     assert log.reference_heading is not None
     if find_drift(log) is not None:
         return True

@@ -9,15 +9,14 @@
 # under the License.
 
 """
+
 The likelihood of a gyro's output, given its heading: scale factor error, bias, delay and lag.
 
-Everything is computed on increments between blocks of up to half a second: rates integrated by the
-trapezoid rule against the reference.
-
-Errors within a block (vibration, backlash, an eccentric encoder) are no random walk. The
-covariance of the increments is a banded matrix with one unknown ratio, which is solved exactly for
-each ratio of a grid. A bias may wander by a random walk, of sizes of a grid too. Blocks are
-shorter where the heading swings so fast that means over 0.5 s would attenuate it.
+Everything is computed on increments between blocks of up to half a second, shorter where the
+heading swings so fast that means would attenuate it: rates integrated by the trapezoid rule
+against the reference. Errors within a block (vibration, backlash, an eccentric encoder) are no
+random walk. The covariance of the increments is a banded matrix with one unknown ratio, and is
+solved exactly for each ratio of a grid. A bias may wander by a random walk, of sizes of a grid.
 """
 
 from __future__ import annotations
@@ -68,48 +67,38 @@ MIN_FIT_PROBABILITY = 1e-3
 class ScaleBiasFit:
     """The result of a fit."""
 
-    # s, 1, and b, rad/s
-    scale_factor_error: float
-    bias: float
+    scale_factor_error: float  # s, 1
+    bias: float  # b, rad/s
     covariance: Array  # of (s, b), shape (2, 2); nan where the method gives none
     time_offset: float = 0.0  # how late the gyro is against the profile, s
-    # as the run shows them, rad/√s and rad in one reading
-    angle_random_walk: float = math.nan
-    reference_noise: float = math.nan
-    # largest deviation of a stretch of the run from the profile, rad, and its significance in
-    # standard deviations
+    angle_random_walk: float = math.nan  # as the run shows it, rad/√s
+    reference_noise: float = math.nan  # in one reading, as the run shows it, rad
+    # largest deviation of a stretch of the run from the profile, rad, and in standard deviations
     stretch_residual: tuple[float, float] = (0.0, 0.0)
-    time_offset_deviation: float = math.nan  # standard deviation of the time offset, s
-    # the effect of the noise of each block on (s, b), shape (n, 2), and the times of the blocks,
-    # s, shape (n,), as one array (n, 3)
+    time_offset_deviation: float = math.nan  # s
+    # effect of the noise of each block on (s, b), and the times of the blocks, s, shape (n, 2 + 1)
     influence: Array = field(default_factory=lambda: np.empty((0, 3)))
     stretch_interval: tuple[float, float] = (0.0, 0.0)  # beginning and end of that stretch, s
     # true heading where gyro and reference begin, from the reference's first heading, and its
     # standard deviation, rad; nan against a profile, which defines its own start
     start_heading: float = math.nan
     start_heading_deviation: float = math.nan
-    # sum of squares of the residual, in units of white noise of 1 rad/√s, and its degrees of
-    # freedom
-    residual_squares: float = math.nan
-    dof: float = 0.0
-    # comparison of that with the noise; None where the noise is not known
-    goodness: GoodnessOfFit | None = None
-    # standard deviation between the turns of a profile of the fraction that each lost, 1
-    slip_deviation: float = 0.0
-    # by how much both headings differ that the fit leaves unexplained: that of the random walk
-    # over the run, from and to 0, with their root mean square, which is 1 / √6 of it, rad
+    residual_squares: float = math.nan  # their sum, in units of white noise of 1 rad/√s
+    dof: float = 0.0  # degrees of freedom of these
+    goodness: GoodnessOfFit | None = None  # None where the noise is not known
+    slip_deviation: float = 0.0  # of the fraction that each turn of a profile lost, 1
+    # √6 times the root mean square of the difference of the headings that the fit leaves, rad: the
+    # size of a random walk from and to 0 over the run
     heading_difference: float = math.nan
-    # variance of a mean at a constant rate by the steps of the output, (rad/s)²
-    rounding_variance: float = 0.0
+    rounding_variance: float = 0.0  # of a mean at a constant rate by output steps, (rad/s)²
     # drift of a reference in motion against the rests in which it stands, and half its interval of
     # 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
     reference_adds_up: bool = False  # whether the reference adds up its errors, as odometry
-    # standard deviation of s by a lag or a smoothing that the motion does not determine; part of
-    # the covariance
+    # of s by a lag or smoothing that the motion does not determine; part of the covariance
     response_deviation: float = 0.0
-    # components of the axis of the gyro along the cross axes of the reference, rad, shape (k,),
-    # and their covariance, shape (k, k); k is 2 where it shows the rotation about these, else 0
+    # components of the axis of the gyro along the two cross axes of an attitude, rad, shape (2,)
+    # or (0,), and their covariance
     misalignment: Array = field(default_factory=lambda: np.empty(0))
     misalignment_covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
     # sizes of the error of a measured heading once in a revolution, rad, shape (2,), or none (0,)
@@ -122,14 +111,7 @@ MISALIGNMENT_REMEDY = ('turn the axes of the attitude into those of the gyro, or
 
 
 def oblique_angle(misalignment: Array, covariance: Array) -> tuple[float, float, float]:
-    """
-    Return the angle of a misalignment, rad, half its interval of 95 %, and its p-value.
-
-    Parameters
-    ----------
-    misalignment, covariance : of the two components, shapes (2,) and (2, 2), rad and rad²
-
-    """
+    """Return the angle of a misalignment, rad, half its interval of 95 %, and its p-value."""
     angle = float(np.hypot(*misalignment))
     along = misalignment / max(angle, 1e-300)
     square = float(misalignment @ np.linalg.pinv(covariance) @ misalignment)
@@ -147,9 +129,8 @@ class _ReferencePoints:
     """
     Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
 
-    The variances are known up to one factor. Errors that several points share have columns, shape
-    (n, k), and prior standard deviations, shape (k,), times one row of the factors
-    `prior_factors`, shape (m, k).
+    The variances are known up to one factor. Errors that several points share have columns, (n,
+    k), and prior standard deviations, (k,), times one row of the factors `prior_factors`, (m, k).
     """
 
     time: Array
@@ -190,9 +171,7 @@ class _Increments:
 
 #: Sizes of a rate random walk of the bias that are possible, rad/s/√s.
 _RATE_RANDOM_WALKS = np.geomspace(1e-7, 1e-2, 6)
-#: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
-#: random walk, and are not modelled as one.
-MAX_BLOCK_DURATION = 0.5
+MAX_BLOCK_DURATION = 0.5  # s
 #: Prior standard deviations: of the error of the present delay, s, and of the lag, s².
 DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
 #: Two offsets fit equally well if the ratio of their misfits is below this.
@@ -223,8 +202,8 @@ class _RunAlignment:
         """
         Return the increments if the gyro is `offset` s late, part of it by a first-order lag.
 
-        The time constant of the lag has the square 2 `lag`. The output of such a lag plus its rate
-        times the constant is the input, but for a delay.
+        The output of a lag with the time constant √(2 `lag`), plus its rate times that, is the
+        input.
         """
         points, constant = self._points, math.sqrt(2.0 * lag)
         gyro_time = points.time + offset - constant
@@ -292,11 +271,7 @@ class _RunAlignment:
         return data
 
     def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
-        """
-        Return rate, acceleration and integral of the rate, linear between the samples.
-
-        The lag is taken off the rate and the integral.
-        """
+        """Return rate, acceleration and integral of the rate at times, corrected for a lag."""
         base = self._smoothing_time
         integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
         rate = 0.5 * (later - earlier) / base
@@ -312,12 +287,7 @@ class _RunAlignment:
         return within + (at - inside) * rate
 
     def find_coarse_offset(self, largest: float) -> float:
-        """
-        Return the offset, s, at which most increments fit.
-
-        A slip affects only the blocks that contain it. A periodic motion fits about equally well
-        at several offsets: the smallest of these is returned.
-        """
+        """Return the smallest of the offsets, s, at which most increments fit about as well."""
         # a profile is smoother than measured headings
         step = 0.02 if self.is_measured else 0.04
         offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
@@ -422,18 +392,13 @@ def tracking_error_columns(motion: Motion, time: Array,
 
     The gyro's scale may differ between the two senses of turning. The response of the robot may be
     of higher order than a lag, and have a delay and a lag of its own in each turn, as where the
-    acceleration is limited. The robot may slip in each turn, and while it decelerates.
-
-    Parameters
-    ----------
-    time : s, shape (n,)
-    slip_deviation : largest standard deviation of the slip of a turn, as a fraction of it
+    acceleration is limited. The robot may slip in each turn, by a fraction of it with a standard
+    deviation of at most `slip_deviation`, and while it decelerates.
 
     Returns
     -------
     columns of headings, rad, shape (n, k), their prior standard deviations, shape (k,), and
     possible factors of these, shape (m, k)
-
     """
     rate, heading = motion.rate_at(time), motion.heading_at(time)
     sense, acceleration = np.sign(rate), np.gradient(rate, time)
@@ -474,8 +439,8 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     """
     Return the middles between lasting readings one step apart, with variances in units of theirs.
 
-    A constant reading has a constant error of up to half a step; where it changes by one step, the
-    heading is the edge between the two, but for the turn between the samples.
+    The error of a reading is constant; where it changes by one step, the heading is the edge
+    between the two, but for the turn between the samples.
     """
     change = np.abs(np.diff(motion.heading))
     index = np.flatnonzero(change > 0.5 * step)
@@ -505,9 +470,9 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
     """
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
-    Of a value that was held, as it changes by several steps at once, it is the first sample. All
-    samples of a constant reading count as one. At the first and the last the gyro rests if
-    they last much longer than the readings next to them; then their samples share one error.
+    Of a held value that changes by several steps it is the first sample. All samples of a constant
+    reading count as one, but for the first and the last if they last much longer than the readings
+    next to them: then the gyro rests, and their samples share one error.
     """
     change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
     run = np.cumsum(change > 0.5 * step)
@@ -532,9 +497,9 @@ def _random_walk_covariance(time: Array, weight: Array,
     """
     Return the variance of increments by a random walk, and the covariance of neighbours, s, (n,).
 
-    The random walk has unit variance a second, the increments are between weighted means of
-    blocks. With A the weights summed up to each point, the mean of a block is its last value less
-    the sum of A times the steps, and its first value plus the sum of (1 - A) times the steps.
+    The increments are between weighted means of blocks. With A the weights summed up to each
+    point, a mean is the last value less the sum of A times the steps of the walk, or the first one
+    plus that of 1 - A.
     """
     interval = np.diff(time, append=time[-1])
     until = np.cumsum(weight)
@@ -594,11 +559,7 @@ class _Estimate:
         return self.covariance * ((self.dof - 2.0) / (self.dof * self.rate_variance))
 
     def influence(self, data: _Increments) -> Array:
-        """
-        Return the effect of the noise of each block on (s, b), shape (n, 2).
-
-        A bias that wanders is part of the noise.
-        """
+        """Return the effect of each block's noise and bias on (s, b), shape (n, 2)."""
         wander = data.columns.shape[1] - data.wander_count
         noise = self.residual + data.columns[:, wander:] @ self.values[wander:]
         return noise[:, None] * (self.weighted @ self.inverse[:2].T)
@@ -644,15 +605,10 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
 def _average_over_noise(data: _Increments, prior_factors: Array,
                         has_shaft: bool) -> tuple[Array, Array, _Estimate]:
     """
-    Return the average over all ratios of the noises and factors of the priors, (m, k).
+    Return means over all ratios of noises and factors of priors, covariance, likeliest estimate.
 
     An error of the shaft is included only where the likelihoods show it: over less than a
     revolution it has nearly the effect of a scale factor error. Errors that repeat count once.
-
-    Returns
-    -------
-    means of the values, shape (k,), their covariance, shape (k, k), and the likeliest estimate
-
     """
     typical = float(np.median(data.walk_variance) / np.median(data.reference_variance))
     noises = [_IncrementCovariance(data, ratio) for ratio in _NOISE_RATIOS * typical]
@@ -677,10 +633,9 @@ def _repetition(data: _Increments, estimate: _Estimate) -> float:
     """
     Return how many times the same errors occur: 1 if all are independent.
 
-    They may be the same in all passes through a place of the shaft in one sense, as the steps of
-    an encoder in an even swing. There are as many groups, by place and sense, as a pass has
-    blocks. It is the mean square of a group's mean, times its number of blocks, over that of all
-    (analysis of variance).
+    They may be the same in all passes through a place of the shaft in one sense, as in an even
+    swing. There are as many groups, by place and sense, as a pass has blocks. It is the mean
+    square of a group's mean, times its number of blocks, over that of all (analysis of variance).
     """
     turned, white = data.columns[:, 0], estimate.noise.whiten(estimate.residual)
     heading = np.cumsum(turned) - 0.5 * turned
@@ -701,8 +656,7 @@ def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
 
     White noise of the variance N² of the gyro has the covariance -N² / base with an acceleration
     by the gyro over a base, and reference headings of the variance r the covariance 2 r / base²
-    with one by the reference. In a mean with weights inverse to them both cancel. Otherwise the
-    noise passes for a lag, and with that, in a swing of one frequency, for a scale factor error.
+    with one by the reference. In a mean with weights inverse to them both cancel.
     """
     columns = data.columns.copy()
     if len(data.accelerations):
@@ -717,13 +671,13 @@ def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
     """
     Return the prior standard deviation of a lag, and that of the scale by what is not known of it.
 
-    The motion determines a lag by the part of the acceleration that the other columns do not
-    explain, as gyro and reference both show it, since their noise is no information; less two
-    standard deviations. If it does so more narrowly than what is `possible`, s², or than the lag
-    that is found, there is no prior; what a lag adds to the fourth order is that of a Gaussian
-    window, or by a fifth of its square less, of a mean over a time, or by its square more, of a
-    filter of first order, which has the lag `offset` ** 2 / 2. Else the lag is 0, as in a swing of
-    one frequency, and what it may do to the scale is uncertain.
+    The motion determines a lag by the part of the acceleration that gyro and reference both show
+    and the other columns do not explain, less two standard deviations. If it does so more narrowly
+    than what is `possible`, s², or than the lag that is found, there is no prior, and only the
+    shape of the response is not known: a lag adds to the fourth order what a Gaussian window does,
+    or by a fifth of its square less, of a mean over a time, or by its square more, of a filter of
+    first order, which has the lag `offset` ** 2 / 2. Else the lag is 0, as in a swing of one
+    frequency, and what it may do to the scale is uncertain.
     """
     of_first_order = 0.5 * offset ** 2
     possible = max(possible, of_first_order)
@@ -755,29 +709,24 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     """
     Fit scale factor error, bias and time offset by likelihood.
 
-    Rates are integrated by the trapezoid rule and compared with the reference heading increment by
-    increment. The increments have noise of the rate (a random walk of the heading) and of the
-    reference heading (an encoder's step), so that neighbours are correlated; the ratio of the two
-    is found by restricted likelihood. A measured heading is smoothed by the gyro's output before
-    it serves as the regressor, which makes this the errors-in-variables likelihood.
+    The increments have noise of the rate (a random walk of the heading) and of the reference
+    heading (an encoder's step), so that neighbours are correlated; the ratio of the two is found
+    by restricted likelihood. A measured heading is smoothed by the gyro's output before it serves
+    as the regressor, which makes this the errors-in-variables likelihood.
 
-    A robot follows its profile late and smoothly, so delay and lag are fitted too: without them, a
-    first-order lag of 0.2 s causes 0.9 % of scale factor error. The lag is of first order against
-    a profile of rates, which a robot only follows; against headings, which were measured on the
-    robot itself, it is small and taken to second order. Other deviations from a profile
+    A robot follows its profile late and smoothly: without delay and lag, a first-order lag of 0.2
+    s causes 0.9 % of scale factor error. Against headings, which were measured on the robot
+    itself, the lag is small and taken to second order. Other deviations from a profile
     (`tracking_error_columns`) are fitted within their priors, and so is a stretch with a turn of
     its own, weighted by its probability.
 
     Parameters
     ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, rad/s, shape (n,)
-    motion : of the gyro
+    time, rate : s since the start of the motion, and output of the gyro, rad/s, shape (n,)
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
     lag_deviation : prior standard deviation of the lag, s²; with a measured motion only where it
         does not determine the lag, as a sine does not
-    slip_deviation : largest standard deviation of the slip of each turn of a profile, as a
-        fraction of it
+    slip_deviation : largest one of the slip of each turn of a profile, as a fraction of it
     cross_rotation : of the motion about the two axes across that of the reference, at the times of
         a measured motion, rad, shape (n, 2) or (n, 0); None where it is not known
     bias_wanders : whether it may do so by a random walk; it is then the mean over the motion
@@ -785,7 +734,6 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     Raises
     ------
     DataRefused : gyro and motion hardly overlap
-
     """
     if cross_rotation is None:
         cross_rotation = np.empty((len(motion.time), 0))
@@ -845,11 +793,9 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     Return the time offset, s, the increments there, and their fits.
 
     First values and covariance averaged over the noise, then the estimate at the likeliest one,
-    and the standard deviation of the scale by a lag that the motion does not determine.
-
-    A measured heading, or the gyro, may be late since it was smoothed. Half the variance of the
-    times by which it is late is from 0, of a delay, to half the square of their mean, of a
-    first-order lag, which is a standard deviation of the prior.
+    and the standard deviation of the scale by a lag that the motion does not determine. Half the
+    variance of the times by which a smoothed heading, or a gyro, is late is from 0, of a delay, to
+    half the square of their mean, of a first-order lag, a standard deviation of the prior.
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
@@ -904,8 +850,8 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     """
     Return the true heading where gyro and reference begin, and its standard deviation, rad.
 
-    It is relative to the reference's first heading. The expected noise of the first block's
-    heading, given all that follows, is subtracted, and then the gyro's turn before that block.
+    It counts from the reference's first heading: that of the first block less its expected noise,
+    given all that follows, and less the gyro's turn before it.
     """
     heading, elapsed, shared, gyro_angle = (data.start_offsets[0], data.start_offsets[1],
                                             data.start_offsets[2:-1], data.start_offsets[-1])
@@ -953,8 +899,8 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     """
     Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and the noise.
 
-    The values are fitted together with the excess turn of each stretch, so that they do not absorb
-    a slip. The standard deviation of the noise is that of a robust fit.
+    The values are fitted with the excess turn of each stretch, so that they do not absorb a slip.
+    The standard deviation of the noise is that of a robust fit.
     """
     noise, interval = estimate.noise, data.columns[:, 1]
     shared = data.columns[:, 4:] @ estimate.values[4:]
@@ -997,13 +943,8 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
     """
     Return the stretch that improves a fit most.
 
-    Parameters
-    ----------
-    columns : of the fit, white, shape (n, k)
-    steps : the addition of a turn of 1 rad/s from each edge on, white, shape (n, m); the last edge
-        is the end
-    observed : what is fitted, white, shape (n,)
-
+    Given are white columns of the fit, (n, k), the addition of a turn of 1 rad/s from each edge
+    on, (n, m), of which the last is the end, and what is fitted, (n,).
     """
     basis, singular, _ = np.linalg.svd(
         columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)

@@ -110,8 +110,7 @@ class CalibrationForecast:
         """
         Prepare for a gyro, whose angle random walk is above 0; all durations are in s.
 
-        The rest begins `SETTLING_TIME` s after the motion; a duration of 0 is none. The motion of
-        the robot after the rest, the drive, is repeated where it ends.
+        The rest begins `SETTLING_TIME` s after the motion; 0 is none. The drive is repeated.
         """
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
@@ -131,10 +130,9 @@ class CalibrationForecast:
         """
         Return the heading error, rad, by blocks of one length for all motions.
 
-        A fit takes shorter blocks where the motion is fast, and loses less at both ends, which
-        improves the bias by 0.3 %. A search with these blocks would prefer fast motions for it, at
-        the cost of the scale; with the allowance for a difference between the senses of turning it
-        would prefer slow ones.
+        A fit takes shorter blocks where the motion is fast, which improves the bias by 0.3 %: a
+        search with these would prefer fast motions, at the cost of the scale; one with the
+        allowance for a difference between the senses of turning would prefer slow ones.
         """
         blocks = math.ceil(self._duration / min(MAX_BLOCK_DURATION, self._duration / 40.0))
         return self._predict(motion, blocks, False).heading_error
@@ -265,7 +263,7 @@ class _MotionFamily:
 
     The axes: number of turns, sense of the first one, fractions of the headings above and below 0
     that are used, rates of one pair of turns and of the next, and fraction of the time that is
-    rest between turns. Angles are stretched up to the duration or the limits of the heading.
+    rest between turns.
     """
 
     def __init__(self, robot: RobotLimits, duration: float):
@@ -320,8 +318,8 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     """
     Return the motion of that length, s, with the least heading error in the forecast's drive.
 
-    The forecast is for motions of this length. Each generation of the search tries 70 motions.
-    `DataRefused` is raised where the robot cannot make one, or none would calibrate well enough.
+    Each generation of the search tries 70 motions. `DataRefused` is raised where the robot cannot
+    make one, or none would calibrate well enough.
     """
     _refuse_impossible(robot, duration)
     family = _MotionFamily(robot, duration)
@@ -364,12 +362,7 @@ def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
 
 
 def plain_motion(robot: RobotLimits, duration: float) -> Motion:
-    """
-    Return the plain motion of that length, s: rest, one turn there, rest, one turn back, rest.
-
-    It turns at half of the robot's fastest rate, as far as time and place allow, to the wider
-    side.
-    """
+    """Return a motion, s, of one turn there and back with rests, at half of the fastest rate."""
     _refuse_impossible(robot, duration)
     place, half = max(robot.highest, -robot.lowest), 0.5 * duration - robot.rest
     rate = max(0.5 * robot.max_turn_rate(min(place, robot.max_turn_angle(half))), robot.slowest)

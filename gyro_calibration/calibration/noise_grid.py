@@ -107,12 +107,7 @@ class SharedNoise:
 
 @dataclass(frozen=True)
 class HierarchicalPrior:
-    """
-    A value whose normal prior has a standard deviation of unknown size.
-
-    A value that the data determine weakly is drawn towards the mean of its prior, a value that
-    they determine well is not.
-    """
+    """A value whose normal prior has a standard deviation of unknown size."""
 
     name: str  # of the size
     value_index: int  # number of the value
@@ -252,22 +247,18 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
 
     About its mean over the log a bias is the sum of ``u_j cos(ω_j (t - t_0))`` with ``ω_j = π j /
     T``. The variance of ``u_j`` is ``2 / T`` times the two-sided spectrum at ``ω_j``, ``B²/ω`` and
-    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. A bias among the
-    values of the regression is the mean over the log. How far that is from the bias where the log
-    began has the variance ``2/π B²`` and ``K² T / 3``, which is not observable in the log:
-    `fit_noise_grid` adds it to the variance of the value `wandering_value`.
+    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. How far that mean
+    is from the bias where the log began has the variance ``2/π B²`` and ``K² T / 3``, which the
+    log does not show: `fit_noise_grid` adds it to the variance of the value `wandering_value`.
 
     Parameters
     ----------
     time : of the points, s, shape (n + 1,)
-    bias_instability : range of B, rad/s, or None without flicker
-    rate_random_walk : range of K, rad/s/√s, or None without rate random walk
-    cosine_count : their number
+    bias_instability, rate_random_walk : ranges of B, rad/s, and K, rad/s/√s; None without it
 
     Returns
     -------
     columns, s, shape (n, q); and the parts of the noise
-
     """
     duration = float(time[-1] - time[0])
     omega = math.pi * np.arange(1, cosine_count + 1) / duration
@@ -321,11 +312,8 @@ class _Regression:
         """
         Solve for one banded noise, and k variances of the shared values.
 
-        Returns
-        -------
-        log likelihoods, shape (k,); values, shape (k, m + q); the first m columns of the inverse
-        normal matrices, shape (k, m + q, m)
-
+        Return log likelihoods, (k,), values, (k, m + q), and the first m columns of the inverse
+        normal matrices, (k, m + q, m).
         """
         weighted = covariance.solve(np.column_stack([self.columns, self.observed]))
         gram = self.columns.T @ weighted
@@ -360,26 +348,21 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
 
     Parameters
     ----------
-    observed : shape (n,)
-    columns : of the values, shape (n, m)
+    observed, columns : shape (n,), and those of the values, shape (n, m)
     banded : parts of the noise; their sum must be positive definite
-    shared_columns : of the shared values, shape (n, q)
-    shared : parts of their variances
+    shared_columns, shared : of the shared values, shape (n, q), and parts of their variances
     prior_mean, prior_deviation : of the values, shape (m,); infinite deviation for a flat prior
     noisy_column : number of a column that holds the increments of the reference, whose noise are
-        the parts 'reference' and 'motion'. Its estimate would be too small by the share of the
-        noise in it; it is estimated with the column smoothed by what is observed as the instrument
-        (errors in variables). None where no column is noisy
+        the parts 'reference' and 'motion'; the column smoothed by what is observed is then the
+        instrument (errors in variables)
+    wandering_value : number of the value whose variance includes `unobservable_variance`
     hierarchical_priors : values with a prior of unknown size
-    wandering_value : number of the value whose variance holds what the shared noise has
-        `unobservable_variance`; None where there is none
     carried : share of the observation before that is subtracted from each, shape (n,); None where
         the errors of the observations are not autoregressive
 
     Raises
     ------
     ValueError : there are not more observations than values
-
     """
     count = columns.shape[1]
     if len(observed) <= count:
@@ -421,8 +404,8 @@ def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float,
     """
     Return an axis where the sizes are likely, at least to the middle between old points.
 
-    Where they are likely at an end of the old axis, it goes on beyond that: the likeliest point of
-    a coarse grid is not always next to the likeliest size.
+    It may go on beyond an end of the old axis: the likeliest point of a coarse grid is not always
+    next to the likeliest size.
     """
     if len(axis) == 1:
         return axis

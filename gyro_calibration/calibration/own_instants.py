@@ -47,12 +47,8 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     Return where a slow reference has its own values, or None if it has one in each sample.
 
     Values that are held change in single samples. Straight lines between values meet at corners,
-    which may lie between two samples. Both must come at even intervals.
-
-    Parameters
-    ----------
-    time, values : of the samples, s, and rad or rad/s without nan, shape (n,)
-
+    which may lie between two samples. Both must come at even intervals. Times, s, and values have
+    shape (n,), without nan.
     """
     step, sample = quantization_step(values), float(np.median(np.diff(time)))
     change = np.diff(values)
@@ -87,11 +83,7 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
 
 
 def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> float | None:
-    """
-    Return the usual interval of instants, s, some of which may be hidden; None if uneven.
-
-    In a motion that is calculated, of steady rates and ramps, only every second gap is the usual.
-    """
+    """Return the usual interval of instants, s, some of which may be hidden; None if uneven."""
     if len(gaps) < _MIN_INSTANTS or np.quantile(gaps, 0.1) < 1.5 * sample:
         return None
     usual = float(np.median(gaps))
@@ -128,14 +120,9 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     """
     Return a log whose reference is known at its own instants alone, and these.
 
-    It is nan in between. Where instants lie between samples, the samples next to them get the
-    values of a cubic spline. A rate that is held as a command is not slow.
-
-    Returns
-    -------
-    the log; the instants next to its samples, (n,), and their values, or None if no reference is
-    slow
-
+    Where instants lie between samples, the samples next to them get the values of a cubic spline.
+    A rate that is held as a command is not slow. The instants next to samples have shape (n,),
+    with nan; None if no reference is slow.
     """
     kept = None
     for name in ('reference_rate', 'reference_heading'):
@@ -177,8 +164,7 @@ def output_delay(log: Log, rate: Array) -> float:
     """
     Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s.
 
-    A robot is later than its command, and a rate that was measured and is held is later than the
-    motion, by half of the time that it is held.
+    A robot is later than its command; a rate that is held is later than the motion.
     """
     assert log.time is not None and log.output is not None
     known, output = np.isfinite(rate), bridge_gaps(log.output)

@@ -168,9 +168,9 @@ class Calibration:
         """
         Test whether columns explain the errors of the fitted dwells, given other columns.
 
-        It is an F test, averaged over what the scatter may be, in addition to the uncertainty of
-        the given model. The columns, (n, m), those of other fitted values, (n, k), and an error in
-        addition to the residual, rad/s, (n,), are given.
+        It is an F test, averaged over what the scatter may be, beside the uncertainty of the given
+        model. Given are the columns, (n, m), those of other fitted values, (n, k), and an error in
+        addition to the residual, rad/s, (n,).
         """
         known_basis, white, new = self._whiten_beside(known, unexplained, columns)
         # a sine may have its zeros at the rates of all dwells
@@ -212,11 +212,7 @@ class Calibration:
 
     @cached_property
     def given_errors(self) -> Array:
-        """
-        Return what independent errors of the given model's values do to the fitted dwells, rad/s.
-
-        Each is one standard deviation; shape (n, k), where k is 0 if they are unknown.
-        """
+        """Return the errors of fitted dwells by independent ones of the given model, rad/s."""
         known, covariance = static_terms(self.given), self.given.covariance
         if covariance is None:
             return np.empty((len(self.used), 0))
@@ -259,11 +255,7 @@ class Calibration:
 
     @property
     def left_out_rate(self) -> Array:
-        """
-        Return the rate of each dwell by a fit without its sweep, rad/s, shape (n,).
-
-        It is not finite at outlying dwells and where the other sweeps do not determine the model.
-        """
+        """Return the rate of each dwell by a fit without its sweep, rad/s, shape (n,)."""
         slope = GyroModel(self.terms).output_slope(channels_of(self.dwells))
         return np.asarray(self.dwells.rate + self.left_out_residual / slope)
 
@@ -306,17 +298,11 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     """
     Fit effects to dwells by generalised least squares, solved by QR.
 
-    Effects of the rate are evaluated at the reference rate. The polynomial of Ojeda et al. (eq. 9
-    to 12) is evaluated at the output, whose noise is small where it is an average. A shape is
-    found by Gauss-Newton steps from the best of a grid over its bounds. Dwells in which effects
-    look alike are refused.
-
-    Parameters
-    ----------
-    effects : each once
-    scatter : of the dwells, if it is known already
-    given : model that is corrected: its effects are known, unless they, or their confounders, are
-        among the fitted ones. Temperatures count from its reference temperature, or the mean
+    Effects of the rate are evaluated at the reference rate, the polynomial of Ojeda et al. (eq. 9
+    to 12) at the output, whose noise is small where it is an average. A shape is found by
+    Gauss-Newton steps from the best of a grid over its bounds. Dwells in which effects look alike
+    are refused. Of a given model that is corrected, effects are known unless they, or their
+    confounders, are among the fitted ones, and temperatures count from its reference temperature.
     """
     _refuse_unobservable(dwells, effects)
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
@@ -446,8 +432,8 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
     """
     Return each dwell's residual of a fit without its part: the deleted residuals.
 
-    They are those of a fit with an error of its own for each dwell of the part. Where the part is
-    not a whole sweep, the others of its sweep show the bias and scale that they share.
+    Where the part is not a whole sweep, the others of its sweep show the bias and scale they
+    share.
     """
     left_out = np.full(len(whitened), math.inf)
     for part in range(parts.max() + 1):
@@ -534,8 +520,8 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     """
     Return the errors of full turns at the rates and temperatures of dwells that are not outlying.
 
-    The rates by the model, rad/s, shape (n,), as in `Calibration.left_out_rate`, are not finite
-    where there is none. A turn is faster than `min_rate`, rad/s.
+    The rates by the model, rad/s, shape (n,), are as `Calibration.left_out_rate`. A turn is faster
+    than `min_rate`, rad/s.
     """
     known = np.isfinite(rate)
     wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded

@@ -95,8 +95,8 @@ def step_evenness(log: Log, step: float) -> float:
     """
     Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
 
-    Rounding errors are independent from sample to sample if the rate varies. At a constant rate
-    they are a sawtooth, which passes for tones, and at rest they are constant.
+    Rounding errors are independent if the rate varies; at a constant rate they are a sawtooth,
+    which passes for tones.
     """
     assert log.time is not None and log.output is not None
     interval = float(np.median(np.diff(log.time)))
@@ -132,8 +132,8 @@ def heading_difference(log: Log) -> HeadingDifference:
     Separate the difference of the headings of gyro and reference by its growth over time.
 
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    a lag, a scale factor and a misalignment of the axis are fitted, the delay to second order from
-    the best of some. An error that was smoothed shows at lags beyond its time constant.
+    to second order from the best of some, a lag, a scale factor and a misalignment are fitted. An
+    error that was smoothed shows at lags beyond its time constant.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     stamps, output = log.time, bridge_gaps(log.output)
@@ -248,11 +248,7 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
 
 
 def is_course(log: Log) -> bool:
-    """
-    Tell whether a heading is lost at times, as a course at low speed, and errs like one.
-
-    A direction of travel has no rotation about other axes, so an attitude is none.
-    """
+    """Tell whether a heading that is no attitude is lost at times and errs like a course."""
     log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
@@ -282,9 +278,8 @@ def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> 
     """
     Return the usual bend and change of a heading difference over a span, rad, shape (2,).
 
-    They are the standard deviations of its second difference over halves of the span, which is
-    that of the end of a random walk, and of its change beyond the bias, by their medians; 0 where
-    no span is known.
+    By medians, they are the standard deviations of its second difference over halves of the span,
+    as of the end of a random walk, and of its change beyond the bias; 0 where no span is known.
     """
     starts = np.linspace(time[0], time[-1] - span, _USUAL_SPANS)
     first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
@@ -304,7 +299,7 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     1 %), and the error of the reference and its step; or where it changes beyond its usual bias by
     that. The reference must then jump rather by what the gyro turned than not at all: a bias may
     drift in a rest. The random walk is that of the difference to the reference elsewhere, or the
-    scatter of that difference over as long a time, if it is larger, as that of a wandering bias.
+    scatter of that difference over as long a time, if it is larger.
     """
     heading = log.reference_heading
     known = np.flatnonzero(np.isfinite([] if heading is None else heading))

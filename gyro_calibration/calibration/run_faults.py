@@ -69,11 +69,7 @@ UNIT_TOLERANCE = 1.1
 
 
 def refuse_unit_error(scale: float, reference: str) -> None:
-    """
-    Raise `DataRefused` for a scale, reported over true rate, that a confused unit explains.
-
-    The name of the reference is given if its unit may be the wrong one; else ''.
-    """
+    """Refuse a scale, reported over true rate, that a confused unit explains."""
     size = max(abs(scale), 1e-300)
     found = [factor for factor in _UNIT_CONFUSIONS
              if 1.0 / UNIT_TOLERANCE < size / factor < UNIT_TOLERANCE]
@@ -125,11 +121,7 @@ def split_run(time: Array, rate: Array) -> RunPieces:
 
 def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
                         slip: str = '') -> None:
-    """
-    Raise `DataRefused` for a run that another motion explains far better than its profile.
-
-    `slip` is a message on a slip, where one is known better than the pieces show it.
-    """
+    """Refuse a run that another motion explains far better; `slip` is a message on a slip."""
     trials = [(unexplained, unexplained, message) for unexplained, message
               in _try_motions(run, motion, largest_offset)]
     # a stretch of another turn

@@ -58,12 +58,7 @@ BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, _NONLINEARITY_DEVIATION = (
 
 @dataclass(frozen=True)
 class Scatter:
-    """
-    Standard deviations of dwells about a smooth surface over rate and temperature.
-
-    The surface is as smooth as the number of dwells allows. The scatter does not depend on the
-    effects that are fitted: one found with too few of them would include what they leave.
-    """
+    """Standard deviations of dwells about a smooth surface over rate and temperature."""
 
     dwell_bias: float  # of a dwell, beyond its own deviation, rad/s
     # of the scale factor from dwell to dwell, 1, such as that of a table's speed
@@ -73,11 +68,7 @@ class Scatter:
     inliers: Mask  # which dwells are not outlying, shape (n,)
 
     def deviation(self, dwells: Dwells) -> Array:
-        """
-        Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,).
-
-        A deviation of its own that is not known is the rms of the others.
-        """
+        """Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,)."""
         known = np.isfinite(dwells.deviation)
         typical = rms(dwells.deviation[known]) if known.any() else 0.0
         return np.sqrt(np.where(known, dwells.deviation, typical) ** 2 + self.dwell_bias ** 2
@@ -106,9 +97,8 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
-    It is the sweep, since errors that its dwells have in common do not predict other sweeps. Fewer
-    than four sweeps do not determine a model without one of them, nor do two temperatures the
-    slope between them: then parts are about 60 blocks of time within sweeps, or the dwells.
+    It is the sweep, since errors that its dwells have in common do not predict other sweeps. With
+    fewer than `MIN_SWEEPS`, parts are about 60 blocks of time within sweeps, or the dwells.
     """
     sweeps, count = _sweep_numbers(dwells), min(len(dwells), 60)
     if sweeps.max() + 1 >= MIN_SWEEPS:
@@ -210,8 +200,7 @@ def find_inliers(dwells: Dwells) -> Mask:
     Return which dwells are not outlying, by a robust fit of the surface.
 
     Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
-    dwells of a sweep whose scale differs are not outlying. Nor is what the deviation of a dwell of
-    its own explains, such as that by the steps of the output where rests are all on one step.
+    dwells of a sweep whose scale differs are not outlying.
     """
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
@@ -261,9 +250,9 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     """
     Fit columns (n, m) to an error (n,) for each of k scatters of sweeps' bias and scale, (k, 2).
 
-    Returned are the logarithm of the determinants of the covariance, in that of the dwells, and of
-    the Gram matrix, (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and
-    the inverse of the Gram matrix of the whitened columns, (k, m, m).
+    Return the logarithm of the determinants of covariance, in that of the dwells, and Gram matrix,
+    (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and the inverse of
+    the Gram matrix of the whitened columns, (k, m, m).
     """
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
@@ -289,16 +278,15 @@ class Uncertainty:
     """
     The uncertainty of values fitted to dwells.
 
-    Few dwells and few sweeps do not determine how large the scatter is. So the distribution of the
-    values is averaged over possible scatters, weighted by their restricted likelihood: that of the
-    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
+    Few dwells and few sweeps do not determine how large the scatter is; the maximum of the
+    likelihood alone would often be at zero, and its intervals too narrow. So the distribution of
+    the values is averaged over possible scatters, weighted by their restricted likelihood: that of
+    the dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
     uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
     its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
     sweeps alone are then those of Student's distribution with as many degrees of freedom as there
     are sweeps more than values. That sweeps do not differ has the weight of a factor of e in that
-    variance: without it, the intervals of sweeps that do not differ would be too wide. The maximum
-    of the likelihood alone would be at zero in about half of the cases, and its intervals would be
-    too narrow.
+    variance: without it, the intervals of sweeps that do not differ would be too wide.
     """
 
     weights: Array  # of possible scatters, shape (k,)
@@ -315,8 +303,7 @@ class Uncertainty:
         """
         Average over the possible scatters of dwells, of which there are more than values.
 
-        The columns are the change of the error for each value, shape (n, m), and the error is the
-        residual of the fitted values, rad/s, shape (n,).
+        Given are the change of the error for each value, (n, m), and the residual, rad/s, (n,).
         """
         lengths, deviation = np.linalg.norm(columns, axis=0), scatter.deviation(dwells)
         dof, likeliest = len(dwells) - len(lengths), (scatter.sweep_bias, scatter.sweep_scale)
@@ -397,11 +384,10 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
     Return the error of a rate that the covariance of the values, (m, m), does not contain.
 
     Effects that were not fitted may exist below the noise: a fit with more columns has a larger
-    variance than that of the values. Its mean over the fitted dwells is added to the variance of
-    the bias; its value half a width outside of the calibrated range gives the slopes. Given are
-    the scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,), and a
-    function of rates, rad/s, and temperatures, degC: the change of the output for each value,
-    (n, m).
+    variance. Its mean over the fitted dwells is added to the variance of the bias; its value half
+    a width outside of the calibrated range gives the slopes. Given are the scatter of bias and
+    scale factor from sweep to sweep, rad/s and 1, (2,), and a function of rates, rad/s, and
+    temperatures, degC: the change of the output for each value, (n, m).
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = (np.zeros(len(dwells)) if dwells.temperature is None

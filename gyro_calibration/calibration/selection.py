@@ -99,11 +99,7 @@ class SelectedEffects:
 
 
 def select_effects(dwells: Dwells, technology: str | None = None) -> SelectedEffects:
-    """
-    Fit the effects that the dwells support, each with its reason.
-
-    The technology of the instrument, one of `TECHNOLOGY_EFFECTS`, decides where causes tie.
-    """
+    """Fit the effects that the dwells support, each with its reason; a technology decides ties."""
     base = _add_slopes(_fit_base(dwells, None))
     best = _add_slopes(find_supported_effects(dwells, FALSE_ALARM_RATE, base=base))
     best, confounders = resolve_confounders(
@@ -132,7 +128,7 @@ def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
     Fit the effects that predict left-out sweeps better, at a false alarm rate.
 
     The best one is added until none is supported, then those that later ones made superfluous are
-    removed. With a given model they are changes of it. The effects of a `base` are in the fit.
+    removed. With a given model they are changes of it. The effects of a `base` stay.
     """
     best = base = base or _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
@@ -167,11 +163,7 @@ def _fit_base(dwells: Dwells, given: GyroModel | None) -> Calibration:
 
 
 def _is_supported(smaller: Calibration, larger: Calibration, significance: float) -> bool:
-    """
-    Return whether more effects predict left-out sweeps better, and each is significant.
-
-    A response that no longer grows with the rate at some dwells cannot be undone there.
-    """
+    """Return whether more effects predict left-out sweeps better, and each is significant."""
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.cross_validation_misfit() < smaller.cross_validation_misfit()
     return (predicts and larger.min_non_monotonic_rate is None
@@ -205,9 +197,9 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
     """
     Decide between sine response and cubic nonlinearity where a fit has one of them.
 
-    The one that fits better is taken, but for the one by the physics of the technology if the data
-    do not distinguish them, and without a technology for a `bounded_effect`, whose error stays
-    bounded beyond the rates that were seen, if the data do not prefer the other one.
+    The one that fits better is taken, or, if the data do not decide, the one by the physics of the
+    technology, and without one a `bounded_effect`, whose error stays bounded beyond the rates
+    seen.
     """
     effect = next((each for each in CONFOUNDERS if each in fit.effects), None)
     if effect is None:
@@ -240,8 +232,8 @@ def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
     """
     Return the slowest new rate, rad/s, at which two dwells each way distinguish two fits.
 
-    Their outputs are then to differ by one standard deviation more than is needed. None if that is
-    more than three times the fastest rate.
+    By one standard deviation more than is needed. None if it is above three times the fastest
+    rate.
     """
     known = fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
     deviation = np.full(4, np.median(known) if len(known) else np.nan)

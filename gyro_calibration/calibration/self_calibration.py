@@ -9,6 +9,7 @@
 # under the License.
 
 """
+
 Scale factor error and bias from about 20 s of known motion, with the reasons to refuse a run.
 
 The model is ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three methods:
@@ -101,12 +102,7 @@ def default_reference_errors(motion: Motion) -> ReferenceErrors:
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
-    """
-    Fit by Hong and Park's heading reference, unchanged (eq. 4 to 7).
-
-    The rectangle rule of eq. 4 is kept: against a continuous heading it errs by several percent
-    where the sampling is slow.
-    """
+    """Fit by Hong and Park's heading reference, with the rectangle rule of eq. 4 (eq. 4 to 7)."""
     step = np.diff(time)
     g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
     z = motion.heading_at(time[1:]) - motion.heading_at(time[:1])
@@ -141,10 +137,9 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
     Parameters
     ----------
-    noise : the wander of the bias goes into its standard deviation, and the residual is compared
-        with it
-    reference : the errors of the motion; goes into the standard deviations. By default a motion of
-        rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
+    noise : its wander goes into the deviation of the bias; the residual is compared with it
+    reference : errors of the motion, for the standard deviations; by default those of
+        `default_reference_errors`
     prior : standard deviations of (s, b) about zero before the run, as
         `GyroModel.prior_deviations` of a fleet, shape (2,); what the run leaves open is drawn to
         it, in a method that gives a covariance
@@ -199,8 +194,7 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
     By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
     error, which is no noise of a fit; between codes the errors are independent, of the sizes of
-    `rounding_errors`. Ramps within a block average them out. The covariance has shape (2, 2), the
-    variance is in (rad/s)²; both are zero without steps.
+    `rounding_errors`. Shape (2, 2) and (rad/s)²; both are zero without steps.
     """
     step = quantization_step(output)
     if not step:
@@ -325,11 +319,7 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
 
 def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits,
                 white_noise: float) -> None:
-    """
-    Refuse by the first cause found; causes that spoil later checks come first.
-
-    `white_noise` is that of the samples, rad/√s.
-    """
+    """Refuse by the first cause found, in the order in which they spoil later checks."""
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual
     s = fit.scale_factor_error
@@ -379,12 +369,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
-    """
-    Return a remark on a scale factor error that gyros of a technology hardly have, or ''.
-
-    The standard deviation of the scale factor error of such gyros, 1, and the name of the motion
-    are given.
-    """
+    """Return a remark on a scale factor error beyond what such gyros have, or ''."""
     size = 100.0 * fit.scale_factor_error
     sigmas = abs(fit.scale_factor_error) / math.hypot(
         prior_deviation, float(np.nan_to_num(math.sqrt(fit.covariance[0, 0]))))
@@ -494,8 +479,7 @@ def rest_variance(noise: Noise, duration: float, white_deviation: float,
     Return the variance of a mean at rest about the bias, (rad/s)².
 
     Given are the duration, s, the deviation of the mean by the white noise of the samples, and by
-    how much the means of both halves differ, rad/s: a robot that settles in the first half of the
-    rest moves the mean by half of the change.
+    how much the means of both halves differ, rad/s: a robot that settles moves the mean by half.
     """
     return (max(white_deviation, noise.angle_random_walk / math.sqrt(duration)) ** 2
             + float(noise.mean_change_variance(duration, duration)) + 0.25 * half_difference ** 2)
@@ -505,12 +489,11 @@ def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[
     """
     Return derivatives of (s, b) by the rate at rest, shape (2,), and their covariance, (2, 2).
 
-    The rest after a run is combined with the covariance of (s, b) by the run, shape (2, 2). The
-    rate is the mean of the output at rest less the bias of the run, rad/s; its variance is that of
-    the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a turn by
-    hand, or another response of the robot. That and a run as stated have even odds before the rest
-    is seen. The ratio of that error to the stated deviation has a half-Cauchy prior with a median
-    of 1.
+    The rate is the mean of the output at rest less the bias of the run, rad/s; its variance is
+    that of the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a
+    turn by hand, or another response of the robot. That and a run as stated have even odds before
+    the rest is seen. The ratio of that error to the stated deviation has a half-Cauchy prior of
+    median 1.
     """
     stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
@@ -534,9 +517,9 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
-    It begins later, by up to its length in the limits, where the robot still moves then, as after
-    an overshoot. It lasts until the robot moves, at most as long as the motion did. None where
-    the log ends before, or the robot drives on.
+    It begins later, by up to its length in the limits, where the robot still moves then, and lasts
+    until the robot moves, at most as long as the motion did. None where the log ends before, or
+    the robot drives on.
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
@@ -580,9 +563,8 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
     """
     Return the bias of a gyro at rest and its standard deviation, rad/s.
 
-    See Ojeda et al., eq. 1, or 15 for compensated rates. The mean includes the Earth's rate about
-    the axis. A slow and steady turn looks like a bias; only the limit on the bias excludes it. The
-    noise gives the smallest standard deviation of the mean.
+    See Ojeda et al., eq. 1, or 15 for compensated rates. The mean includes the Earth's rate. A
+    slow and steady turn looks like a bias; only the limit on the bias excludes it.
     """
     refuse_samples(time, rate, limits, output)
     parts = np.array_split(rate, 10)

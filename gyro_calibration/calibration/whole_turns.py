@@ -65,15 +65,10 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     """
     Find scale factor error and bias from whole turns between two rests on one mark.
 
-    The rates of the turns do not matter, only the net number of turns. The number is accepted only
-    where the gyro agrees to less than `_MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
-    factor error needs few turns. Arguments and `DataRefused` are those of `self_calibrate`.
-
-    Parameters
-    ----------
-    turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
-        factor error up to `_MAX_COUNTING_SCALE_ERROR`
-    mark_deviation : standard deviation of the angle between the two rests on the mark, rad
+    Only the net number of turns matters, counter-clockwise positive; None is the nearest whole
+    one, for a scale factor error up to `_MAX_COUNTING_SCALE_ERROR`. The gyro must agree to less
+    than `_MAX_COUNT_ERROR` of a turn; so one with a large error needs few turns. The deviation is
+    that of the angle between the rests on the mark, rad. The rest is that of `self_calibrate`.
     """
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)

@@ -123,10 +123,9 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     Return the derivative of the rate by each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then the
-    `GyroModel.active_tolerances` errors, then (s, b) of the self-calibration, if there is one; the
-    order of `covariance`. The rate of the model solves ``rate = output - error(rate)``, so the
-    derivative of the error is divided by the slope of the output there: 0.5 for a sine response at
-    a phase of 60 deg. Effects that compensation cannot undo have a derivative of 0.
+    `GyroModel.active_tolerances`, then (s, b) of the self-calibration. The rate of the model
+    solves ``rate = output - error(rate)``, so the derivative of the error is divided by the slope
+    of the output there. Effects that compensation cannot undo have a derivative of 0.
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None or model.active_tolerances:

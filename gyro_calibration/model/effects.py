@@ -169,11 +169,10 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     """
     Return the error polynomial of Ojeda, Chung and Borenstein (2000), eq. 9 to 13.
 
-    It is one of the output, not of the true rate, so that compensation is one subtraction (eq.
-    13). Its powers are centred and scaled, since the condition number of raw powers of deg/s and
-    degC is about 1e11. The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of
-    output. The index of eq. 10 as printed collides; here each product has its own column. The
-    orders are p and q of the paper, not negative.
+    It is one of the output, so that compensation is one subtraction (eq. 13). Its powers are
+    centred and scaled, since the condition number of raw powers of deg/s and degC is about 1e11.
+    The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of output; the index of
+    eq. 10 as printed collides. The orders are p and q of the paper, not negative.
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 

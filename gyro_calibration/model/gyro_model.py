@@ -294,10 +294,10 @@ class GyroModel:
 
     def rate_from_channels(self, channels: Channels) -> tuple[Number, Number]:
         """
-        Return the rate, rad/s, at the output and the surroundings of channels.
+        Return the rate, rad/s, at the output and surroundings of channels, and whether there is
+        none.
 
-        The rate of the channels is not used. The second value tells whether no rate of the
-        `rate_domain` has this output; the correction at the end of the domain is held there.
+        Where no rate of the `rate_domain` has this output, the correction at its end is held.
         """
         output, (independent, dependent) = channels.output, self._split_by_rate
         given = output - _sum_errors(independent, channels)

@@ -80,11 +80,7 @@ def motion_from_headings(time: Array, heading: Array) -> Motion:
 
 
 def motion_from_log(log: Log) -> tuple[Motion, float]:
-    """
-    Return the motion of the reference of a log, and the time of its beginning, s.
-
-    Raise `InputError` without a reference over time, `DataRefused` with less than two values.
-    """
+    """Return the motion of the reference of a log, and its begin, s."""
     for values, motion in ((log.reference_heading, motion_from_headings),
                            (log.reference_rate, motion_from_rates)):
         if values is not None and log.time is not None:
@@ -149,12 +145,10 @@ _COLUMN_UNITS = {name: factor for column, (quantity, factor) in COLUMNS.items()
 
 def read_motion(path: str | Path) -> Motion:
     """
-    Read a motion profile from a CSV file.
+    Read a motion profile from a CSV file, or raise `MotionError`.
 
     It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s. The reference of a log
     is a profile too: its heading where it has both, and without the rows where it was lost.
-
-    Raise `MotionError` for other columns, values that are not finite, times that do not increase.
     """
     try:
         lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
@@ -221,8 +215,8 @@ def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
     """
     Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
 
-    The channels have the true rate and surroundings at the stamps, s, shape (n,). The noise is
-    that of samples at their median interval; without a generator there is none.
+    The channels have the true rate and surroundings at the stamps, s, (n,). The noise is that of
+    their median interval; without a generator there is none.
     """
     rate = model.distort('rate', channels.rate, time)
     output = model.output_from_channels(channels.with_rate(rate, rate))

@@ -84,10 +84,9 @@ class Noise:
 
 def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
     """
-    Return the variance of the mean of a process over `BIAS_AVERAGING_TIME` s, and a covariance.
+    Return variance, and covariance with its end, of the mean of a unit process over a calibration.
 
-    The process is a Gauss-Markov process of unit variance; the covariance is that of the mean and
-    the value at the end of the interval.
+    It is a Gauss-Markov process, and `BIAS_AVERAGING_TIME` s long.
     """
     ratio = BIAS_AVERAGING_TIME / time_constant
     decayed = 1.0 - np.exp(-ratio)
@@ -98,9 +97,8 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     """
     Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
 
-    Flicker and random walk have no finite variance, but their increments do
-    (`NoiseTerm.angle_covariance`). The result holds for sums whose weights add up to zero, such as
-    the difference of two biases.
+    Flicker and random walk have no finite variance, so it holds for sums whose weights add up to
+    zero, such as the difference of two biases.
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
     angle = (noise.bias_instability ** 2 * FLICKER.angle_covariance(apart)

@@ -204,7 +204,8 @@ def rested(seed, change=0.0):
 
 
 def test_the_rates_at_rest_after_the_run_have_their_stated_deviation():
-    checks = (check_rest(*rested(seed), calibrated(seed % 20), XV3500.noise) for seed in range(200))
+    checks = [check_rest(*rested(seed), calibrated(seed % 20), XV3500.noise)
+              for seed in range(200)]
     beyond = sum(abs(check.rate) > 1.645 * check.deviation for check in checks)
     assert fewest(200, 0.1) <= beyond <= most(200, 0.1)
 
