@@ -39,16 +39,13 @@ from scipy.stats import pearsonr
 _MIN_ALLAN_SAMPLES = 100
 #: Largest share of lost samples in a window; it is also the largest change of the variance.
 _MAX_LOST_PER_WINDOW = 0.01
-#: Least number of spans in the test whether a reference turns with the output: chance shows such a
-#: correlation of fewer too often for spans of several lengths.
+#: Least number of spans in the test whether a reference turns with the output.
 _MIN_SPANS = 8
-#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
-#: product numpy computes in one thread, which is faster here.
+#: Samples in a block that fits into the cache, and whose dot product takes one thread.
 _BLOCK_SAMPLES = 8192
 #: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
 _LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
-#: Indices of quantization and ramp among the terms, and of terms whose second differences are
-#: independent over longer times.
+#: Indices of terms, the last ones those with independent second differences over longer times.
 _QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
 _SHORT_MEMORY_INDICES = [
     place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
@@ -273,8 +270,7 @@ def allan_deviation(rate: Array, interval: float,
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
     freedom = _degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
-    # A few overlapping windows between gaps may have less than one degree of freedom: their
-    # deviation has no upper bound.
+    # a few windows between gaps may have less than one degree of freedom, and no upper bound
     bounded = freedom >= 1.0 - 1e-9
     sizes, counts = sizes[bounded], counts[bounded]
     variance, freedom = variance[bounded], freedom[bounded]
@@ -293,9 +289,8 @@ def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, 
 
 def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
     """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
-    # They are those of the random term that fits the slope of each Allan variance best. The slope
-    # of the logarithm is that from half to twice each time, -1 for a single one. Quantization is
-    # assumed at the short end only; a steep slope elsewhere is chance.
+    # Those of the random term that fits the slope of each Allan variance best, from half to twice
+    # each time. Quantization is assumed at the short end only; a steep slope elsewhere is chance.
     low = np.searchsorted(sizes, sizes / 2.0)
     high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
     rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))

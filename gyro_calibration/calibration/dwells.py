@@ -47,8 +47,7 @@ _MAX_DEVIATION = 0.5 * DEGREE
 OUTLIER_THRESHOLD = 6.0
 #: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
 MIN_TEMPERATURE_SPREAD = 1.0
-#: Minimum share of a log in dwells, as a swing is steady for short times only; and share up to
-#: which another method is the default, since few short dwells hide their scatter.
+#: Minimum share of a log in dwells, and share up to which another method is the default.
 MIN_DWELL_SHARE, FEW_DWELLS_SHARE = 0.05, 0.25
 #: Duration of the blocks in which the heading is averaged, s, and how many of them show a ramp.
 _BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
@@ -61,17 +60,12 @@ class Dwells:
     rate: Array  # of the reference, rad/s
     output: Array  # of the gyro, rad/s
     temperature: Array | None  # degC; None where the log holds none
-    # standard deviation of the mean output against the mean reference, rad/s; nan where it is not
-    # known
-    deviation: Array
-    # number of the sweep, or block of time, of each dwell; cross-validation leaves a sweep out as
-    # a whole
-    sweep: Numbers
+    deviation: Array  # of output against reference, rad/s; nan if unknown
+    sweep: Numbers  # number of the sweep, or block of time, which cross-validation leaves out
     location: tuple[str, ...]  # of each dwell in its file, for messages
     remarks: tuple[str, ...] = ()  # on what was found and left out, one sentence each
     rows: tuple[Numbers, ...] = ()  # of the log, whose mean each dwell is
-    # step of a coarse output, and standard deviation of the noise of its samples before they are
-    # rounded, both rad/s, shape (n, 2); empty where the steps do not matter
+    # step of a coarse output and deviation of its noise, rad/s, (n, 2); empty where it is fine
     rounding: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def __len__(self) -> int:
@@ -182,8 +176,7 @@ def dwells_from_table(log: Log) -> Dwells:
     output = output[rows]
     rounding: Array = np.empty((0, 2))
     if not (deviation > 0.0).any():  # that of the steps is the only one that is known
-        # The step is the largest one that all differences are multiples of: that of the gyro
-        # where its samples are all alike, or of the digits that were written. Where the rates
+        # The step is the largest one that all differences are multiples of. Where the rates
         # explain it, as those of a gyro without errors, it is at most 1 deg/s.
         step = _largest_divisor(output - output[0])
         if step > 0.5 * _largest_divisor(rate - rate[0]):
@@ -328,8 +321,7 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
                           'and one of reference_rate_dps and reference_heading_deg')
     known = np.isfinite(reference)
     lost = find_lost_reference(known)
-    # A reference has errors up to 0.05 s before and after a loss: motion capture loses its markers
-    # one by one. Stamps may come in bursts, so the mean interval counts.
+    # Motion capture loses its markers one by one. Stamps may come in bursts: the mean counts.
     steps = np.diff(time)
     steps = steps[steps < 1.0]
     reach = round(0.05 / float(steps.mean())) if len(steps) else 0
@@ -366,8 +358,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         fresh = part[~is_repeated[part]]
         is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
         kept.append(fresh[~is_outlier[fresh]])
-    # margin or settling time, if longer, are cut off both ends; a time offset shows before a ramp,
-    # in the mirrored log
+    # a time offset shows before a ramp, in the mirrored log
     error, rate_change = samples.error, np.diff([np.median(samples.output[rows]) for rows in kept])
     mirrored = [(len(time) - 1 - rows)[::-1] for rows in kept[:-1]]
     after, before = (max(_MARGIN, _settling_time(*each))
@@ -422,8 +413,7 @@ def _find_straight(samples: _Samples) -> list[slice]:
     edges = np.append(first, len(time))
     times, headings = (np.add.reduceat(values, first) / np.diff(edges)
                        for values in (time, samples.heading))
-    # A vibration of the table cancels over a whole number of its periods, so several lengths are
-    # used.
+    # A vibration of the table cancels over a whole number of its periods.
     deviation = max((float(np.median(np.abs(
         headings[reach:-reach] - 0.5 * (headings[2 * reach:] + headings[:-2 * reach]))))
         for reach in (2, 3, 5) if len(headings) > 2 * reach), default=math.inf)
@@ -432,8 +422,7 @@ def _find_straight(samples: _Samples) -> list[slice]:
     for cone in _split_into_lines(times, headings, 2.0 * tolerance):
         if times[cone.stop - 1] - times[cone.start] < 0.5 * _MIN_DURATION:
             continue
-        # a line through the middle is extended within the tolerance, without the ramps, by at most
-        # its own length at both ends, so that the time is linear in the length of the log
+        # a line through the middle is extended within the tolerance, by at most its own length
         length = cone.stop - cone.start
         middle = slice(cone.start + length // 5, cone.stop - length // 5)
         begin, end = max(0, cone.start - length), min(len(times), cone.stop + length)
@@ -572,10 +561,9 @@ def _average(samples: _Samples,
         reference = samples.heading[rows]
         angle = integrate(samples.time[rows], samples.output[rows])
         rate[place], output[place] = (samples.slope(rows, each) for each in (reference, angle))
-        # Over M steps of an encoder the deviation of the slope is about 0.35 step / (M duration),
-        # and below one step 0.6 step / duration (by simulation). Each step is observed late by up
-        # to a sample, which adds the square root of M over the number of samples. A heading that
-        # stays on one step for the whole dwell is taken as a rest.
+        # By simulation, the deviation of the slope over M steps of an encoder is about 0.35 step /
+        # (M duration), below one step 0.6 step / duration. Each step is seen late by up to a
+        # sample. A heading that stays on one step for the whole dwell is taken as a rest.
         blur[place] = 0.0
         if np.ptp(reference) > 0.5 * samples.step > 0.0:
             steps = abs(reference[-1] - reference[0]) / samples.step
@@ -587,13 +575,11 @@ def _average(samples: _Samples,
             slopes = [samples.slope(rows[part], each[part]) for part in parts]
             variance[place] = np.var(slopes, ddof=1) / len(parts)
     # Against a heading, the scatter of the output includes the motion of the table, that of the
-    # error the steps of the encoder; the smaller one is used. Its product with the duration is the
-    # same in all dwells under white noise.
+    # error the steps of the encoder. Under white noise its product with the duration is constant.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
-    # Step and noise of the samples. Up to a quarter of a squared step, the variance depends on the
-    # place in the step, so such dwells have one noise. Where most dwells are on one step each,
-    # their steps may be those of their rates; then the whole output shows it.
+    # Up to a quarter of a squared step, the variance depends on the place in the step, so such
+    # dwells have one noise. Where most are on one step each, the whole output shows the step.
     values = [samples.output[rows] for rows in dwells]
     step = (quantization_step(np.concatenate(values))
             if np.median([np.ptp(each) for each in values]) > 0.0

@@ -73,15 +73,13 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 _WHITE_NOISE_RANGE = (1e-5, 1e-2)
 #: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
 _GYRO_LAG_DEVIATION = 2e-4
-#: Prior standard deviation of the smoothing of a heading without steps, half the variance of the
-#: times over which it is a mean, s²: that of a mean over 0.2 s, which may cause no delay.
+#: Prior standard deviation of the smoothing of a heading without steps: a mean over 0.2 s, s².
 _SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
 #: Places of a shaft in a revolution whose errors are independent.
 _PLACE_COUNT = 24
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
-#: Largest difference of the scales of a reference rate and heading that is not reported, 0.4 deg
-#: in a revolution, as by integration over samples.
+#: Largest difference of the scales of a reference rate and heading that is not reported.
 _SAME_SCALE = 1e-3
 #: Share of the largest differences that show their tail.
 _TAIL_SHARE = 0.005
@@ -436,8 +434,7 @@ class _Drift:
     bias: float
     deviation: float
     wander_deviation: float  # of the mean bias less the bias at the beginning, rad/s
-    # 95 % bounds of the angle random walk if nothing else moves the heading from piece to piece,
-    # rad/√s
+    # 95 % bounds of the angle random walk if nothing else moves the heading, rad/√s
     walk_bounds: tuple[float, float]
 
 

@@ -78,18 +78,15 @@ TECHNOLOGY_PRIORS = {
 }
 #: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
 MAX_ENCODER_OFFSET = 0.25
-#: Typical duration of a burst of errors of a course, s. The few errors within it hardly determine
-#: its variance: the errors of a course have Student's distribution with so many degrees of
-#: freedom, plus one for each observed error.
+#: Typical duration of a burst of errors of a course, s; their distribution is Student's, with so
+#: many degrees of freedom, plus one for each observed error.
 _BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
-#: The random walk of the bias that is possible beside a course, rad/s/√s; and the cosines of a
-#: wander that one part of noise describes.
+#: Possible random walk of the bias beside a course, rad/s/√s; cosines of a wander of one part.
 _COURSE_RANDOM_WALK_RANGE, WANDER_COSINES = (1e-7, 1e-4), 8
 #: Largest number of corrections of the rate, and error of the scale by a last one.
 _MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
-#: Prior standard deviations of scale factor error and bias, rad/s, where gyro and reference
-#: disagree by more than a gyro errs; and prior odds of that beside a course that is lost at times,
-#: which has no wheels. A scale of odometry is wrong as probably as it is right.
+#: Prior deviations of s and b, rad/s, where gyro and reference disagree by more than a gyro errs;
+#: prior odds of that beside a course that is lost at times, which has no wheels.
 _WIDE_PRIOR, _WIDE_ODDS_OF_COURSE = (0.3, 10.0 * DEGREE), 1e-3
 #: Prior standard deviation of the smoothing of a course, s².
 _SMOOTHING_DEVIATION = 0.1
@@ -105,11 +102,9 @@ _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Cosines over which the power spectrum of a rate is averaged: that of white noise to 14 %.
 _SPECTRUM_BINS = 101
-#: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
-#: vibration.
+#: Largest angle random walk of a gyro in a vehicle, rad/√s; more white noise is vibration.
 _MAX_VEHICLE_WALK = 5e-4
-#: Least number of spans to determine the noise of a course, and largest deviation of its turn in
-#: a span from that of a gyro that follows it, rad.
+#: Least number of spans, and largest deviation in a span from a gyro that follows, rad.
 _MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
 
 
@@ -198,13 +193,12 @@ class Spans:
     rests: NDArray[np.intp]
     stands: Mask
     treatment: ReferenceTreatment  # of the kind of the reference
-    # the angle random walk by the white noise of the samples, with that of a reference rate, and
-    # by the difference of gyro and reference over a second, the smaller first, rad/√s
+    # smaller and larger angle random walk, by the white noise of samples and reference rate, and
+    # by the difference of gyro and reference over a second, rad/√s
     walk_bounds: tuple[float, float]
     reference_noise_ratio: float  # ratio of the noise of a reference rate to that of the gyro
     uses_code_changes: bool  # whether the points are changes of the code of an encoder
-    # begin and end of each hole in the output that is as long as a span, s, shape (k, 2); over a
-    # span that meets one, nothing is compared, and its observation is 0
+    # begin and end of each hole in the output that is as long as a span, s, shape (k, 2)
     holes: Array
     output_step: float  # quantization step of the output, rad/s; 0 without one
     adds_up: bool  # whether the reference is never lost, as odometry, which adds up its errors
@@ -616,8 +610,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         walks = [min(walks[0], _MAX_VEHICLE_WALK)]
     by_code = kind == 'encoder' and encoder_step(reference) > 0.0 and (at == time).all()
     if by_code:
-        # between two samples with different codes the shaft was in the middle of both; a single
-        # code gives only a range, and its error at rest or at a reversal is systematic
+        # between two samples with different codes the shaft was in the middle of both
         at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
         reference = np.append(np.where(np.diff(reference) != 0.0,
                                        0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
@@ -911,8 +904,7 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
             if evidence < greatest:
                 break
             greatest, likeliest = evidence, correlation
-        # what a drive of minutes does not determine is drawn to 0, and the mean bias of the drive
-        # is not that of the gyro
+        # what a drive of minutes does not determine is drawn to 0
         fit = fit_with(likeliest, walk, size, wandering_value=1, hierarchical_priors=[
             HierarchicalPrior(name, place, (1e-2 * size, size))
             for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))])

@@ -44,9 +44,7 @@ class GoodnessOfFit:
     chi_square: float  # sum of squares of the residual over the variance that is known
     dof: float  # degrees of freedom
     probability: float  # of as much, or more, by chance
-    # noise that accumulates in the heading, over the known one; noise that repeats or averages out
-    # is not included
-    noise_ratio: float
+    noise_ratio: float  # that accumulates in the heading, over the known one
 
     def __str__(self) -> str:
         """Return a sentence for people."""
@@ -58,8 +56,7 @@ class GoodnessOfFit:
                 f'noise {self.noise_ratio:.2f} times that of the model)')
 
 
-#: Probability of a misfit by chance below which it is stated: of a residual, of a frequency band
-#: of it, or of sizes of a cause that differ from log to log.
+#: Probability of a misfit by chance below which it is stated.
 MIN_FIT_PROBABILITY = 1e-3
 
 
@@ -79,26 +76,23 @@ class ScaleBiasFit:
     # effect of the noise of each block on (s, b), and the times of the blocks, s, shape (n, 2 + 1)
     influence: Array = field(default_factory=lambda: np.empty((0, 3)))
     stretch_interval: tuple[float, float] = (0.0, 0.0)  # beginning and end of that stretch, s
-    # true heading where gyro and reference begin, from the reference's first heading, and its
-    # standard deviation, rad; nan against a profile, which defines its own start
+    # true heading where the run begins, from the first one of a measured reference, and its
+    # deviation, rad; nan against a profile
     start_heading: float = math.nan
     start_heading_deviation: float = math.nan
     residual_squares: float = math.nan  # their sum, in units of white noise of 1 rad/√s
     dof: float = 0.0  # degrees of freedom of these
     goodness: GoodnessOfFit | None = None  # None where the noise is not known
     slip_deviation: float = 0.0  # of the fraction that each turn of a profile lost, 1
-    # √6 times the root mean square of the difference of the headings that the fit leaves, rad: the
-    # size of a random walk from and to 0 over the run
+    # √6 times the rms of the difference of the headings that the fit leaves, rad
     heading_difference: float = math.nan
     rounding_variance: float = 0.0  # of a mean at a constant rate by output steps, (rad/s)²
-    # drift of a reference in motion against the rests in which it stands, and half its interval of
-    # 95 %, rad/s; None without such rests
+    # drift in motion against rests, and half its interval of 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
     reference_adds_up: bool = False  # whether the reference adds up its errors, as odometry
     # of s by a lag or smoothing that the motion does not determine; part of the covariance
     response_deviation: float = 0.0
-    # components of the axis of the gyro along the two cross axes of an attitude, rad, shape (2,)
-    # or (0,), and their covariance
+    # of the axis of the gyro along the cross axes of an attitude, rad, (2,) or (0,); covariance
     misalignment: Array = field(default_factory=lambda: np.empty(0))
     misalignment_covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
     # sizes of the error of a measured heading once in a revolution, rad, shape (2,), or none (0,)
@@ -119,8 +113,7 @@ def oblique_angle(misalignment: Array, covariance: Array) -> tuple[float, float,
             math.exp(-0.5 * square))  # the chi-squared distribution of two degrees of freedom
 
 
-#: Limit of significance, standard deviations: noise does not exceed it in 10 000 stretches a run,
-#: in all runs of a robot.
+#: Limit of significance: noise does not exceed it in 10 000 stretches a run.
 MAX_NOISE_SIGMAS = 7.0
 
 
@@ -152,15 +145,13 @@ class _Increments:
     prior_factors: Array  # possible factors of the prior standard deviations, shape (l, m)
     prior_mean: Array  # prior means of the values, shape (m,)
     gyro_increments: Array  # increments of the gyro's integral, rad, shape (n,)
-    # variance of the increments of a random walk, and covariance of each with the one before, s,
-    # shape (n,)
+    # variance of increments of a random walk, and covariance with the one before, s, shape (n,)
     walk_variance: Array
     walk_covariance: Array
     # variance of the reference in each block, up to one factor, shape (n + 1,)
     reference_variance: Array
     time: Array  # of the blocks, s, shape (n + 1,)
-    # from the first point to the first block: its heading, the time, the shared errors in that
-    # block, then the turn of the gyro
+    # of the first block against the first point: heading, time, shared errors, turn of the gyro
     start_offsets: Array
     # the change by a lag with accelerations by gyro and reference over `acceleration_time`, s,
     # rad/s², and by a term of the fourth order, rad/s⁴, shape (n, 3); empty for a profile
@@ -176,8 +167,7 @@ MAX_BLOCK_DURATION = 0.5  # s
 DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
 #: Two offsets fit equally well if the ratio of their misfits is below this.
 _MAX_MISFIT_RATIO = 1.5
-#: Rate and acceleration are differences over this time, s, or an interval if longer, to either
-#: side: over less, noise dominates them.
+#: Rate and acceleration are differences over this time to either side, s, or an interval.
 _MIN_SMOOTHING_TIME = 0.01
 
 
@@ -375,13 +365,12 @@ ASYMMETRY_DEVIATION = 1e-4
 _TURN_LAG_DEVIATION = 0.02
 #: Largest number of groups of neighbouring turns with a delay and a lag of their own.
 _MAX_TURN_GROUPS = 12
-#: A response of higher order, as of a robot that overshoots, as a sum of second differences of the
+#: A response of higher order, as of a robot that overshoots, as second differences of the
 #: heading: their times, s, and prior standard deviation, 1.
 _RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.2 * np.arange(1, 5), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
 _PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
-#: Largest prior standard deviation of an error of a shaft once in a revolution, as of an eccentric
-#: encoder, rad.
+#: Largest prior deviation of an error of a shaft once in a revolution, rad.
 _SHAFT_ERROR_DEVIATION = math.radians(1.0)
 
 
@@ -452,8 +441,7 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
                                   np.clip(relative_deviation * np.diff(motion.time)[index] / step,
                                           _MIN_CROSSING_DEVIATION, 1.0))
-    # none has more weight than the median one: the accuracy of a reference is seldom that of its
-    # slowest steps
+    # the accuracy of a reference is seldom that of its slowest steps
     relative_deviation = (np.maximum(relative_deviation, np.median(relative_deviation))
                           if len(time) else relative_deviation)
     alone = np.diff(index, prepend=-1, append=len(change)) == 1
@@ -881,14 +869,12 @@ class DeviatingStretch:
     # sum of squares that it explains, and that remains
     explained_squares: float
     remaining_squares: float
-    # sums of squares that each stretch explains, and of its column without the part that the fit
-    # explains, for all stretches that are distinguishable from the fit, shape (m,)
+    # what each stretch explains, and its column beside those of the fit, squares, shape (m,)
     all_explained_squares: Array
     column_squares: Array
 
 
-#: A turn that the profile does not contain, by hand or by a single slip: standard deviation of its
-#: rate, rad/s, and its prior odds.
+#: A turn beside the profile, by hand or a slip: standard deviation, rad/s, and prior odds.
 EXCESS_RATE_DEVIATION, _EXCESS_TURN_ODDS = 0.0175, 0.1
 #: Largest number of places of a run at which a stretch begins or ends.
 _MAX_EDGES = 150
@@ -966,6 +952,5 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
         gains[distinct], norms[distinct])
 
 
-#: Fraction of a stretch that the columns of a fit must not explain, so that the two are
-#: distinguishable; with less, noise gives a stretch a large turn.
+#: Fraction of a stretch that a fit must not explain; with less, noise gives it a large turn.
 _MIN_DISTINCT_SHARE = 0.2

@@ -93,13 +93,9 @@ class Prediction:
     """The expected accuracy of a calibration by a motion."""
 
     scale_deviation: float  # standard deviation of s, 1
-    # standard deviation of b against the mean bias of the drive that follows, rad/s; without
-    # flicker and random walk it is what the calibration states
-    bias_deviation: float
+    bias_deviation: float  # of b against the mean bias of the drive, rad/s
     heading_error: float  # mean absolute error of the heading over that drive, rad
-    # the part of it that white noise causes, which remains if s and the bias are known at all
-    # times
-    floor: float
+    floor: float  # the part that white noise causes
 
 
 class CalibrationForecast:
@@ -141,8 +137,8 @@ class CalibrationForecast:
         white_precision, of_run, of_both, of_drive = _noise_covariances(
             self._noise, self._duration, blocks, self._rest_duration, self._drive_duration,
             self._drive_columns.shape[1])
-        # the fit: its weights of (s, b) on increments of the gyro's integral, shape (2, n), and
-        # the covariance by errors of the robot that it does not determine, (2, 2)
+        # the weights of (s, b) on increments of the gyro's integral, (2, n), and the covariance by
+        # errors of the robot that the fit does not determine, (2, 2)
         count = blocks * _CELLS_PER_BLOCK ** 2
         point = (np.arange(count) + 0.5) * self._duration / count
         rate = motion.rate_at(point)
@@ -158,8 +154,8 @@ class CalibrationForecast:
         of_tracking = weights @ columns[:, 4:] * prior[4:]
         unweighed = of_tracking @ of_tracking.T
         if self._rest_duration:
-            # combined with the median rest: its halves differ by twice the deviation of the mean,
-            # times `_MEDIAN_SIGMA`
+            # the median rest: its halves differ by `_MEDIAN_SIGMA` deviations, twice that of the
+            # mean
             white = self._noise.angle_random_walk / math.sqrt(self._rest_duration)
             stated = covariance[:2, :2] + np.diag([0.0, self._noise.allan_floor ** 2])
             expected, variance = (rest_variance(self._noise, self._rest_duration, white, change)
@@ -168,8 +164,7 @@ class CalibrationForecast:
                 stated, _MEDIAN_SIGMA * math.sqrt(stated[1, 1] + expected), variance)
             share = np.eye(2) - np.outer(gain, (0.0, 1.0))
             weights = np.column_stack([share @ weights, gain])
-            # the probability of another turn of the robot is no noise, but part of the stated
-            # variance
+            # another turn of the robot is no noise, but part of the stated variance
             unweighed = share @ (unweighed - stated) @ share.T + combined - variance * np.outer(
                 gain, gain)
 

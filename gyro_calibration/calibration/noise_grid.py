@@ -71,11 +71,9 @@ from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import logsumexp, softmax
 
-#: Points of the grid for each size, and passes: the first is over the whole range, each further
-#: one around the likely points.
+#: Points of the grid for each size, and passes, each around the likely points of the one before.
 _GRID_POINTS, _GRID_PASSES = 5, 4
-#: Cosines that describe a wandering bias; faster changes are hardly distinguishable from white
-#: noise.
+#: Cosines of a wandering bias; faster changes are hardly distinguishable from white noise.
 _COSINE_COUNT = 24
 
 
@@ -85,9 +83,7 @@ class BandedNoise:
 
     name: str  # of the size
     diagonal: Array  # shape (n,)
-    # of each observation with the one before it, shape (n,); the first is not looked at. None
-    # where they are independent
-    off_diagonal: Array | None
+    off_diagonal: Array | None  # with the one before, (n,); None where independent
     # smallest and largest size that is possible; equal where the size is known
     size_range: tuple[float, float]  # noqa: A003
 
@@ -100,9 +96,7 @@ class SharedNoise:
     variance: Array  # shape (q,)
     # smallest and largest size that is possible; equal where the size is known
     size_range: tuple[float, float]  # noqa: A003
-    # variance that the observations have in common, so that it looks like one of the values, in
-    # units of size²
-    unobservable_variance: float = 0.0
+    unobservable_variance: float = 0.0  # that looks like one of the values, in size²
 
 
 @dataclass(frozen=True)
@@ -125,14 +119,10 @@ class GridFit:
     sizes: Mapping[str, tuple[float, float, float]]
     # the size of each part at the point of the grid with the largest likelihood, by name
     likeliest_sizes: Mapping[str, float]
-    # logarithm of the mean likelihood over the grid, to compare models with the same columns of
-    # flat prior
-    log_evidence: float
+    log_evidence: float  # of the mean likelihood over the grid
     # observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
     residual: Array
-    # variance that the shared noise has in common with one of the values, as it is
-    # `unobservable_variance`
-    unobservable_variance: float
+    unobservable_variance: float  # of the shared noise, that looks like one of the values
     _noise: TridiagonalMatrix
     _carried: Array | None = None
 

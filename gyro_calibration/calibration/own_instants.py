@@ -27,8 +27,7 @@ _LONGEST_INTERVAL = 1.0
 MAX_GYRO_LAG = 0.1
 #: Step of a heading from which on it is that of an encoder, whose changes are exact, rad.
 MAX_ROUNDING_STEP = 2e-4
-#: Largest change of the slope on a straight line as a share of the usual slope, and least number
-#: of instants.
+#: Largest change of the slope on a line as a share of the usual slope; least number of instants.
 _MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
 
 

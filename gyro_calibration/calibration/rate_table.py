@@ -62,13 +62,11 @@ class Calibration:
 
     terms: tuple[Term, ...]  # effects with their values
     dwells: Dwells  # all of them
-    # the model that is corrected; an ideal gyro where there is none. Its effects that are not
-    # fitted count as known
-    given: GyroModel
+    given: GyroModel  # that is corrected; its effects that are not fitted count as known
     scatter: Scatter  # of the dwells, and which were fitted
     residual: Array  # error of each dwell that the effects do not explain, rad/s, shape (n,)
-    # the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying dwells,
-    # infinite where the other sweeps do not determine it
+    # of a fit without the dwell's sweep, rad/s, (n,); nan at outlying dwells, infinite where the
+    # other sweeps do not determine it
     left_out_residual: Array
     deviation: Array  # standard deviation of each dwell, rad/s, shape (n,)
     condition_number: float  # number of the columns, each of length one
@@ -97,11 +95,10 @@ class Calibration:
         residual = self.residual[self.scatter.inliers]
         if model.uses_channel('output'):
             # The polynomial depends on the output. With the measured one in the columns, a scale
-            # factor error of -1 would make every residual zero for any error of sweeps, and the
-            # likelihood would prefer a large scatter of their scale: the Jacobian of output
-            # against error is missing there. Columns and residual are therefore those of the
-            # output that the model expects: its change is that of the error over 1 - g, with g
-            # the slope of the error over the output.
+            # factor error of -1 would make every residual zero: the Jacobian of output against
+            # error is missing there. Columns and residual are those of the output that the model
+            # expects: its change is that of the error over 1 - g, with g the slope of the error
+            # over the output.
             expected, step = model.output_from_channels(channels), 1e-5
             below, here, above = (channels.with_rate(channels.rate, expected + change)
                                   for change in (-step, 0.0, step))

@@ -31,33 +31,27 @@ from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
-#: Delays of the gyro behind a reference that are tried, and those around the best, s; and the
-#: rows that are compared.
+#: Trial delays of the gyro, and those around the best, s; and the rows that are compared.
 _TRIAL_DELAYS, _FINE_DELAYS = (0.1 * np.arange(-15.0, 16.0)).tolist(), 0.01 * np.arange(-9.0, 10.0)
 _TRIAL_ROWS = 5000
-#: Largest error of an exact reference heading as a share of the difference of the headings over a
-#: second: a fifth of its variance.
+#: Largest error of an exact reference heading as a share of the difference over a second.
 _MAX_HEADING_ERROR_SHARE = 0.25
-#: Noise of a reference rate that is not white is detected from so many standard deviations on, in
-#: this quietest share of the log, in blocks of so many samples.
+#: Standard deviations from which on noise of a rate that is not white is detected, share of the
+#: log that is quietest, and samples of a block.
 _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
 #: Number of spans of a log whose scatter is estimated: to 4 %.
 _USUAL_SPANS = 500
 #: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
 #: the errors of an encoder are at most so many times its rounding error.
 _MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
-#: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
-#: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
-#: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
+#: Least ratio of the errors of a course to the noise of the gyro, also for one that is straight
+#: between fixes (measured: 4.6 to 920, all below 8 on straight lines; odometry: up to 5).
 _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
-#: Least noise of a course, rad, over a second or from span to span; by RTK fixes of a car in town
-#: it is 0.4 deg, and a motion capture with short gaps has less.
+#: Least noise of a course, rad, over a second or from span to span; RTK in town has 0.4 deg.
 MIN_COURSE_NOISE = 0.25 * DEGREE
-#: Time for which a recorder misses a reference that is not lost, as it does not begin, nor end, to
-#: receive all topics at once, s; or five intervals of the reference, as for gaps of a recording.
+#: Time for which a recorder misses a reference that is not lost, at its begin or end, s.
 _MAX_LATE_START = 0.1
-#: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
-#: straight between fixes.
+#: Largest ratio of 90 % to 99 % quantile of second differences of straight lines between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
 
 
@@ -71,8 +65,8 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
     scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    # of the quietest rest, as of filtered noise single seconds are far quieter by chance; where
-    # steps hide the noise, a rest does not show the bias
+    # of filtered noise single seconds are quieter by chance; where steps hide the noise, a rest
+    # does not show the bias
     quietest = (maximum_filter1d(scatter, 3)[1:-1].min(initial=math.inf) if scatter.all()
                 else 0.0)
     is_quiet = scatter <= 2.0 * quietest + 1e-12
@@ -114,9 +108,7 @@ def step_evenness(log: Log, step: float) -> float:
 class HeadingDifference:
     """Difference of the headings of gyro and reference over a second."""
 
-    # standard deviation of the part that does not grow with time, rad: errors of the reference, of
-    # stamps, or by vibration of the gyro
-    constant_error: float
+    constant_error: float  # of the part that does not grow with time, rad
     # angle random walk that is equivalent to the whole difference in a second, rad/√s
     total_walk: float
 
@@ -220,8 +212,8 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
         blocks = len(every) // block
         energies = np.sum(every[:blocks * block].reshape(blocks, block) ** 2, axis=1)
-        # selected by the blocks on both sides, as a block that is quiet itself may be so by
-        # chance; one with far more energy than these is a motion between two rests
+        # by the blocks on both sides, as one may be quiet by chance; one with far more energy than
+        # these is a motion between two rests
         sides = np.maximum(np.roll(energies, 1), np.roll(energies, -1))
         most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
         quiet = np.repeat((sides <= most) & (energies <= 3.0 * most), block)
@@ -267,8 +259,7 @@ def is_course(log: Log) -> bool:
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
     larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > _MIN_LOST_SHARE
               else _COURSE_NOISE_RATIO)
-    # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
-    # the variance
+    # an encoder errs by its rounding; a difference over a second has 3 times the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
     return heading_difference(log).total_walk > max(larger * walk, MAX_ROUNDING_RATIO * rounding,
                                                     MIN_COURSE_NOISE)

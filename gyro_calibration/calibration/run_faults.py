@@ -29,8 +29,8 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-#: Minimum length of the pieces in which motions are compared, and step of the tried starts, ends
-#: and offsets, s; largest number of pieces: the time of the search is proportional to its cube.
+#: Shortest pieces in which motions are compared, and step of the tried offsets, s; most pieces:
+#: the time of the search is proportional to their cube.
 _TRIAL_STEP, _MAX_PIECES = 0.1, 650
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
 MAX_UNEXPLAINED_SHARE = 0.1

@@ -49,9 +49,8 @@ from scipy.stats import t as student
 MIN_SWEEPS = 4
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _MIN_DWELLS = 12
-#: Standard deviations between gyros, by data sheets: the change of the bias with temperature,
-#: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
-#: the nonlinearity at the fastest rate that is not fitted, 1 (L3G4200D: 0.2 %).
+#: Standard deviations between gyros (L3G4200D): of the bias, rad/s/K, the scale factor, 1/K, and
+#: the nonlinearity at the fastest rate, 1.
 BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, _NONLINEARITY_DEVIATION = (
     Prior().coefficient, 3e-4, 2e-3)
 
@@ -158,12 +157,10 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
     kept = find_inliers(dwells)
     used = select_dwells(dwells, kept)
     error, surface = used.output - used.rate, _smooth_surface(used)
-    # The likelihood does not depend on the part that the surface explains; without its removal,
-    # small errors would be lost in rounding.
+    # without the removal of what the surface explains, small errors would be lost in rounding
     error = error - surface @ (surface.T @ error)
     fastest = max(float(np.abs(used.rate).max()), 1e-9)
-    # of exact values above their rounding, or what is rounded would be explained, and the Gram
-    # matrix of a dwell that is exact beside others would be singular
+    # above rounding, or that would be explained and the Gram matrix of exact dwells singular
     size = (rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1))
             + 1e-12 * fastest + 1e-3 * float(np.nan_to_num(used.deviation).max(initial=0.0)))
     relative = size / fastest

@@ -35,11 +35,9 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
-#: Probability of taking an effect that is not there, in one calibration, and of an alarm in a
-#: fleet without outliers, changes and missing effects.
+#: Probability of taking an effect that is not there, and of a false alarm in a fleet.
 FALSE_ALARM_RATE = 0.01
-#: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
-#: one of thirty thousand calibrations.
+#: Standard deviations from which on two causes are distinguished.
 MIN_DISTINGUISHING_SIGMAS = 4.0
 #: Technology -> which of sine response and cubic nonlinearity its physics causes.
 TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
@@ -70,12 +68,8 @@ class _ConfoundedPair:
     # taken, other: their names
     taken: str
     other: str
-    # standard deviations by which the data prefer the one that was taken; negative where they
-    # prefer the other
-    sigmas: float
-    # slowest rate, rad/s, at which two dwells each way would distinguish them; None if it is above
-    # three times the fastest
-    distinguishing_rate: float | None
+    sigmas: float  # by which the data prefer the one taken; negative for the other
+    distinguishing_rate: float | None  # that would distinguish them, rad/s; None far above
     reason: str  # why it was taken, one sentence
 
     @property

@@ -43,17 +43,14 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
-#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
-#: equal slip in all turns is indistinguishable from a scale factor error.
+#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn.
 _MAX_WHEEL_SLIP = 0.01
-#: Standard deviations from which on a stretch is a slip. With three times the noise of the
-#: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
+#: Standard deviations from which on a stretch is a slip: 6 of 800 good runs exceed it, and 1 deg,
+#: with three times the noise of the XV-3500, none with its own.
 _MIN_SLIP_SIGMAS = 4.5
-#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
-#: is stated, s.
+#: Duration of the drive for which the precision of a calibration is stated, s.
 DRIVE_DURATION = 300.0
-#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
-#: which the robot is driving, rad/s.
+#: Time after the profile at which a robot is at rest, s; change of the rate of a drive, rad/s.
 SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
 
 
@@ -63,8 +60,7 @@ class RunLimits:
 
     min_samples: int = 50  # minimum number of samples
     max_gap: float = 0.5  # longest between samples, s
-    # smallest standard deviation of the profile's rate, rad/s; one speed does not separate scale
-    # from bias
+    # smallest standard deviation of the profile's rate, rad/s
     min_rate_spread: float = 1.0 * DEGREE
     max_scale_factor_error: float = 0.3  # largest, 1
     max_bias: float = 10.0 * DEGREE  # largest, rad/s
@@ -72,16 +68,14 @@ class RunLimits:
     # largest significant deviation of a stretch of the run from the profile, rad
     max_stretch_residual: float = 1.0 * DEGREE
     max_time_offset: float = 1.0  # largest lag of the gyro behind the profile, either way, s
-    # largest noise that accumulates in the heading, as a multiple of the known noise, or else of
-    # the white noise of the samples, and as its heading error over the run, rad; a run that
-    # exceeds both is refused
+    # largest noise that accumulates in the heading, over the known one or else that of the
+    # samples, and its heading error over the run, rad; a run that exceeds both is refused
     max_noise_ratio: float = 8.0
     max_unexplained_angle: float = 1.0 * DEGREE
     rest_duration: float = 2.0  # length of the check after the run, s
     # largest corrected rate at rest after the run, rad/s, unless the noise explains more
     max_rest_rate: float = 2e-4
-    # largest error of the heading after five minutes, rad, unless it was larger without the
-    # calibration (`likelihood` only): that of a bias of 0.1 deg/s, which a gyro has at least
+    # largest error of the heading after five minutes, rad, unless it was larger before
     max_heading_error: float = 30.0 * DEGREE
 
 
@@ -154,9 +148,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
                               reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
-    # errors not observable in a run: wander of the bias, and errors of the reference with the
-    # slip that all turns have; the root mean square of slips between zero and a largest one is
-    # twice their standard deviation
+    # not observable: wander of the bias, errors of the reference, the slip that all turns have;
+    # the rms of slips between zero and a largest one is twice their standard deviation
     scale = 1.0 + fit.scale_factor_error
     unobservable = np.diag(
         [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
@@ -211,8 +204,7 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
     local = mean + (change - np.roll(change, 1)) / (1.0 + before + after)
     code = np.unique(np.rint(local), return_inverse=True)[1]
-    # a ramp may begin within a block: those next to one are no evidence of the noise, nor those in
-    # which the rate changes by a tenth of a step
+    # a ramp may begin within a block
     slow = np.abs(np.roll(mean, -2) - np.roll(mean, 2)) < 4.0 * 0.1
     weight = count * np.where(quiet & before & after & slow, 1.0, 1e-6)
     total: Array = np.bincount(code, weight).astype(float)
@@ -237,11 +229,9 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
               key=lambda found: float(np.linalg.det(found.covariance)))
     if motion.rate is not None:
         return fit
-    # Against a profile the fit includes a scale difference between both senses of turning; for
-    # measured headings its variance is added. Such an error is proportional to the absolute value
-    # of the rate. The part of it that is proportional to the rate, or constant, is
-    # indistinguishable from scale factor error and bias. In a swing without rests, the mean
-    # absolute rate is indistinguishable from a bias.
+    # Against a profile the fit includes a scale difference between both senses of turning. Such an
+    # error is proportional to the absolute rate; the part of that which is proportional to the
+    # rate, or constant, is indistinguishable from scale factor error and bias.
     columns = np.column_stack([rate, np.ones(len(rate))])
     absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
     return replace(
@@ -327,8 +317,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     has_slipped = excess_angle > limits.max_stretch_residual and sigmas > _MIN_SLIP_SIGMAS
     slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
             else '')
-    # against measured headings the deviations include the noise of mount and encoder; a wobble
-    # with the wheels passes for noise of the rate, but does not accumulate in the heading
+    # the noise of mount and encoder deviates too; a wobble does not accumulate in the heading
     noise_ratio = (fit.goodness.noise_ratio if fit.goodness
                    else fit.angle_random_walk / max(white_noise, 1e-300))
     strays = (motion.rate is not None and fit.heading_difference > limits.max_unexplained_angle

@@ -31,16 +31,13 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
 
-#: Standard deviation of the heading of a robot put on a mark by hand or eye, rad: two marks a
-#: finger's width apart at half a metre.
+#: Standard deviation of a robot put on a mark by hand or eye, rad: a finger at half a metre.
 MARK_DEVIATION = 1.0 * DEGREE
 #: Shortest rest, s.
 _MIN_REST_DURATION = 1.0
-#: Length of the means that separate rest from motion, s; the one beside the motion is left
-#: out. And the smallest deviation that is motion for any noise of the gyro, rad/s.
+#: Length of the means that separate rest from motion, s; smallest deviation of motion, rad/s.
 _PART_DURATION, _MIN_MOVING_RATE = 0.25, 0.5 * DEGREE
-#: Largest difference between the angle and the number of turns, in turns; half a turn would be as
-#: near to the next number.
+#: Largest difference between the angle and the number of turns, in turns.
 _MAX_COUNT_ERROR = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
 _MAX_COUNTING_SCALE_ERROR = 0.05

@@ -26,8 +26,7 @@ from gyro_calibration.logs.log import Log, Number
 from gyro_calibration.model.effects import Channels, lag_difference
 import numpy as np
 
-#: State at the last sample, by (channel, time constant) of a lag and ('heating', filter time,
-#: threshold) of the sign of heating.
+#: By (channel, time constant) of a lag, and ('heating', filter time, threshold).
 _LagStates = dict[tuple[Any, ...], float]
 
 

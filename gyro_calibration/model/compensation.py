@@ -36,18 +36,14 @@ _MAX_COMPUTABLE_RATE = math.sqrt(sys.float_info.max)
 class CompensatedSamples:
     """Compensated samples: numbers, or arrays of shape (n,)."""
 
-    # rate after the model and before the self-calibration, rad/s; input of the next self-
-    # calibration
-    model_rate: Number
+    model_rate: Number  # after the model, before the self-calibration, rad/s
     rate: Number  # rad/s
     temperature: Number  # degC, limited to plausible temperatures
-    # the temperature is outside the calibrated range. Up to `GyroModel.extrapolation_range` the
-    # correction is extrapolated, beyond that it is held
+    # outside the calibrated temperatures; up to `GyroModel.extrapolation_range` the correction is
+    # extrapolated, beyond that held
     temperature_clipped: Number
-    # the output is outside the calibrated range of rates, or not plausible, or no rate has this
-    # output. Up to `GyroModel.rate_limit` the correction is extrapolated. Beyond that, and where
-    # the response no longer grows with the rate, the last correction is held, so that the rate is
-    # always finite
+    # the output is outside the calibrated rates, or no rate has it; up to `GyroModel.rate_limit`
+    # the correction is extrapolated, beyond that, or at a fold of the response, held
     beyond_range: Number
 
 

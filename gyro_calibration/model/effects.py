@@ -51,8 +51,7 @@ class Channels:
     # 'temperature', 'specific_force', and 'vibration', the squared deviation of the specific force
     # from its own mean over 1 s
     lagged: Callable[[str, float], Number] | None = None
-    # (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell, 0 before
-    # either
+    # (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell, else 0
     heating: Callable[[float, float], Number] | None = None
 
     def with_rate(self, rate: Number, output: Number) -> Channels:
@@ -73,9 +72,7 @@ class Parameter:
 
     name: str
     unit: str
-    # a convention, such as a reference temperature; without one it is a property of the gyro, and
-    # is fitted
-    default: float | None = None
+    default: float | None = None  # a convention; without one it is fitted
     bounds: tuple[float, float] = (-np.inf, np.inf)
     begin_with: tuple[float, ...] = ()  # first values of a nonlinear one in a diagnosis
 
@@ -93,11 +90,9 @@ class Effect:
     # nonlinear parameters, on which the columns depend
     nonlinear_parameters: tuple[Parameter, ...] = ()
     experiment: str = ''  # experiment that separates it from similar effects
-    # (channels, shapes, coefficients) -> the sum of the columns times the coefficients, where a
-    # faster formula exists
+    # (channels, shapes, coefficients) -> the sum of the columns, where a faster formula exists
     sum_columns: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
-    # (signal, time, *values) -> signal, of a whole log, for an effect that adds nothing but
-    # changes the signal itself
+    # (signal, time, *values) -> signal, for an effect that changes the signal of a whole log
     distortion: Callable[..., Array] | None = None
     # of the distortion: 'rate' before anything is added to the rate, or 'output' after the noise
     stage: str = ''
@@ -147,8 +142,7 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
 
 def _solve_recurrence(factors: Array, added: Array, initial: float) -> Array:
     """Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,)."""
-    # Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
-    # row before is propagated through each row.
+    # rows of sqrt(n) samples in parallel from zero; then the end of each is propagated to the next
     count = len(factors)
     width = math.isqrt(max(count - 1, 0)) + 1
     padding = (0, -count % width)

@@ -109,13 +109,11 @@ def _turns_and_rests(first_rest: float, turns: Iterable[tuple[float, float, floa
         stretch for duration, rate, rest in turns for stretch in ((duration, rate), (rest, 0.0)))])
 
 
-#: 20 s that separate scale factor error from bias: both signs, two speeds, rests, ramps of 0.5 s,
-#: and the first heading at the end.
+#: 20 s that separate scale factor error from bias: both signs, two speeds, and rests.
 CALIBRATION_MOTION = _turns_and_rests(1.0, (
     (duration, rate, 1.0) for duration, speed in ((4.0, 45.0), (3.5, 30.0))
     for rate in (speed, -speed)))
-#: 160 s of a robot in a building, half of it at rest or on straight paths: turns of 90 deg and the
-#: ramps after them.
+#: 160 s of a robot in a building, half of it at rest or on straight paths, with turns of 90 deg.
 ROBOT_MOTION = _turns_and_rests(10.0, (
     (90 / abs(rate) + 0.5, rate, rest) for rate, rest in (
         (15, 6), (-15, 8), (-10, 6), (10, 6), (20, 8), (-20, 7), (-20, 8), (20, 7), (10, 6),

@@ -98,9 +98,8 @@ def simulator_parameters(model: GyroModel, sample_rate: float, temperature: floa
 
 def _format_sdf(parameters: _SimulatorParameters) -> tuple[str, set[str]]:
     """Return the noise of the z axis for an `<imu>` in SDF."""
-    # Gazebo draws the sign of `bias_mean` at random and decays it with the correlation time, so
-    # the bias is exported as the mean of the noise. `dynamic_bias_stddev` is the density of a
-    # Gauss-Markov process.
+    # Gazebo draws the sign of `bias_mean` at random and decays it, so the bias is the mean of the
+    # noise. `dynamic_bias_stddev` is the density of a Gauss-Markov process.
     values = {'mean': parameters.bias, 'stddev': parameters.white_noise, 'bias_mean': 0.0,
               'bias_stddev': parameters.bias_deviation}
     names = {'bias', 'bias_instability', 'rate_random_walk', 'angle_random_walk'}
