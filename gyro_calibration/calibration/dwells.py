@@ -31,7 +31,6 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     find_runs, mark_rows, mask_outliers, mask_repeated_samples, noise_before_rounding,
     quantization_step, rounding_product)
-from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
@@ -386,7 +385,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         remarks.append('dwells that warmed or cooled by more than '
                        f'{MIN_TEMPERATURE_SPREAD:g} K are divided, which makes {more} more')
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells], len(time))
-    remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
+    remarks += _describe_left_out(samples, is_outlier & within, is_repeated & within)
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
     if share < min_share:
         raise NothingSteady(
@@ -513,9 +512,8 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     return found
 
 
-def _describe_left_out(log: Log, samples: _Samples, is_outlier: Mask, is_repeated: Mask,
-                       within: Mask) -> Iterator[str]:
-    """Yield remarks on outliers, repeated and lost samples within the dwells."""
+def _describe_left_out(samples: _Samples, is_outlier: Mask, is_repeated: Mask) -> Iterator[str]:
+    """Yield remarks on outliers and repeated samples within the dwells."""
     places = [f'{time:.2f} s' for time in samples.time[is_outlier]]
     if places:
         yield f'outliers, left out: {len(places)}, at {format_list(places)}'
@@ -524,17 +522,6 @@ def _describe_left_out(log: Log, samples: _Samples, is_outlier: Mask, is_repeate
     if places:
         yield (f'the output was repeated {_format_occurrences(len(places))}, at '
                f'{format_list(places)}; the repeats are left out')
-    assert log.time is not None and log.output is not None
-    time = log.time[np.isfinite(log.output)]
-    lost = count_lost_samples(time)
-    if lost is None:
-        yield 'the stamps are too irregular to count lost samples'
-        return
-    gaps = np.flatnonzero((lost > 0) & (np.interp(time[1:], samples.time, within) > 0.5))
-    if len(gaps):
-        yield (f'samples missing within the dwells: {lost[gaps].sum()}, '
-               f'after {format_list([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
-               'constant rate the means are not affected')
 
 
 def _format_occurrences(number: int) -> str:

@@ -69,23 +69,10 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-#: The gyro's white noise that is possible, rad/√s.
-_WHITE_NOISE_RANGE = (1e-5, 1e-2)
 #: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
 _GYRO_LAG_DEVIATION = 2e-4
 #: Prior standard deviation of the smoothing of a heading without steps: a mean over 0.2 s, s².
 _SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
-#: Places of a shaft in a revolution whose errors are independent.
-_PLACE_COUNT = 24
-#: References on each side of a hole that the residual is continued by.
-_HOLE_EDGE = 15
-#: Largest difference of the scales of a reference rate and heading that is not reported.
-_SAME_SCALE = 1e-3
-#: Share of the largest differences that show their tail.
-_TAIL_SHARE = 0.005
-#: Largest difference from a reference that is computed from the output, relative to its noise:
-#: that of rounding. A second gyro that shares vibration or fast motion differs by 1e-3 or more.
-_OWN_DIFFERENCE_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -285,9 +272,9 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
                         alone * np.sign(difference)) - quantization_step(heading[known])
     usual = (apart < 1.5 * np.median(apart)) & (np.abs(
         since[known[1:]] + delay - 0.5 * since[-1]) < 0.5 * since[-1])
-    low, high = np.quantile(np.abs(difference[usual]), 1.0 - _TAIL_SHARE * np.array([2.0, 1.0]))
-    noise = high + (high - low) * math.log2(
-        max(_TAIL_SHARE * len(known) / FALSE_ALARM_RATE, 1.0))
+    tail = 0.005  # share of the largest differences
+    low, high = np.quantile(np.abs(difference[usual]), 1.0 - tail * np.array([2.0, 1.0]))
+    noise = high + (high - low) * math.log2(max(tail * len(known) / FALSE_ALARM_RATE, 1.0))
     above = usual & (beyond > noise)
     once = above & (np.convolve(above, np.ones(3), 'same') == 1.0)
     jumps = known[1:][once]
@@ -306,7 +293,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
         sizes[jumps] = change[once]
         halvings = (beyond[once].max() - high) / max(high - low, 1e-300)
         found = HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
-                             _TAIL_SHARE * len(known) * 2.0 ** -min(halvings, 1000.0))
+                             tail * len(known) * 2.0 ** -min(halvings, 1000.0))
         remarks.append(
             f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
             f'to the next, at {format_list([f"{time[row]:.2f} s" for row in jumps])}, where the '
@@ -343,7 +330,7 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         if not alike and late < 0.5 * unexplained:
             contradiction = f'is {abs(delay):.1f} s {"behind" if delay > 0.0 else "ahead of"}'
         # what noise or another delay may do to the scale is less than the root of what they leave
-        elif abs(scale - 1.0) >= max(_SAME_SCALE, math.sqrt(max(unexplained, 0.0))):
+        elif abs(scale - 1.0) >= max(1e-3, math.sqrt(max(unexplained, 0.0))):
             contradiction = f'turns {scale:.3f} times as far as'
         if contradiction and log.output is not None:
             rows = np.isfinite(log.output[known])
@@ -463,7 +450,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     between = (durations[1:] + durations[:-1]) / 6.0
     # means over pieces of a random walk
     walk = BandedNoise('angle_random_walk', np.maximum(spacing - between, between),
-                       durations[:-1] / 6.0, _WHITE_NOISE_RANGE)
+                       durations[:-1] / 6.0, (1e-5, 1e-2))
     # a file has headings to 1e-6 rad
     rounding = max(quantization_step(motion.heading), 1e-6) / math.sqrt(
         12.0 * len(piece) / len(known))
@@ -495,7 +482,8 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation, of_scale)
                          / math.sqrt(scatter[1, 1])])
     covariance = scatter * np.outer(widening, widening)
-    place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
+    # 24 places in a revolution, whose errors are independent
+    place = np.floor(np.mod(turned, 1.0) * 24.0).astype(np.intp) % 24
     # what the prior of the lag leaves open
     covariance[0, 0] = max(covariance[0, 0], own_variance)
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
@@ -531,8 +519,7 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
     for begin, end in _find_holes(time):  # the gyro's heading begins anew after it
         after = motion.time >= 0.5 * (begin + end)
         if after.any() and not after.all():  # by medians, as single references may be wrong
-            error[after] -= np.median(error[after][:_HOLE_EDGE]) - np.median(
-                error[~after][-_HOLE_EDGE:])
+            error[after] -= np.median(error[after][:15]) - np.median(error[~after][-15:])
     return HeadingResidual(error - error.mean())
 
 
@@ -663,7 +650,8 @@ def _refuse_own_reference(log: Log) -> None:
         known = np.isfinite(rate) & np.isfinite(columns).all(axis=1)
         shares = np.linalg.lstsq(columns[known], rate[known], rcond=1e-12)[0]
         left = np.abs(rate[known] - columns[known] @ shares)
+        # by rounding; a second gyro that shares vibration differs by 1e-3 of the noise or more
         if np.count_nonzero(known) > 100 and np.quantile(left, 0.9) < (
-                _OWN_DIFFERENCE_SHARE * white_noise_deviation(columns @ shares, 6)):
+                1e-6 * white_noise_deviation(columns @ shares, 6)):
             raise DataRefused('the reference is computed from this gyro, since it follows its '
                               'noise from sample to sample: give a reference without it')

@@ -78,32 +78,18 @@ TECHNOLOGY_PRIORS = {
 }
 #: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
 MAX_ENCODER_OFFSET = 0.25
-#: Typical duration of a burst of errors of a course, s; their distribution is Student's, with so
-#: many degrees of freedom, plus one for each observed error.
-_BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
-#: Possible random walk of the bias beside a course, rad/s/√s; cosines of a wander of one part.
-_COURSE_RANDOM_WALK_RANGE, WANDER_COSINES = (1e-7, 1e-4), 8
-#: Largest number of corrections of the rate, and error of the scale by a last one.
-_MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
-#: Prior deviations of s and b, rad/s, where gyro and reference disagree by more than a gyro errs;
-#: prior odds of that beside a course that is lost at times, which has no wheels.
-_WIDE_PRIOR, _WIDE_ODDS_OF_COURSE = (0.3, 10.0 * DEGREE), 1e-3
+#: Cosines of a wander that one part of noise describes.
+WANDER_COSINES = 8
+#: Prior deviations of s and b, rad/s, where gyro and reference disagree by more than a gyro errs.
+_WIDE_PRIOR = (0.3, 10.0 * DEGREE)
 #: Prior standard deviation of the smoothing of a course, s².
 _SMOOTHING_DEVIATION = 0.1
-#: Correlations of the errors of a course over a span that are possible.
-_COURSE_CORRELATIONS = (0.0, 0.2, 0.4, 0.6, 0.8)
 #: Names of the values that are always fitted.
 BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 #: Least effective number of stretches of an established value.
 MIN_STRETCHES = 3.0
 #: Distance of trial delays, s, and the largest in standard deviations of the prior.
 _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
-#: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
-_FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
-#: Cosines over which the power spectrum of a rate is averaged: that of white noise to 14 %.
-_SPECTRUM_BINS = 101
-#: Largest angle random walk of a gyro in a vehicle, rad/√s; more white noise is vibration.
-_MAX_VEHICLE_WALK = 5e-4
 #: Least number of spans, and largest deviation in a span from a gyro that follows, rad.
 _MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
 
@@ -364,7 +350,7 @@ class Spans:
     def _motion_share(self) -> Array:
         """Return the share of the motion in the power of each cosine of the rate, shape (m,)."""
         rate = np.asarray(self.channels.rate)
-        power = uniform_filter1d(dct(rate, norm='ortho') ** 2, _SPECTRUM_BINS)
+        power = uniform_filter1d(dct(rate, norm='ortho') ** 2, 101)  # of white noise to 14 %
         return np.maximum(1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300), 0.0)
 
     def _smooth(self, rate: Array) -> Array:
@@ -488,11 +474,10 @@ class Spans:
     def bias_wander(self) -> tuple[Array, list[SharedNoise]]:
         """Return the columns of a wandering bias, and the parts of its noise."""
         least, most = self.walk_bounds
-        flicker, walk = ((low * least, high * most)
-                         for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
+        # rad/s and rad/s/√s; beside a fine reference relative to the angle random walk
         waves, parts = bias_wander_columns(self.time, *(
-            (flicker, walk) if self.treatment.is_fine
-            else (None, _COURSE_RANDOM_WALK_RANGE, WANDER_COSINES)))
+            ((3e-3 * least, 0.5 * most), (1e-4 * least, 0.1 * most)) if self.treatment.is_fine
+            else (None, (1e-7, 1e-4), WANDER_COSINES)))
         assert self.log.time is not None
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
@@ -607,7 +592,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         if difference.is_significant:  # or a heading that was differentiated
             treatment = replace(treatment, errs_as_heading=True)
     else:
-        walks = [min(walks[0], _MAX_VEHICLE_WALK)]
+        walks = [min(walks[0], 5e-4)]  # more is vibration of the vehicle
     by_code = kind == 'encoder' and encoder_step(reference) > 0.0 and (at == time).all()
     if by_code:
         # between two samples with different codes the shaft was in the middle of both
@@ -742,7 +727,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     least = abs(wide.values[0]) - wide.half_width(0)
     probability = 0.0 if is_lost and least < NORMAL_QUANTILE_975 * prior[0] else float(expit(
         wide.fit.log_evidence - usual.fit.log_evidence
-        + math.log(_WIDE_ODDS_OF_COURSE if is_lost else 1.0)))
+        + math.log(1e-3 if is_lost else 1.0)))  # what is lost at times has no wheels
     likelier = wide if probability > 0.5 else usual
     if min(probability, 1.0 - probability) < 0.025:  # an interval of 95 % does not contain it
         return likelier
@@ -761,7 +746,7 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Arr
     delayed = replace(spans, delay=spans.delay or _find_delay(spans))
     point_variances: Array = np.ones(count + 1)
     scale = 0.0
-    for number in range(_MAX_CORRECTIONS):
+    for number in range(20):
         design = design_matrix(delayed, causes)
         if spans.treatment.is_fine:
             values = _robust_least_squares(design, delayed.observed, free)[0]
@@ -776,7 +761,7 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Arr
             point_variances = _point_variances(left[:count])
         delayed, change, scale = corrected, values[0] - scale, values[0]
         # the columns are of the rate by the scale before
-        if number and abs(scale * change) < _SCALE_TOLERANCE:
+        if number and abs(scale * change) < 1e-4:
             break
     return delayed, point_variances
 
@@ -850,10 +835,11 @@ def _fit_headings(spans: Spans, design: Array, point_variances: Array,
 
 def _burst_variance(time: Array, error: Array) -> Array:
     """Return the variance of each point of a course relative to the usual one."""
-    around = np.abs(time[:, None] - time) <= 0.5 * _BURST_DURATION
+    around = np.abs(time[:, None] - time) <= 2.5  # bursts of errors last for about 5 s
     squares, count = around @ error ** 2, around.sum(axis=1)
     usual = max(float(np.median(squares / count)), 1e-12)
-    return np.asarray((_STUDENT_DOF + squares / usual) / (_STUDENT_DOF + count))
+    # Student's distribution with 4 degrees of freedom, and one for each observed error
+    return np.asarray((4.0 + squares / usual) / (4.0 + count))
 
 
 def _point_variances(left: Array) -> Array:
@@ -898,7 +884,7 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     else:
         walk, size = _reference_walk(spans, fit_with) if spans.adds_up else (None, None)
         greatest, likeliest = -math.inf, None
-        for over_span in _COURSE_CORRELATIONS:
+        for over_span in (0.0, 0.2, 0.4, 0.6, 0.8):
             correlation = over_span ** (np.diff(spans.time) / spans.treatment.min_span)
             evidence = fit_with(correlation, walk, size).log_evidence
             if evidence < greatest:

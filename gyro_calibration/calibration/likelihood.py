@@ -33,7 +33,7 @@ from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, 
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import helmert
+from scipy.linalg import helmert, orth
 from scipy.special import softmax
 
 
@@ -160,15 +160,9 @@ class _Increments:
     wander_count: int = 0  # number of the last columns, of a wandering bias
 
 
-#: Sizes of a rate random walk of the bias that are possible, rad/s/√s.
-_RATE_RANDOM_WALKS = np.geomspace(1e-7, 1e-2, 6)
 MAX_BLOCK_DURATION = 0.5  # s
 #: Prior standard deviations: of the error of the present delay, s, and of the lag, s².
 DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
-#: Two offsets fit equally well if the ratio of their misfits is below this.
-_MAX_MISFIT_RATIO = 1.5
-#: Rate and acceleration are differences over this time to either side, s, or an interval.
-_MIN_SMOOTHING_TIME = 0.01
 
 
 class _RunAlignment:
@@ -179,7 +173,8 @@ class _RunAlignment:
         self._time, self._rate = time, rate
         self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
-        self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
+        # rate and acceleration are differences over this time to either side, s
+        self._smoothing_time = max(float(np.median(np.diff(time))), 0.01)
         self._acceleration_time = self._smoothing_time
         self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
         self._block_duration = block_duration(motion)
@@ -221,8 +216,9 @@ class _RunAlignment:
             wander, (part,) = bias_wander_columns(means[:, 1], bias_instability=None)
             columns, count = np.column_stack([columns, wander]), wander.shape[1]
             prior = np.append(prior, np.sqrt(part.variance))
-            prior_factors = np.array([np.append(factors, np.full(count, size))
-                                      for factors in prior_factors for size in _RATE_RANDOM_WALKS])
+            prior_factors = np.array([
+                np.append(factors, np.full(count, size))  # of the walk, rad/s/√s
+                for factors in prior_factors for size in np.geomspace(1e-7, 1e-2, 6)])
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
@@ -290,8 +286,7 @@ class _RunAlignment:
         fine = np.arange(-5, 6) * 0.002
         deepest = [min((self._misfit(offset), offset) for offset in bottom + fine)
                    for bottom in bottoms]
-        alike = [offset
-                 for misfit, offset in deepest if misfit <= _MAX_MISFIT_RATIO * min(deepest)[0]]
+        alike = [offset for misfit, offset in deepest if misfit <= 1.5 * min(deepest)[0]]
         return float(min(alike, key=abs))
 
     def _misfit(self, offset: float) -> float:
@@ -342,7 +337,7 @@ def _select_reference_points(motion: Motion, block: float, slip_deviation: float
     rests = np.ones(shared.shape[1])
     return _ReferencePoints(
         time, heading, variance, np.column_stack([_shaft_columns(heading), shared]),
-        np.append(np.full(2, _SHAFT_ERROR_DEVIATION), step / math.sqrt(12.0) * rests),
+        np.append(np.full(2, math.radians(1.0)), step / math.sqrt(12.0) * rests),
         np.array([[factor, factor, *rests] for factor in _PRIOR_FACTORS]))
 
 
@@ -361,17 +356,8 @@ def correct_shaft(heading: Array, sizes: Array) -> Array:
 
 #: Standard deviation of the scale factor error by which the two senses of turning may differ.
 ASYMMETRY_DEVIATION = 1e-4
-#: Prior standard deviation of the differences between turns in the lag of a robot, s².
-_TURN_LAG_DEVIATION = 0.02
-#: Largest number of groups of neighbouring turns with a delay and a lag of their own.
-_MAX_TURN_GROUPS = 12
-#: A response of higher order, as of a robot that overshoots, as second differences of the
-#: heading: their times, s, and prior standard deviation, 1.
-_RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.2 * np.arange(1, 5), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
 _PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
-#: Largest prior deviation of an error of a shaft once in a revolution, rad.
-_SHAFT_ERROR_DEVIATION = math.radians(1.0)
 
 
 def tracking_error_columns(motion: Motion, time: Array,
@@ -393,19 +379,19 @@ def tracking_error_columns(motion: Motion, time: Array,
     sense, acceleration = np.sign(rate), np.gradient(rate, time)
     heading_change = np.diff(heading, prepend=heading[:1])[:, None]
     turn = np.where(sense, np.cumsum((sense != 0.0) & (np.diff(sense, prepend=0.0) != 0.0)), 0)
-    count = min(int(turn.max()), _MAX_TURN_GROUPS)
+    count = min(int(turn.max()), 12)  # groups of turns with a delay and a lag of their own
     if count < 2:
         return np.empty((len(time), 0)), np.empty(0), np.ones((1, 0))
     inside = (-(-turn * count // turn.max()))[:, None] == np.arange(1, count + 1)
     # the mean over the turns is delay, lag and scale
     contrasts = helmert(count).T
     columns = [rate[:, None] * (inside @ contrasts), acceleration[:, None] * (inside @ contrasts)]
-    columns.append(
-        np.column_stack([heading - 2.0 * motion.heading_at(time - late)
-                         + motion.heading_at(time - 2.0 * late) for late in _RESPONSE_DELAYS]))
+    delays = 0.2 * np.arange(1, 5)  # of a response of higher order, as of overshooting, s
+    columns.append(np.column_stack([heading - 2.0 * motion.heading_at(time - late)
+                                    + motion.heading_at(time - 2.0 * late) for late in delays]))
     deviations = [np.full(count - 1, DELAY_DEVIATION),
-                  np.full(count - 1, _TURN_LAG_DEVIATION),
-                  np.full(len(_RESPONSE_DELAYS), _RESPONSE_DEVIATION)]
+                  np.full(count - 1, 0.02),  # of the lag, s²
+                  np.full(len(delays), 0.3)]
     slips = np.ones(1)
     if slip_deviation:
         ending = inside & (rate * acceleration < 0.0)[:, None]
@@ -415,7 +401,7 @@ def tracking_error_columns(motion: Motion, time: Array,
         slips = _PRIOR_FACTORS
     of_response, of_slips = (each.reshape(-1, 1) for each in np.meshgrid(_PRIOR_FACTORS, slips))
     prior_factors = np.hstack([
-        np.repeat(of_response, 2 * count - 2 + len(_RESPONSE_DELAYS), axis=1),
+        np.repeat(of_response, 2 * count - 2 + len(delays), axis=1),
         np.repeat(of_slips, (2 * count - 1) * bool(slip_deviation), axis=1)])
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(heading_change), axis=0))
@@ -440,7 +426,7 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
                           if len(time) else time)
     relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
                                   np.clip(relative_deviation * np.diff(motion.time)[index] / step,
-                                          _MIN_CROSSING_DEVIATION, 1.0))
+                                          0.05, 1.0))
     # the accuracy of a reference is seldom that of its slowest steps
     relative_deviation = (np.maximum(relative_deviation, np.median(relative_deviation))
                           if len(time) else relative_deviation)
@@ -448,10 +434,6 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     edges = (change[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
     return _ReferencePoints(time[edges], heading[edges], relative_deviation[edges] ** 2,
                             np.zeros((int(edges.sum()), 2)))
-
-
-#: Least standard deviation of a heading where an encoder steps, in units of that of a reading.
-_MIN_CROSSING_DEVIATION = 0.05
 
 
 def _find_constant_readings(motion: Motion, step: float, block: float) -> _ReferencePoints:
@@ -553,10 +535,6 @@ class _Estimate:
         return noise[:, None] * (self.weighted @ self.inverse[:2].T)
 
 
-#: Variance of a block's reference noise over what the rate noise adds from block to block.
-_NOISE_RATIOS = np.geomspace(1e-3, 1e5, 25)
-
-
 def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Array,
                     prior: Array) -> _Estimate:
     """Solve the weighted normal equations, and compute the likelihood of noise and prior."""
@@ -598,8 +576,9 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
     An error of the shaft is included only where the likelihoods show it: over less than a
     revolution it has nearly the effect of a scale factor error. Errors that repeat count once.
     """
+    # variance of a block's reference noise over what the rate noise adds from block to block
     typical = float(np.median(data.walk_variance) / np.median(data.reference_variance))
-    noises = [_IncrementCovariance(data, ratio) for ratio in _NOISE_RATIOS * typical]
+    noises = [_IncrementCovariance(data, ratio) for ratio in np.geomspace(1e-3, 1e5, 25) * typical]
     estimates = [_solve_weighted(data, noise, weighted, data.prior_deviation * factors)
                  for noise in noises for weighted in [noise.solve(_instrument(data, noise))]
                  for factors in prior_factors]
@@ -821,15 +800,13 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
         if alignment.has_shaft:
             alignment.set_shaft_error(estimate.values[4:6] / _nonzero_scale(estimate.values[0]))
         if (len(prior_factors) == len(data.prior_factors)
-                and abs(offset - before) < _OFFSET_TOLERANCE
+                and abs(offset - before) < 1e-3
                 and np.abs(alignment.shaft_error ** 2 - shaft_error ** 2).max() < 1e-6):
             break
     assert estimate is not None
     return offset, data, values, covariance, estimate, response_deviation
 
 
-#: The noise is estimated again where the offset changed by more than this, s.
-_OFFSET_TOLERANCE = 1e-3
 #: Largest additional delay of a robot that follows its profile with a lag, s.
 MAX_TRACKING_LAG = 0.25
 
@@ -874,10 +851,8 @@ class DeviatingStretch:
     column_squares: Array
 
 
-#: A turn beside the profile, by hand or a slip: standard deviation, rad/s, and prior odds.
-EXCESS_RATE_DEVIATION, _EXCESS_TURN_ODDS = 0.0175, 0.1
-#: Largest number of places of a run at which a stretch begins or ends.
-_MAX_EDGES = 150
+#: Standard deviation of a turn beside the profile, by hand or a slip, rad/s.
+EXCESS_RATE_DEVIATION = 0.0175
 
 
 def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
@@ -894,7 +869,7 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     noise_deviation = max(
         robust_deviation(robust) * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
     edges = np.unique(
-        np.linspace(0, len(robust), min(len(robust), _MAX_EDGES) + 1).astype(np.intp))
+        np.linspace(0, len(robust), min(len(robust), 150) + 1).astype(np.intp))
     steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)
     prior = noise_deviation / estimate.prior_deviation
     found = find_deviating_stretch(
@@ -914,8 +889,8 @@ def _average_over_stretch(
         (estimate.dof - 1.0) * np.log1p(-np.minimum(
             found.all_explained_squares / total_squares, 1.0 - 1e-15))
         + np.log1p(found.column_squares * (EXCESS_RATE_DEVIATION / noise_deviation) ** 2))
-    odds = (_EXCESS_TURN_ODDS * float(np.exp(np.minimum(logarithms, 100.0)).sum())
-            / max(len(logarithms), 1))  # the mean over all stretches, each against none
+    # prior odds of 0.1, times the mean over all stretches, each against none
+    odds = 0.1 * float(np.exp(np.minimum(logarithms, 100.0)).sum()) / max(len(logarithms), 1)
     widened = replace(data, columns=np.insert(data.columns, 4, stretch_column, axis=1),
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
     other = _solve_weighted(widened, estimate.noise, estimate.noise.solve(widened.columns),
@@ -932,17 +907,15 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
     Given are white columns of the fit, (n, k), the addition of a turn of 1 rad/s from each edge
     on, (n, m), of which the last is the end, and what is fitted, (n,).
     """
-    basis, singular, _ = np.linalg.svd(
-        columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    basis = basis[:, singular > 1e-7]
+    basis = orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), 1e-7)
     step_residuals = steps - basis @ (basis.T @ steps)
     sums, products, whole = (step_residuals.T @ observed, step_residuals.T @ step_residuals,
                              steps.T @ steps)
     differences = sums[:, None] - sums
     norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
                      for matrix in (products, whole))
-    # neither stretches that scale and bias explain nearly as well, nor empty ones
-    distinct = np.triu(norms > _MIN_DISTINCT_SHARE * wholes, 1)
+    # no empty stretches, nor those of which the fit explains 80 %: noise gives them large turns
+    distinct = np.triu(norms > 0.2 * wholes, 1)
     gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
     first, last = np.unravel_index(int(gains.argmax()), gains.shape)
     gain = float(gains[first, last])
@@ -950,7 +923,3 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
         int(first), int(last), float(differences[first, last] / max(norms[first, last], 1e-300)),
         gain, float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
         gains[distinct], norms[distinct])
-
-
-#: Fraction of a stretch that a fit must not explain; with less, noise gives it a large turn.
-_MIN_DISTINCT_SHARE = 0.2

@@ -24,6 +24,7 @@ the motion; that of s depends on the motion.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 import math
@@ -41,8 +42,6 @@ from scipy.special import ndtri
 
 #: Cells in which the noise is counted, in one block of the fit, and points of the motion in each.
 _CELLS_PER_BLOCK = 5
-#: Largest number of cells of the drive, of 1 s or longer.
-_MAX_DRIVE_CELLS = 600
 #: Median of the absolute value of a normal variable, standard deviations.
 _MEDIAN_SIGMA = float(ndtri(0.75))
 
@@ -110,7 +109,7 @@ class CalibrationForecast:
         """
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
-        cells = min(max(round(drive_duration), 1), _MAX_DRIVE_CELLS)
+        cells = min(max(round(drive_duration), 1), 600)
         time = np.linspace(0.0, drive_duration, cells + 1)[1:]
         rounds = np.floor(time / drive.duration)  # the drive begins again where it ended
         heading = rounds * drive.heading[-1] + drive.heading_at(time - rounds * drive.duration)
@@ -218,21 +217,12 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
             ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
 
 
-@dataclass(frozen=True)
-class _Turn:
-    """One turn through an angle, rad, signed, at a rate above 0, rad/s, and its rest after, s."""
-
-    angle: float
-    rate: float
-    rest: float
-
-
-def _build_motion(robot: RobotLimits, turns: list[_Turn]) -> Motion:
-    """Return the motion of a rest and then turns; angles are large enough for their rates."""
+def _build_motion(robot: RobotLimits, turns: Iterable[tuple[float, float, float]]) -> Motion:
+    """Return a rest, then turns of angle, rad, signed, rate above 0, rad/s, and rest after, s."""
     time, rate = [0.0, robot.rest], [0.0, 0.0]
-    for turn in turns:
+    for angle, speed, rest in turns:
         # a ramp: times, s, and fractions of the rate from 0 to 1; rounded where jerk is limited
-        rising, rounding = robot.ramp_times(turn.rate)
+        rising, rounding = robot.ramp_times(speed)
         since, share = np.array([0.0, rising]), np.array([0.0, 1.0])
         if rounding:
             since = np.linspace(0.0, rising + rounding, 17)
@@ -240,14 +230,14 @@ def _build_motion(robot: RobotLimits, turns: list[_Turn]) -> Motion:
                        for begin in (0.0, rising, rounding, rising + rounding)]
             share = (squares[0] - squares[1] - squares[2] + squares[3]) / (
                 2.0 * rising * rounding)
-        steady = abs(turn.angle) / turn.rate - robot.ramp_duration(turn.rate)
+        steady = abs(angle) / speed - robot.ramp_duration(speed)
         up = time[-1] + since[1:]
         down = time[-1] + since[1:] + since[-1] + max(steady, 0.0)
-        rates = math.copysign(turn.rate, turn.angle) * share
+        rates = math.copysign(speed, angle) * share
         time += [*up, *([down[0] - since[1]] if steady > 1e-9 else []), *down]
         rate += [*rates[1:], *([rates[-1]] if steady > 1e-9 else []), *rates[-2::-1]]
-        if turn.rest > 1e-9:
-            time.append(time[-1] + turn.rest)
+        if rest > 1e-9:
+            time.append(time[-1] + rest)
             rate.append(0.0)
     return motion_from_rates(np.array(time), np.array(rate))
 
@@ -296,8 +286,7 @@ class _MotionFamily:
                 or (np.abs(angles) < rates * ramps).any()):
             return None
         rests = np.append(np.full(count - 1, max(left, 0.0) / (count - 1)), robot.rest)
-        return _build_motion(robot, [_Turn(*values) for values in zip(
-            angles.tolist(), rates.tolist(), rests.tolist())])
+        return _build_motion(robot, zip(angles.tolist(), rates.tolist(), rests.tolist()))
 
 
 @dataclass(frozen=True)
@@ -364,8 +353,8 @@ def plain_motion(robot: RobotLimits, duration: float) -> Motion:
     angle = min(place, rate * (half - robot.ramp_duration(rate)))
     between = 2.0 * (half - angle / rate - robot.ramp_duration(rate))
     side = 1.0 if robot.highest == place else -1.0
-    return _build_motion(robot, [_Turn(side * angle, rate, between),
-                                 _Turn(-side * angle, rate, robot.rest)])
+    return _build_motion(
+        robot, [(side * angle, rate, between), (-side * angle, rate, robot.rest)])
 
 
 def can_follow(robot: RobotLimits, motion: Motion) -> bool:

@@ -27,8 +27,7 @@ _LONGEST_INTERVAL = 1.0
 MAX_GYRO_LAG = 0.1
 #: Step of a heading from which on it is that of an encoder, whose changes are exact, rad.
 MAX_ROUNDING_STEP = 2e-4
-#: Largest change of the slope on a line as a share of the usual slope; least number of instants.
-_MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
+_MIN_INSTANTS = 20
 
 
 class OwnInstants(NamedTuple):
@@ -99,7 +98,7 @@ def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array
     slope = np.diff(values) / np.diff(time)
     usual = float(np.mean(np.abs(slope)))
     rounding = 2.0 * step / float(np.diff(time).min()) if step < MAX_ROUNDING_STEP else 0.0
-    runs = find_runs(np.abs(np.diff(slope)) <= max(_MAX_SLOPE_CHANGE * usual, rounding))
+    runs = find_runs(np.abs(np.diff(slope)) <= max(1e-3 * usual, rounding))
     first, last = np.array([(run.start, run.stop + 1) for run in runs],
                            dtype=np.intp).reshape(-1, 2).T
     # two corners within two samples each leave one interval in between on a line of its own

@@ -31,16 +31,8 @@ from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
-#: Trial delays of the gyro, and those around the best, s; and the rows that are compared.
-_TRIAL_DELAYS, _FINE_DELAYS = (0.1 * np.arange(-15.0, 16.0)).tolist(), 0.01 * np.arange(-9.0, 10.0)
-_TRIAL_ROWS = 5000
-#: Largest error of an exact reference heading as a share of the difference over a second.
-_MAX_HEADING_ERROR_SHARE = 0.25
-#: Standard deviations from which on noise of a rate that is not white is detected, share of the
-#: log that is quietest, and samples of a block.
-_DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
-#: Number of spans of a log whose scatter is estimated: to 4 %.
-_USUAL_SPANS = 500
+#: Samples of a block.
+_BLOCK_SAMPLES = 25
 #: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
 #: the errors of an encoder are at most so many times its rounding error.
 _MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
@@ -49,8 +41,6 @@ _MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
 _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Least noise of a course, rad, over a second or from span to span; RTK in town has 0.4 deg.
 MIN_COURSE_NOISE = 0.25 * DEGREE
-#: Time for which a recorder misses a reference that is not lost, at its begin or end, s.
-_MAX_LATE_START = 0.1
 #: Largest ratio of 90 % to 99 % quantile of second differences of straight lines between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
 
@@ -115,8 +105,8 @@ class HeadingDifference:
     @property
     def is_significant(self) -> bool:
         """Tell whether the error is a significant part of the difference over a second."""
-        # a simulated log without noise has numerical errors of 1e-9 rad
-        return self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk, 1e-9)
+        # a fifth of the variance; a simulated log without noise has numerical errors of 1e-9 rad
+        return self.constant_error > max(0.25 * self.total_walk, 1e-9)
 
 
 def heading_difference(log: Log) -> HeadingDifference:
@@ -163,11 +153,12 @@ def heading_difference(log: Log) -> HeadingDifference:
                    - by_output, 0.0)
 
     # a delay that explains less than half is chance
-    usual, delay, every = find_variance(longest, 0.0), 0.0, max(len(time) // _TRIAL_ROWS, 1)
+    usual, delay, every = find_variance(longest, 0.0), 0.0, max(len(time) // 5000, 1)
+    coarse = (0.1 * np.arange(-15.0, 16.0)).tolist()
     if tried := [each for each in ((find_variance(longest, trial, every), trial)
-                                   for trial in _TRIAL_DELAYS) if each[0] < 0.5 * usual]:
+                                   for trial in coarse) if each[0] < 0.5 * usual]:
         delay = min((find_variance(longest, near, every), near)
-                    for near in (min(tried)[1] + _FINE_DELAYS).tolist())[1]
+                    for near in (min(tried)[1] + 0.01 * np.arange(-9.0, 10.0)).tolist())[1]
     variance = {lag / longest: find_variance(lag, delay) for lag in (
         *(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest)}
     variance = {part: each for part, each in variance.items() if not math.isnan(each)}
@@ -215,7 +206,7 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
         # by the blocks on both sides, as one may be quiet by chance; one with far more energy than
         # these is a motion between two rests
         sides = np.maximum(np.roll(energies, 1), np.roll(energies, -1))
-        most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
+        most = np.quantile(sides, min(max(0.03, 8.0 / blocks), 1.0))
         quiet = np.repeat((sides <= most) & (energies <= 3.0 * most), block)
         part = every[:len(quiet)][quiet]
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
@@ -233,7 +224,7 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
         # third differences of white noise are correlated over three samples
         deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
         variance = float(np.mean(product)) / line[0]
-        if not variance > _DETECTION_SIGMAS * deviation:
+        if not variance > 3.0 * deviation:
             return 0.0
     gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
@@ -250,7 +241,8 @@ def is_course(log: Log) -> bool:
         return False
     stamps, (first, last) = log.time[rows], rows[[0, -1]]
     at_ends = max(stamps[0] - log.time[0], log.time[-1] - stamps[-1])
-    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), _MAX_LATE_START)
+    # a recorder does not begin, nor end, to receive all topics at once
+    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), 0.1)
             and not find_lost_reference(known[first:last + 1]).any()):
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
@@ -272,7 +264,7 @@ def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> 
     By medians, they are the standard deviations of its second difference over halves of the span,
     as of the end of a random walk, and of its change beyond the bias; 0 where no span is known.
     """
-    starts = np.linspace(time[0], time[-1] - span, _USUAL_SPANS)
+    starts = np.linspace(time[0], time[-1] - span, 500)
     first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
                            for share in (0.0, 0.5, 1.0))
     changes = np.array([first - 2.0 * middle + last, last - first - bias * span])

@@ -29,9 +29,8 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-#: Shortest pieces in which motions are compared, and step of the tried offsets, s; most pieces:
-#: the time of the search is proportional to their cube.
-_TRIAL_STEP, _MAX_PIECES = 0.1, 650
+#: Shortest pieces in which motions are compared, and step of the tried offsets, s.
+_TRIAL_STEP = 0.1
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
 MAX_UNEXPLAINED_SHARE = 0.1
 #: Factor by which a motion with a deviating stretch must leave less than one without.
@@ -114,7 +113,7 @@ class RunPieces:
 def split_run(time: Array, rate: Array) -> RunPieces:
     """Return a run in pieces."""
     length = max(_TRIAL_STEP, 2.0 * float(np.median(np.diff(time))),
-                 float(time[-1] - time[0]) / _MAX_PIECES)
+                 float(time[-1] - time[0]) / 650)  # the time is proportional to the cube of this
     edges = np.arange(time[0], time[-1], length)
     return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
 

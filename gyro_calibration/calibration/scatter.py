@@ -40,7 +40,7 @@ from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_
 from gyro_calibration.logs.quality import robust_deviation
 from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import softmax
 from scipy.stats import t as student
@@ -204,7 +204,7 @@ def find_inliers(dwells: Dwells) -> Mask:
         parts = _sweep_numbers(dwells)
         own = (parts[:, None] == np.arange(parts.max() + 1)).astype(float)
         turning = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
-        extended = _orthonormal_basis(np.column_stack([columns, own, own * turning[:, None]]))
+        extended = orth(np.column_stack([columns, own, own * turning[:, None]]), 1e-4)
         if 2 * extended.shape[1] <= len(dwells):
             columns = extended
     residual = np.abs(robust_residual(columns, dwells.output - dwells.rate, 20))
@@ -228,13 +228,7 @@ def _smooth_surface(dwells: Dwells) -> Array:
     products = [rate ** i * temperature ** j for i, j in powers]
     columns = np.column_stack([*products[:4], np.abs(rate),
                                *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
-    return _orthonormal_basis(columns)
-
-
-def _orthonormal_basis(columns: Array) -> Array:
-    """Return orthonormal columns that span others, shape (n, m)."""
-    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, sizes > 1e-4 * sizes[0]]
+    return np.asarray(orth(columns, 1e-4))
 
 
 def surface_dof(dwells: Dwells) -> int:

@@ -43,8 +43,6 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
-#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn.
-_MAX_WHEEL_SLIP = 0.01
 #: Standard deviations from which on a stretch is a slip: 6 of 800 good runs exceed it, and 1 deg,
 #: with three times the noise of the XV-3500, none with its own.
 _MIN_SLIP_SIGMAS = 4.5
@@ -90,9 +88,8 @@ class ReferenceErrors:
 
 
 def default_reference_errors(motion: Motion) -> ReferenceErrors:
-    """Return the usual errors of a reference whose errors are not given: commanded rates slip."""
-    commanded = motion.rate is not None
-    return ReferenceErrors(_MAX_WHEEL_SLIP / math.sqrt(3.0)) if commanded else ReferenceErrors()
+    """Return the usual errors: at commanded rates wheels slip by up to 1 % of each turn."""
+    return ReferenceErrors(0.0 if motion.rate is None else 0.01 / math.sqrt(3.0))
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
