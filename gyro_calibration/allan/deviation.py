@@ -288,7 +288,7 @@ def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, 
 
 
 def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
-    """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
+    """Return twice the squared variance over its own variance, shape (n,)."""
     # Those of the random term that fits the slope of each Allan variance best, from half to twice
     # each time. Quantization is assumed at the short end only; a steep slope elsewhere is chance.
     low = np.searchsorted(sizes, sizes / 2.0)
@@ -297,18 +297,13 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
     slopes = np.where(
         high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
     steep, freedom = int(np.argmin(np.append(slopes < -1.5, False))), []
-    for place, (size, slope) in enumerate(zip(sizes.tolist(), slopes)):
-        part = QUANTIZATION_NOISE if place < steep else min(
+    for number, (size, slope) in enumerate(zip(sizes.tolist(), slopes)):
+        part = QUANTIZATION_NOISE if number < steep else min(
             (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK),
             key=lambda term: abs(2.0 * term.slope - slope))
-        count = samples + 1 - 2 * size
-        # the covariance of quantization is nonzero at single lags only
-        stride = 1 if part is QUANTIZATION_NOISE else max(1, size // _LAGS_PER_WINDOW)
-        lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
-        squares = (_lag_covariance(part.angle_covariance, size, size, lags) ** 2 * (count - lags)
-                   * stride)
-        freedom.append(
-            max(1.0, float(squares[0]) * count / stride / float(2.0 * squares.sum() - squares[0])))
+        place = NOISE_TERMS.index(part)
+        freedom.append(max(1.0, 2.0 * float(part.allan_variance(size)) ** 2
+                           / float(covariance_form(samples, size, size)[place, place])))
     return np.array(freedom)
 
 

@@ -263,15 +263,6 @@ def few_values_remedy(time: Array, known: Mask, wanted: int) -> str:
     return f'record longer, {math.ceil(duration)} s at the interval of the reference'
 
 
-def interpolate_reference(time: Array, values: Array) -> Array:
-    """Return a slow reference at each sample, linear between its values; nan where it is lost."""
-    known = np.isfinite(values)
-    if known.all() or not known.any():
-        return values
-    return np.where(find_lost_reference(known), np.nan,
-                    np.interp(time, time[known], values[known], np.nan, np.nan))
-
-
 class NothingSteady(DataRefused):
     """The reference of a log in time is hardly ever steady, so that it shows no dwells."""
 

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
-    interpolate_reference, join_dwells, MIN_DWELL_SHARE, NothingSteady)
+    join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
     COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
     TECHNOLOGY_PRIORS, WANDER_COSINES)
@@ -131,10 +131,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
     time, output, motion, crossing = _extract_motion(log)
     if method is None:
         method = 'likelihood'
-        if log.reference_heading is not None and log.time is not None:
-            sampled = replace(log, reference_heading=interpolate_reference(
-                log.time, log.reference_heading))
-            method = 'course' if is_course(sampled) or is_noisy(sampled) else 'likelihood'
+        if log.reference_heading is not None:
+            method = 'course' if is_course(log) or is_noisy(log) else 'likelihood'
             longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
             if longest < 0.5 * motion.duration and (
                     hole := _find_turn_in_hole(time, output, motion)):

@@ -191,6 +191,16 @@ class Spans:
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
 
+    @property
+    def stamps(self) -> Array:
+        """Return the stamps of the gyro, s, shape (m,)."""
+        return np.asarray(self.log.time)
+
+    @property
+    def output(self) -> Array:
+        """Return its output, rad/s, shape (m,)."""
+        return np.asarray(self.log.output)
+
     @cached_property
     def cross_rotation(self) -> Array:
         """Return the rotation of the reference about the cross axes, rad, (m, 2) or (m, 0)."""
@@ -199,10 +209,9 @@ class Spans:
     @cached_property
     def is_measured(self) -> Mask:
         """Tell which spans and rests the output covers, shape (n + r,)."""
-        assert self.log.time is not None
         at, margin = self.gyro_stamps(self.time), 0.5 * float(np.median(np.diff(self.time)))
         first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
-                                      self.log.time[self.rests]]).T
+                                      self.stamps[self.rests]]).T
         begin, end = self.holes[:, :, None].transpose(1, 0, 2)
         covered = (self.time_outside[:-1] >= 0.0) & (self.time_outside[1:] <= 0.0)
         return np.asarray(~((begin < last) & (end > first)).any(axis=0)
@@ -211,9 +220,8 @@ class Spans:
     @property
     def time_outside(self) -> Array:
         """Return the mean time of each point before the log, or after it, s, shape (n + 1,)."""
-        assert self.log.time is not None
         at = self.gyro_stamps(self.value_times)
-        outside = at - np.clip(at, self.log.time[0], self.log.time[-1])
+        outside = at - np.clip(at, self.stamps[0], self.stamps[-1])
         return np.bincount(self.point_index, outside) / np.bincount(self.point_index)
 
     @property
@@ -271,8 +279,7 @@ class Spans:
     @cached_property
     def time_in_motion(self) -> Array:
         """Return the time without the rests, s, shape (m,)."""
-        assert self.log.time is not None
-        return integrate(self.log.time, self.is_in_motion.astype(float))
+        return integrate(self.stamps, self.is_in_motion.astype(float))
 
     @property
     def angles(self) -> Array:
@@ -289,8 +296,7 @@ class Spans:
     @property
     def rest_durations(self) -> Array:
         """Return the length of each rest, s, shape (r,)."""
-        assert self.log.time is not None
-        return np.diff(self.log.time[self.rests])[:, 0]
+        return np.diff(self.stamps[self.rests])[:, 0]
 
     @cached_property
     def rest_rounding(self) -> float:
@@ -298,7 +304,7 @@ class Spans:
         rows = mark_rows(self.rests, len(self.log))
         if not (self.output_step and rows.any()):
             return 0.0
-        output = np.asarray(self.log.output)
+        output = self.output
         variance = np.average([np.var(output[first:last + 1]) for first, last in self.rests],
                               weights=np.diff(self.rests)[:, 0]) / self.output_step ** 2
         if variance > 0.25:  # as with a noise of half a step, which averages it out
@@ -312,8 +318,7 @@ class Spans:
 
     def point_means(self, values: Array, slopes: Array | None = None) -> Array:
         """Return the means of a signal at the delayed points, linear or with slopes, (n + 1,)."""
-        assert self.log.time is not None
-        time = self.log.time
+        time = self.stamps
         # a change of code is the mean of two samples, between which the signal may be curved
         half = 0.5 * self.uses_code_changes * float(np.median(np.diff(time)))
         total: Array = np.zeros(len(self.time))
@@ -325,10 +330,9 @@ class Spans:
 
     def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
-        assert self.log.time is not None
-        rate = np.broadcast_to(rate, self.log.time.shape)
+        rate = np.broadcast_to(rate, self.stamps.shape)
         moving: Array = rate * self.is_in_motion
-        whole, in_motion = (integrate_with_curvature(self.log.time, each)
+        whole, in_motion = (integrate_with_curvature(self.stamps, each)
                             for each in (rate, moving))
         return self.is_measured * np.append(np.diff(self.point_means(in_motion, moving)),
                                             np.diff(whole[self.rests])[:, 0])
@@ -341,10 +345,9 @@ class Spans:
     @property
     def observed(self) -> Array:
         """Return the change of the reference less that of the integral of the output, (n + r,)."""
-        assert self.log.output is not None
         turned = np.append(np.diff(self.heading), np.zeros(len(self.rests)))
         return self.is_measured * turned - (1.0 + self.clock_rate) * self.span_integrals(
-            self.log.output)
+            self.output)
 
     @cached_property
     def _motion_share(self) -> Array:
@@ -380,7 +383,7 @@ class Spans:
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
-        time, heading = np.asarray(self.log.time), np.asarray(self.channels.heading)
+        time, heading = self.stamps, np.asarray(self.channels.heading)
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
@@ -405,7 +408,7 @@ class Spans:
 
     def step_columns(self, times: Array) -> Array:
         """Return the columns of steps of the bias, each between two samples, shape (n + r, k)."""
-        time = np.asarray(self.log.time)
+        time = self.stamps
         between = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), [math.inf]])
         begin, at = between[np.searchsorted(time, times)], self.gyro_stamps(self.value_times)
         # the time in motion since the step, as a mean over the values of each point
@@ -426,7 +429,6 @@ class Spans:
         These are the causes that depend on the rate. Delay and clock rate are added to those of
         spans.
         """
-        assert self.log.output is not None and self.log.time is not None
         errors, clock_rate = values[1], self.clock_rate
         for cause in causes:
             own = values[self.value_slice(causes, cause)]
@@ -436,18 +438,18 @@ class Spans:
                     and 'rate' in CATALOGUE[cause.cause].inputs):
                 errors = errors + sum(size * column for size, column in zip(
                     own, CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)))
-        rate: Array = self.is_in_motion * (self.log.output - errors) / (1.0 + values[0])
+        rate: Array = self.is_in_motion * (self.output - errors) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]), clock_rate=clock_rate)
-        turned = integrate_with_curvature(self.log.time, rate)
+        turned = integrate_with_curvature(self.stamps, rate)
         # the heading of the reference, between its points that of the gyro
-        at = (1.0 + moved.clock_rate) * self.log.time - moved.delay
+        at = (1.0 + moved.clock_rate) * self.stamps - moved.delay
         heading_change: Array = self.heading - moved.point_means(turned, rate)
         if self.treatment.is_fine:
             heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
             rate = rate + (np.diff(heading_change) / np.diff(self.time))[steps]
         return replace(
-            moved, channels=replace(self.channels.with_rate(rate, self.log.output),
+            moved, channels=replace(self.channels.with_rate(rate, self.output),
                                     heading=turned + np.interp(at, self.time, heading_change)))
 
     def _difference_of_gyro(self, heading_change: Array) -> Array:
@@ -478,10 +480,9 @@ class Spans:
         waves, parts = bias_wander_columns(self.time, *(
             ((3e-3 * least, 0.5 * most), (1e-4 * least, 0.1 * most)) if self.treatment.is_fine
             else (None, (1e-7, 1e-4), WANDER_COSINES)))
-        assert self.log.time is not None
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
-        rest_times = np.clip(self.log.time[self.rests], begin, end)[:, :, None] - begin
+        rest_times = np.clip(self.stamps[self.rests], begin, end)[:, :, None] - begin
         rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
         around = np.searchsorted(self.time - begin, rest_times.mean(axis=(1, 2))) - 1
         np.subtract.at(waves, np.clip(around, 0, len(waves) - 1), rows)
@@ -517,11 +518,10 @@ class Spans:
         that share, and what noise in both columns and observations may do, is an error of the lag,
         s².
         """
-        assert self.log.time is not None and self.log.output is not None
-        time, columns = self.log.time, self.base_columns()
+        time, columns = self.stamps, self.base_columns()
         column = self.cause_columns(CauseTerm('bandwidth'))[:, 0]
         turned = np.column_stack([self.point_means(integrate_with_curvature(
-            time, self.log.output), self.log.output), self.heading])
+            time, self.output), self.output), self.heading])
         rates = CubicSpline(self.time, turned)((1.0 + self.clock_rate) * time - self.delay, 1).T
         seen = np.column_stack([column, *(
             -self.span_changes(np.gradient(self._smooth(each), time)) for each in rates),
@@ -542,9 +542,8 @@ class Spans:
 
     def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
-        assert self.log.time is not None and self.log.output is not None
-        turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
-        after, now, before = (np.interp(self.log.time + shift, self.log.time, turned)
+        turned, half = integrate_with_curvature(self.stamps, self.output), 0.5
+        after, now, before = (np.interp(self.stamps + shift, self.stamps, turned)
                               for shift in (half, 0.0, -half))
         return self.span_changes((after - 2.0 * now + before) / half ** 2)
 
@@ -804,11 +803,10 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
 def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
                              point_variances: Array) -> Spans:
     """Return the spans without rests whose rate is not the bias that the course shows."""
-    assert spans.log.output is not None
     by_course = _fit_with_noise(replace(spans, rests=spans.rests[spans.stands],
                                         stands=spans.stands[spans.stands]), causes,
                                 point_variances)
-    rates = np.array([spans.log.output[first:last].mean() for first, last in spans.rests])
+    rates = np.array([spans.output[first:last].mean() for first, last in spans.rests])
     agree = spans.stands | (np.abs(rates - by_course.values[1]) < by_course.half_width(1))
     return replace(spans, rests=spans.rests[agree], stands=spans.stands[agree])
 

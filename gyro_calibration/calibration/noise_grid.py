@@ -11,31 +11,25 @@
 """
 One likelihood for linear regressions whose noise has several parts of unknown size.
 
-The model of ``n`` observations is::
+The model of ``n`` observations is ``observed = columns @ values + shared_columns @ u + e``:
 
-    observed = columns @ values + shared_columns @ u + e
-
-* ``values``, shape (m,), are estimated. Each has a flat prior, or a normal prior with a stated
-  mean and standard deviation.
-* ``e`` has the covariance ``sum(size_k**2 * banded_k)``; each ``banded_k`` is tridiagonal
-  (`BandedNoise`).
+* ``values``, shape (m,), are estimated, with a flat prior, or a normal one.
+* ``e`` has the covariance ``sum(size_k**2 * banded_k)`` of tridiagonal parts (`BandedNoise`).
 * ``u``, shape (q,), has independent elements with variances ``sum(size_j**2 * variance_j)``
-  (`SharedNoise`). It describes errors that many observations have in common: a bias that wanders
-  (`bias_wander_columns`), or the bias of one sweep of a rate table.
+  (`SharedNoise`): errors that many observations have in common, as of a wandering bias.
 
-The sizes are not known. For each point of a grid over them the restricted likelihood (REML:
-``values`` with a flat prior and ``u`` are integrated out) is computed, with ``V`` the covariance
-of ``e`` and ``P`` the prior precision of ``(values, u)``::
+For each point of a grid over the sizes the restricted likelihood (REML: ``values`` with a flat
+prior and ``u`` are integrated out) is computed, with ``V`` the covariance of ``e`` and ``P`` the
+prior precision of ``(values, u)``, of which ``|P|+`` is the product of those that are not zero::
 
     log L = -1/2 [log|V| + log|A| - log|P|+ + y'V⁻¹y - c'A⁻¹c],    A = X'V⁻¹X + P,    c = X'V⁻¹y
 
-where ``|P|+`` is the product of the precisions that are not zero. Estimates and their covariance
-are averaged over the grid, so that the intervals of the values include the uncertainty of the
-noise (law of total variance). The prior of each size is flat in its logarithm within the range
-given. The grid is refined three times around its likely points.
+Estimates and their covariance are averaged over the grid, so that intervals include the
+uncertainty of the noise. The prior of each size is flat in its logarithm within its range. The
+grid is refined three times around its likely points.
 
 Headings at points ``t_0 ... t_n`` become increments over the spans between them (`heading_noise`).
-A gap of the reference is a long span. The parts of the noise of such increments:
+The parts of the noise of such increments:
 
 =================  =========  ==================================================================
 name               unit       noise
@@ -60,8 +54,8 @@ determinant 1, likelihoods of different correlations can be compared (`carried_s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 import math
 
@@ -124,7 +118,7 @@ class GridFit:
     residual: Array
     unobservable_variance: float  # of the shared noise, that looks like one of the values
     _noise: TridiagonalMatrix
-    _carried: Array | None = None
+    _carried: Array | None
 
     @property
     def deviations(self) -> Array:
@@ -330,7 +324,7 @@ class _Regression:
 def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise],
                    shared_columns: Array | None = None, shared: Sequence[SharedNoise] = (),
                    prior_mean: Array | None = None, prior_deviation: Array | None = None,
-                   noisy_column: int | None = None, wandering_value: int | None = None,
+                   wandering_value: int | None = None,
                    hierarchical_priors: Sequence[HierarchicalPrior] = (),
                    carried: Array | None = None) -> GridFit:
     """
@@ -342,9 +336,6 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     banded : parts of the noise; their sum must be positive definite
     shared_columns, shared : of the shared values, shape (n, q), and parts of their variances
     prior_mean, prior_deviation : of the values, shape (m,); infinite deviation for a flat prior
-    noisy_column : number of a column that holds the increments of the reference, whose noise are
-        the parts 'reference' and 'motion'; the column smoothed by what is observed is then the
-        instrument (errors in variables)
     wandering_value : number of the value whose variance includes `unobservable_variance`
     hierarchical_priors : values with a prior of unknown size
     carried : share of the observation before that is subtracted from each, shape (n,); None where
@@ -367,27 +358,27 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     axes = [np.array([low]) if low == high else np.geomspace(low, high, _GRID_POINTS)
             for low, high in (part.size_range for part in regression.parts)]
     for remaining in reversed(range(_GRID_PASSES)):
-        grid = _evaluate_grid(regression, axes)
-        weights = softmax(grid.log_likelihood)
+        sizes, log_likelihoods, all_values, covariances = _evaluate_grid(regression, axes)
+        weights = softmax(log_likelihoods)
         if remaining:
-            axes = [_refine_axis(axis, grid.sizes[:, place], weights, part.size_range)
+            axes = [_refine_axis(axis, sizes[:, place], weights, part.size_range)
                     for place, (axis, part) in enumerate(zip(axes, regression.parts))]
-    unobservable_variance = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
+    unobservable = sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
         [part.unobservable_variance for part in shared])
     if wandering_value is not None:
-        grid.covariance[:, wandering_value, wandering_value] += unobservable_variance
-    return replace(_average_grid(regression, grid, weights, mean, noisy_column,
-                                 float(weights @ unobservable_variance)), _carried=carried)
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Sizes, shape (k, parts), log likelihoods, values, shape (k, m), and their covariances."""
-
-    sizes: Array
-    log_likelihood: Array
-    values: Array
-    covariance: Array
+        covariances[:, wandering_value, wandering_value] += unobservable
+    values, covariance = average_hypotheses(weights, all_values, covariances)
+    best = int(log_likelihoods.argmax())
+    noise = regression.banded_covariance(sizes[best, :len(banded)])
+    _, (likeliest,), _ = regression.solve(
+        noise, regression.prior_precisions(sizes[best: best + 1, len(banded):]))
+    names = [part.name for part in regression.parts]
+    return GridFit(values + mean, covariance,
+                   {name: _interval_95(each, weights) for name, each in zip(names, sizes.T)},
+                   dict(zip(names, sizes[best].tolist())),
+                   float(logsumexp(log_likelihoods)) - math.log(len(weights)),
+                   regression.observed - regression.columns @ likeliest,
+                   float(weights @ unobservable), noise, carried)
 
 
 def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
@@ -408,7 +399,8 @@ def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float,
     return np.exp(np.linspace(low, high, len(axis)))
 
 
-def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
+def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> Iterator[Array]:
+    """Give sizes, (k, parts), log likelihoods, (k,), values, (k, m), and their covariances."""
     banded, count = len(regression.banded), regression.value_count
     inner = np.array(list(product(*axes[banded:])))  # one empty row where nothing is shared
     precisions = regression.prior_precisions(inner)
@@ -418,30 +410,7 @@ def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
             regression.banded_covariance(sizes), precisions)
         found.append((np.column_stack([np.tile(sizes, (len(inner), 1)), inner]), log_likelihood,
                       values[:, :count], inverse[:, :count]))
-    return _Grid(*(np.concatenate(each) for each in zip(*found)))
-
-
-def _average_grid(regression: _Regression, grid: _Grid, weights: Array, mean: Array,
-                  noisy_column: int | None, unobservable_variance: float) -> GridFit:
-    values, covariance = average_hypotheses(weights, grid.values, grid.covariance)
-    best = int(grid.log_likelihood.argmax())
-    banded, count = len(regression.banded), regression.value_count
-    noise = regression.banded_covariance(grid.sizes[best, :banded])
-    precisions = regression.prior_precisions(grid.sizes[best: best + 1, banded:])
-    _, (all_values,), _ = regression.solve(noise, precisions)
-    names = [part.name for part in regression.parts]
-    likeliest_sizes = dict(zip(names, grid.sizes[best].tolist()))
-    if noisy_column is not None:
-        corrected = _errors_in_variables(regression, noise, precisions[0], likeliest_sizes,
-                                         all_values, mean, noisy_column)
-        values = values + (corrected - all_values)[:count]
-        all_values = corrected
-    residual = regression.observed - regression.columns @ all_values
-    return GridFit(values + mean, covariance, {name: _interval_95(grid.sizes[:, place], weights)
-                                               for place, name in enumerate(names)},
-                   likeliest_sizes,
-                   float(logsumexp(grid.log_likelihood)) - math.log(len(weights)),
-                   residual, unobservable_variance, noise)
+    return (np.concatenate(each) for each in zip(*found))
 
 
 def average_hypotheses(weights: Array, values: Array, covariances: Array) -> tuple[Array, Array]:
@@ -461,29 +430,3 @@ def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:
     below = np.cumsum(weights[order]) - 0.5 * weights[order]
     low, high = np.interp([0.025, 0.975], below, np.log(sizes[order]))
     return math.exp(float(weights @ np.log(sizes))), math.exp(low), math.exp(high)
-
-
-def _errors_in_variables(regression: _Regression, noise: TridiagonalMatrix, precision: Array,
-                         likeliest_sizes: Mapping[str, float], values: Array, mean: Array,
-                         column_index: int) -> Array:
-    """Return the values with a noisy column smoothed by what is observed as the instrument."""
-    parts = [(likeliest_sizes[part.name] ** 2, part)
-             for part in regression.banded if part.name in ('reference', 'motion')]
-    for _ in range(3):
-        scale = values[column_index] + mean[column_index]
-        solved = noise.solve(regression.observed - regression.columns @ values)
-        error = np.zeros(len(solved))
-        for variance, part in parts:
-            error += variance * part.diagonal * solved
-            if part.off_diagonal is not None:
-                error[1:] += variance * part.off_diagonal[1:] * solved[:-1]
-                error[:-1] += variance * part.off_diagonal[1:] * solved[1:]
-        instrument = regression.columns.copy()
-        instrument[:, column_index] += error / math.copysign(max(abs(scale), 1e-3), scale)
-        weighted = noise.solve(instrument)
-        normal = weighted.T @ regression.columns + np.diag(precision)
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(normal)), 1e-300))
-        values = sizes * np.linalg.lstsq(normal * np.outer(sizes, sizes),
-                                         sizes * (weighted.T @ regression.observed),
-                                         rcond=1e-13)[0]
-    return values
