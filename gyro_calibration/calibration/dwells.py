@@ -16,8 +16,6 @@ heading, or the integral of the reference rate, is a straight line but for the s
 Ramps, the settling of the gyro after them, outliers and repeated samples are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress

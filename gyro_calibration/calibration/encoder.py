@@ -11,18 +11,13 @@
 """
 Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
 
-The input is a log in time with a reference heading. There are two methods: the likelihood of the
-headings, and the regression of a course over ground.
-
-The error of an encoder is constant while its reading is, and known where the reading changes by a
-step; so readings are used at their steps. An error of step / sqrt(12) at each sample would give
-rests too much weight: with 0.088 deg and a gyro of low noise the variance of the scale was 58
-times the Cramer-Rao bound. The interval of the scale is the scatter between pieces of the log,
-since the error that repeats in each period of a swing is no noise of the fit, and at least that
-between places of the shaft; that of the bias is its wander between pieces.
+The input is a log in time with a reference heading, and the method the likelihood of headings, or
+the regression of a course over ground. The error of an encoder is constant while its reading is,
+and known where the reading changes by a step; so readings are used at their steps. The interval of
+the scale is the scatter between pieces of the log, since the error that repeats in each period of
+a swing is no noise of the fit, and at least that between places of the shaft; that of the bias is
+its wander between pieces.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

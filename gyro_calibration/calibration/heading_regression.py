@@ -21,13 +21,10 @@ integrals of the most likely rate ``w`` given both (with a course, that of the g
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
 with the integrals ``J``. A point is the mean over some samples; the observations are the
-differences between points, so that a gap of the reference is a long span. A rest is one more
-observation: a turn by 0; the spans do not contain it. It is in a gap, as of a vehicle whose course
-is lost then, or the reference stands, as odometry does, which may drift in motion; then the drift
-is one more value, and the rests determine the bias. An attitude shows the rotation about the two
-axes across that of the gyro too; as the axes of gyro and reference are never exactly parallel,
-parts of it, two more values, are in the output. What differs between the kinds of references
-is in `ReferenceTreatment`. The computing time is proportional to the number of spans.
+differences between points, so that a gap of the reference is a long span. A rest, in a gap or
+where the reference stands, is one more observation: a turn by 0. Odometry, which stands at rest,
+may drift in motion: one more value. An attitude shows the rotation about the two axes across that
+of the gyro; as axes are never exactly parallel, parts of it are in the output: two more values.
 
 A course over ground, the direction of travel by satellites, differs from the heading by the side
 slip. It is smoothed, late or early against the gyro, lost below some speed, and in bursts of some

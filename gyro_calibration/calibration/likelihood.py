@@ -9,7 +9,6 @@
 # under the License.
 
 """
-
 The likelihood of a gyro's output, given its heading: scale factor error, bias, delay and lag.
 
 Everything is computed on increments between blocks of up to half a second, shorter where the
@@ -18,8 +17,6 @@ against the reference. Errors within a block (vibration, backlash, an eccentric 
 random walk. The covariance of the increments is a banded matrix with one unknown ratio, and is
 solved exactly for each ratio of a grid. A bias may wander by a random walk, of sizes of a grid.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -10,8 +10,6 @@
 
 """The instants at which a reference that is slower than the gyro has values of its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

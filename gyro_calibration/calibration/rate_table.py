@@ -11,10 +11,10 @@
 """
 From dwells to a gyro's model: values of effects, covariance, and errors of left-out sweeps.
 
-The errors are also those of full turns of 360 degrees (Ojeda et al., section 4): an error of the
-rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion to the duration
-of the turn. Two errors are compared: with the bias of a rest before the mission only, and with a
-model and then the bias that remains at rest. Dwells that allow no answer raise `DataRefused`.
+The errors are also those of full turns of 360 degrees (Ojeda et al., section 4), of the heading in
+each turn, rad, in proportion to its duration: with the bias of a rest before the mission only, and
+with a model and then the bias that remains at rest. Dwells that allow no answer raise
+`DataRefused`.
 """
 
 from __future__ import annotations

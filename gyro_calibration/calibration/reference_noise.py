@@ -10,8 +10,6 @@
 
 """The errors of a reference: noise beside that of the gyro, steps, and whether it is a course."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 

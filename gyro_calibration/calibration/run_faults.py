@@ -15,8 +15,6 @@ The fault is the motion that explains the run best: the profile with one deviati
 faster or slower, at limited rates, begun late, or ended early.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations

@@ -14,10 +14,8 @@ The scatter of dwells about a gyro's effects, and the uncertainty of the effects
 The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
 that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
 that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
-dwells of one sweep do not count as thirty independent ones.
-
-The sizes are estimated about a smooth surface over rate and temperature, before any effect is
-fitted. About too few effects, they would include the error of a missing effect.
+dwells of one sweep do not count as thirty independent ones: about a smooth surface over rate and
+temperature, as about too few effects they would include the error of a missing effect.
 
 The covariance of the values states how well the dwells determine them, if the model is complete
 and the gyro does not change. The tolerance states the errors of another run: bias and scale factor

@@ -18,8 +18,6 @@ tried. Sine response and cubic nonlinearity explain nearly the same; where the d
 distinguish them, the one by the physics of the instrument is taken, if the instrument is known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math

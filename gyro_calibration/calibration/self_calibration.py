@@ -9,7 +9,6 @@
 # under the License.
 
 """
-
 Scale factor error and bias from about 20 s of known motion, with the reasons to refuse a run.
 
 The model is ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three methods:
@@ -21,8 +20,6 @@ gyro, after its model if it has one, in rad/s, both of shape (n,). `output` is t
 model, where it differs, which shows a gyro that is dead or at its limit. `noise` is that of the
 gyro, if it is known. Data that are not credible raise `DataRefused`, with reason and remedy.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math

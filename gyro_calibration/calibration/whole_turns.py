@@ -15,8 +15,6 @@ The robot rests on the mark, turns at any rates, and rests on the mark again. Th
 reference. The rests give the bias, and the remaining angle over the turns gives the scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 

@@ -10,8 +10,6 @@
 
 """A gyro's model: its effects with values and their covariance, and the last self-calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
