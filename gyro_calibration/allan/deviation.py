@@ -43,8 +43,6 @@ _MAX_LOST_PER_WINDOW = 0.01
 _MIN_SPANS = 8
 #: Samples in a block that fits into the cache, and whose dot product takes one thread.
 _BLOCK_SAMPLES = 8192
-#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
-_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
 #: Indices of terms, the last ones those with independent second differences over longer times.
 _QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
 _SHORT_MEMORY_INDICES = [
@@ -167,8 +165,6 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
                       f'deviations: {remedy}')
 
 
-# lost samples
-
 def _integrate_angle(rate: Array) -> Array:
     """
     Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
@@ -278,8 +274,6 @@ def allan_deviation(rate: Array, interval: float,
                       *chi_squared_bounds(variance, freedom))
 
 
-# degrees of freedom
-
 def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, Any]:
     """Return the 95 % bounds of a root mean square (NIST SP 1065, eq. 45)."""
     lower, upper = (np.sqrt(mean_square * degrees_of_freedom / chdtri(degrees_of_freedom, tail))
@@ -306,8 +300,6 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
                            / float(covariance_form(samples, size, size)[place, place])))
     return np.array(freedom)
 
-
-# covariance of second differences of the angle, and of Allan variances
 
 def _lag_covariance(angle_covariance: Callable[[Integers], Array], first: int, second: int,
                     lags: Integers) -> Array:
@@ -336,9 +328,9 @@ def covariance_form(samples: int, first: int, second: int,
         """Return how many pairs of second differences stand at each lag."""
         return np.maximum(np.minimum(counts[0], counts[1] - lags) - np.maximum(0, -lags), 0)
 
-    # lags that are dense enough for all but quantization
+    # lags that are dense enough for all but quantization: more change less than 1 %
     longer, shorter = max(first, second), min(first, second)
-    stride = max(1, shorter // _LAGS_PER_WINDOW, longer // _LAGS_PER_LONGER_WINDOW)
+    stride = max(1, shorter // 8, longer // 512)
     lags = np.arange(-(min(10 * longer, counts[0]) // stride),
                      min(10 * longer, counts[1]) // stride + 1) * stride
     values = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])

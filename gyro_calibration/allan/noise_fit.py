@@ -33,15 +33,11 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
 
-#: Least decrease of -2 ln likelihood for a further term: 95 % of white records have none.
-_TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALTERNATIVE_LIMIT = 6.0
 #: A combination that is likelier by this in -2 ln likelihood, but has too many terms, widens the
 #: bounds. At 0 those of the angle random walk are 6 to 35 % wider, and hold the truth as often.
 _WIDENING_LIMIT = 1.0
-#: Least p-value of the residuals of an accepted fit.
-_MIN_P_VALUE = 0.05
 #: Relative differences of the sum of the terms that are tried; the smallest sufficient is used.
 _MISFIT_SHARES = (0.0, *np.geomspace(0.01, 0.32, 11).tolist())
 _MIN_OCTAVES = 4  # least number of octaves that show a slope and its end
@@ -145,16 +141,17 @@ class _CombinationFit:
 
     def penalized_deviance(self) -> float:
         """Return -2 ln likelihood plus a penalty for each term."""
-        # In a single record a random walk looks like a ramp. A process counts as two terms.
+        # By 10 a term, 95 % of white records have no further one. In a single record a random walk
+        # looks like a ramp. A process counts as two terms.
         return (self.deviance
-                + _TERM_PENALTY * (len(self.active_terms) + (_PROCESS in self.active_terms))
+                + 10.0 * (len(self.active_terms) + (_PROCESS in self.active_terms))
                 + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
 
     def is_likely(self) -> bool:
         """Return whether the residuals are within chance."""
         normal, _ = self._normal_scores()
         freedom = len(normal) - len(self.active_terms) - (_PROCESS in self.active_terms)
-        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _MIN_P_VALUE
+        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > 0.05
 
     def estimate_squares(self, indices: Sequence[int]) -> tuple[Array, Array]:
         """Return the squared coefficients by least squares, of any sign, and their deviations."""

@@ -36,8 +36,6 @@ from scipy.special import digamma, polygamma
 
 #: Minimum number of samples of a dwell, and minimum duration after all cuts, s.
 _MIN_SAMPLES, _MIN_DURATION = 8, 1.5
-#: Minimum cut at both ends of a dwell, s, which excludes a time offset between gyro and reference.
-_MARGIN = 0.25
 #: Largest deviation of the heading from a straight line beyond its steps, rad.
 _MAX_DEVIATION = 0.5 * DEGREE
 #: A dwell or a sample beyond this many robust standard deviations is outlying.
@@ -122,15 +120,14 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
     if temperatures and not has_temperature:
         remarks += (f'{len(parts) - len(temperatures)} of {len(parts)} logs hold no temperature, '
                     'so that of the others is not used',)
-    return Dwells(np.concatenate([part.rate for part in parts]),
-                  np.concatenate([part.output for part in parts]),
-                  np.concatenate(temperatures) if has_temperature else None,
-                  np.concatenate([part.deviation for part in parts]), np.concatenate(
-                      [part.sweep + number for part, number in zip(parts, first_sweep)]),
-                  sum((part.location for part in parts), ()), remarks,
+    rate, output, deviation, rounding = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ('rate', 'output', 'deviation', 'rounding'))
+    sweep = np.concatenate([part.sweep + number for part, number in zip(parts, first_sweep)])
+    return Dwells(rate, output, np.concatenate(temperatures) if has_temperature else None,
+                  deviation, sweep, sum((part.location for part in parts), ()), remarks,
                   sum((part.rows for part in parts), ()),
-                  np.concatenate([part.rounding for part in parts])
-                  if all(len(part.rounding) for part in parts) else np.empty((0, 2)))
+                  rounding if len(rounding) == len(rate) else np.empty((0, 2)))
 
 
 def require_output(log: Log) -> Array:
@@ -200,11 +197,10 @@ def _largest_divisor(values: Array) -> float:
 
 def _number_sweeps(rate: Array) -> Numbers:
     """
-    Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
+    Return the number of the sweep of each dwell, shape (n,).
 
     The rates of a sweep increase or decrease, or their absolute values do with changing sign, with
-    or without a rest between them. Where the median sweep has less than four dwells, nine blocks
-    of consecutive dwells are taken as sweeps.
+    or without a rest between them; else nine blocks of consecutive dwells are taken as sweeps.
     """
     turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
     for used in (np.full(len(rate), True), turning) if turning.any() else ():
@@ -220,11 +216,7 @@ def _number_sweeps(rate: Array) -> Numbers:
 
 
 def _number_passes(value: Array) -> Numbers:
-    """
-    Assign numbers to passes through values; a pass begins where the direction reverses.
-
-    Values that are repeated where passes turn belong to both in equal parts.
-    """
+    """Assign numbers to passes, from where the direction reverses; repeats there are shared."""
     change = np.diff(value)
     # Mean rates of opposite sign differ slightly in absolute value.
     steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
@@ -346,10 +338,10 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         fresh = part[~is_repeated[part]]
         is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
         kept.append(fresh[~is_outlier[fresh]])
-    # a time offset shows before a ramp, in the mirrored log
+    # 0.25 s at least, for a time offset; it shows before a ramp, in the mirrored log
     error, rate_change = samples.error, np.diff([np.median(samples.output[rows]) for rows in kept])
     mirrored = [(len(time) - 1 - rows)[::-1] for rows in kept[:-1]]
-    after, before = (max(_MARGIN, _settling_time(*each))
+    after, before = (max(0.25, _settling_time(*each))
                      for each in ((time, error, kept[1:], rate_change),
                                   (-time[::-1], error[::-1], mirrored, -rate_change)))
     ends = [(time[rows[0]] + after, time[rows[-1]] - before) for rows in kept]
@@ -453,19 +445,11 @@ def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator
 
 
 def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
-    """
-    Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
-
-    There the deviation is proportional to the square of time, so the ratio of two deviations gives
-    its beginning.
-    """
+    """Return how many blocks of a ramp are within the tolerance, by the square of time."""
     if len(deviation) <= _RAMP_BLOCKS:
         return 0
     ratio = math.sqrt(max(1.0, deviation[_RAMP_BLOCKS] / tolerance))
     return math.ceil(min(6.0, 1.0 / max(ratio - 1.0, 1e-3)) * _RAMP_BLOCKS)
-
-
-# settling and temperature
 
 
 def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
@@ -516,8 +500,6 @@ def _describe_left_out(samples: _Samples, is_outlier: Mask, is_repeated: Mask) -
 def _format_occurrences(number: int) -> str:
     return 'once' if number == 1 else f'{number} times'
 
-
-# means
 
 def _average(samples: _Samples,
              dwells: Sequence[Numbers]) -> tuple[Array, Array, Array, Array]:
@@ -619,9 +601,8 @@ def _shrink_variances(variance: Array, dof: Array) -> Array:
     """
     Shrink variances, shape (n,), toward their common value, by more if they agree.
 
-    A variance of twelve batches has a standard error of 40 %; weights by it would be random.
-    Empirical Bayes: the logarithms are shrunk by the part of their scatter that the degrees of
-    freedom explain (Smyth 2004, section 6.2).
+    A variance of twelve batches has a standard error of 40 %. Empirical Bayes: the logarithms are
+    shrunk by the scatter that the degrees of freedom explain (Smyth 2004, section 6.2).
     """
     known = variance > 0.0  # 0 where it is not known
     if known.sum() < 3:

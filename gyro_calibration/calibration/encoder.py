@@ -29,8 +29,8 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
-    TECHNOLOGY_PRIORS, WANDER_COSINES)
+    COURSE_TREATMENT, fit_course, is_noisy, lag_deviation, MAX_ENCODER_OFFSET,
+    MAX_FOLLOWED_RESIDUAL, TECHNOLOGY_PRIORS, WANDER_COSINES)
 from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
     ScaleBiasFit)
@@ -66,25 +66,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 #: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
 _GYRO_LAG_DEVIATION = 2e-4
-#: Prior standard deviation of the smoothing of a heading without steps: a mean over 0.2 s, s².
-_SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
-
-
-@dataclass(frozen=True)
-class HeadingResidual:
-    """Heading of the gyro less that of the reference, over a whole log."""
-
-    heading: Array  # rad, shape (n,); its mean is 0, as the gyro's first heading is not known
-
-    @property
-    def rms(self) -> float:
-        """Return the root of the mean square, rad."""
-        return math.sqrt(float(np.mean(self.heading ** 2)))
-
-    @property
-    def largest(self) -> float:
-        """Return the largest error either way, rad."""
-        return float(np.abs(self.heading).max())
 
 
 @dataclass(frozen=True)
@@ -95,8 +76,9 @@ class EncoderCalibration:
     method: str  # 'likelihood' or 'course'
     fit: ScaleBiasFit  # the same with noise and time offset, as found
     reference: Motion  # its headings over time, s since it began
-    residual_before: HeadingResidual  # without calibration
-    residual_after: HeadingResidual
+    # heading of the gyro less that of the reference, without calibration and with it, rad, (n,)
+    residual_before: Array
+    residual_after: Array
     lost_samples: int  # where the stamps are regular enough to count them
     remarks: tuple[str, ...]  # one sentence each
 
@@ -171,16 +153,16 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
                           '--from), or correct the stamps')
     refuse_one_speed(motion, limits)
     refuse_dead(output)
-    # the gyro's lag is assumed to be about that of a filter of 20 ms
+    # the gyro's lag is about that of a filter of 20 ms; a heading without steps may be a mean over
+    # 0.2 s
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
     fit = fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
-                         lag_deviation=_GYRO_LAG_DEVIATION if has_steps else _SMOOTHING_DEVIATION,
+                         lag_deviation=_GYRO_LAG_DEVIATION if has_steps else 0.2 ** 2 / 24.0,
                          cross_rotation=crossing, bias_wanders=True)
     if motion.rate is not None:
-        # the variance of the times by which a motion is late is seldom above their mean squared
         exact = fit.scale_factor_error
         fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
-            0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION), bias_wanders=True)
+            lag_deviation(fit.time_offset), _GYRO_LAG_DEVIATION), bias_wanders=True)
         # the shape of the response is not known: what it changes is uncertain
         fit = replace(fit, response_deviation=abs(fit.scale_factor_error - exact))
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
@@ -193,7 +175,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     elif fit.shaft_error.size:
         motion = replace(motion, heading=correct_shaft(motion.heading, fit.shaft_error))
     drift = _estimate_drift(motion, _heading_residual(
-        time - fit.time_offset, corrected, motion).heading, fit.bias, technology)
+        time - fit.time_offset, corrected, motion), fit.bias, technology)
     # a bias within chance that could make a heading worse
     if (drift.deviation * DRIVE_DURATION > limits.max_heading_error
             and abs(drift.bias) < stats.norm.ppf(0.975) * drift.deviation):
@@ -422,12 +404,11 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     """
     Find the mean bias over a log, and how it wanders, by the drifts between pieces of the log.
 
-    What repeats itself with a motion within a piece is noise of the mean heading of that piece. It
-    is at least what the step of the reference leaves, and at most all that the headings are apart.
+    What repeats itself with a motion within a piece is noise of the mean heading of that piece.
     The bias has a normal prior about zero, of a tenth of the size that the technology has up to
     all of it: a bias of many standard deviations stays; one that the log hardly shows would only
-    harm a heading. Given are the motion by the reference, and of the fit the error of the heading,
-    rad, shape (n,), and the bias, rad/s.
+    harm a heading. Given are, of the fit, the error of the heading, rad, shape (n,), and the bias,
+    rad/s.
     """
     piece = _number_pieces(motion.time)
     counts = np.bincount(piece)
@@ -505,7 +486,8 @@ def _scatter_between(group: NDArray[np.intp], influence: Array, turned: Array) -
     return np.asarray(sums @ sums.T)
 
 
-def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidual:
+def _heading_residual(time: Array, rate: Array, motion: Motion) -> Array:
+    """Return heading of the gyro less that of the reference, rad, (n,); its mean is 0."""
     error = np.interp(motion.time, time, integrate(time, rate)) - motion.heading
     covered = (motion.time >= time[0]) & (motion.time <= time[-1])
     error = np.interp(motion.time, motion.time[covered], error[covered])
@@ -513,7 +495,7 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
         after = motion.time >= 0.5 * (begin + end)
         if after.any() and not after.all():  # by medians, as single references may be wrong
             error[after] -= np.median(error[after][:15]) - np.median(error[~after][-15:])
-    return HeadingResidual(error - error.mean())
+    return np.asarray(error - error.mean())
 
 
 def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,

@@ -169,9 +169,8 @@ class Spans:
     channels: Channels  # inputs of the effects; the rate is that of the gyro, as corrected so far
     value_times: Array  # times of the known values of the reference, s
     point_index: NDArray[np.intp]  # point of each of them
-    # time, heading: of the points, s and rad, shape (n + 1,)
-    time: Array
-    heading: Array
+    time: Array  # of the points, s, shape (n + 1,)
+    heading: Array  # of the points, rad
     # first and last row of each rest, shape (r, 2), and whether the reference is known there
     rests: NDArray[np.intp]
     stands: Mask
@@ -231,12 +230,7 @@ class Spans:
 
     @property
     def shaft_sectors(self) -> NDArray[np.intp]:
-        """
-        Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,).
-
-        The errors of an encoder repeat with the motion; stretches in time are not independent
-        then.
-        """
+        """Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,)."""
         middle = self.point_means(np.asarray(self.channels.heading))
         sector = np.floor(0.5 * (middle[1:] + middle[:-1]) / (10.0 * DEGREE))
         keys = np.append(2.0 * sector + (np.diff(middle) > 0.0), np.zeros(len(self.rests)))
@@ -280,12 +274,7 @@ class Spans:
 
     @property
     def angles(self) -> Array:
-        """
-        Return the angle that is turned in each span, rad, shape (n,).
-
-        It is 0 where a course is nearer to no turn than to that of the gyro, which is noise then,
-        and in the observations too.
-        """
+        """Return the angle turned in each span, rad, (n,); 0 where a course shows noise."""
         by_gyro = np.diff(self.point_means(np.asarray(self.channels.heading)))
         turns = np.diff(self.heading) * by_gyro > 0.5 * by_gyro ** 2
         return np.asarray(np.where(turns | self.treatment.is_fine, by_gyro, 0.0))
@@ -359,11 +348,7 @@ class Spans:
 
     @cached_property
     def smooth_rate(self) -> Array:
-        """
-        Return the rate by a Wiener filter of its cosines, rad/s, shape (m,).
-
-        White noise in the changes of the rate, in which a delay shows, would pass for information.
-        """
+        """Return the rate by a Wiener filter: its noise would pass for information on a delay."""
         return self._smooth(np.asarray(self.channels.rate))
 
     def rate_columns(self) -> Array:
@@ -509,10 +494,9 @@ class Spans:
         """
         Return the column of a lag without its noise, what others explain of it, both (n + r,).
 
-        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro,
-        which would make the lag too small. It is reduced to the share that the reference shows too
-        (regression calibration, Carroll and others 2006), if that is beyond chance. The error of
-        that share, and what noise in both columns and observations may do, is an error of the lag,
+        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro.
+        It is reduced to the share that the reference shows too (regression calibration, Carroll
+        and others 2006), if that is beyond chance. What is left of noise is an error of the lag,
         s².
         """
         time, columns = self.stamps, self.base_columns()
@@ -550,8 +534,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     """
     Divide a log with a reference of some kind into spans.
 
-    The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
-    gyro was measured. The instants are those of a slow reference, by `keep_own_instants`.
+    The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, the instants those
+    of a slow reference.
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
@@ -650,9 +634,8 @@ class SpanFit:
     spans: Spans  # the log
     causes: tuple[CauseTerm, ...]  # in addition to scale factor error, bias and delay
     fit: GridFit  # of the restricted likelihood
-    # values, covariance: estimates and their cluster-robust covariance
     values: Array
-    covariance: Array
+    covariance: Array  # cluster-robust
     effective_stretches: Array  # effective number of stretches that determine each value
     freedom: Array  # degrees of freedom of the deviation of each value
 
@@ -701,9 +684,8 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
     Rests that the motion contradicts are left out where no causes are given. Wheels of another
-    size, or a wrong unit, may exceed what a gyro errs by: beside a course the values are means
-    under the prior of the technology and a wide one, weighted by their probability given the
-    drive, and the intervals contain both answers where it does not decide.
+    size may exceed what a gyro errs by: beside a course the values are means under the prior of
+    the technology and a wide one, weighted by their probability given the drive.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
     corrected, point_variances = _correct_rate(spans, every)
@@ -926,14 +908,12 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
 
-    Nor less than their mean square error under the widest prior, to which a narrower one draws a
-    value; nor than what they change by without each place of a shaft (jackknife, Tukey 1958), as
-    the few turning points of an even swing may determine a value. The intervals of the first
-    values are not wider than those of their priors; that of a scale factor error that fewer than
-    `MIN_STRETCHES` stretches determine is as wide, as it cannot be separated from errors of the
-    reference, unless the prior includes these.
-
-    Also the effective number of stretches that determine each value, and the degrees of freedom.
+    Nor less than their mean square error under the widest prior; nor than what they change by
+    without each place of a shaft (jackknife, Tukey 1958), as the few turning points of an even
+    swing may determine a value. The intervals of the first values are not wider than those of
+    their priors; that of a scale factor error that fewer than `MIN_STRETCHES` stretches determine
+    is as wide, as it cannot be separated from errors of the reference. Also the effective number
+    of stretches that determine each value, and the degrees of freedom.
     """
     count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
@@ -1029,8 +1009,6 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
                               np.concatenate([noise.whiten(columns), prior]), clusters,
                               int(stretches.max()) + 1, noise)
 
-
-# a course over ground
 
 def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     """

@@ -437,9 +437,9 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
     """
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
-    Of a held value that changes by several steps it is the first sample. All samples of a constant
-    reading count as one, but for the first and the last if they last much longer than the readings
-    next to them: then the gyro rests, and their samples share one error.
+    All samples of a constant reading count as one, but for the first and the last if they last
+    much longer than the readings next to them: then the gyro rests, and their samples share one
+    error.
     """
     change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
     run = np.cumsum(change > 0.5 * step)
@@ -595,11 +595,10 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
 
 def _repetition(data: _Increments, estimate: _Estimate) -> float:
     """
-    Return how many times the same errors occur: 1 if all are independent.
+    Return how many times the same errors occur, as in an even swing: 1 if all are independent.
 
-    They may be the same in all passes through a place of the shaft in one sense, as in an even
-    swing. There are as many groups, by place and sense, as a pass has blocks. It is the mean
-    square of a group's mean, times its number of blocks, over that of all (analysis of variance).
+    There are as many groups, by place and sense, as a pass through the motion has blocks. It is
+    the mean square of a group's mean, times its number of blocks, over that of all.
     """
     turned, white = data.columns[:, 0], estimate.noise.whiten(estimate.residual)
     heading = np.cumsum(turned) - 0.5 * turned
@@ -637,11 +636,10 @@ def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
 
     The motion determines a lag by the part of the acceleration that gyro and reference both show
     and the other columns do not explain, less two standard deviations. If it does so more narrowly
-    than what is `possible`, s², or than the lag that is found, there is no prior, and only the
-    shape of the response is not known: a lag adds to the fourth order what a Gaussian window does,
-    or by a fifth of its square less, of a mean over a time, or by its square more, of a filter of
-    first order, which has the lag `offset` ** 2 / 2. Else the lag is 0, as in a swing of one
-    frequency, and what it may do to the scale is uncertain.
+    than what is `possible`, s², or than the lag that is found, only the shape of the response is
+    not known: from a mean over a time, with a fifth of the square of a lag less in the fourth
+    order than a Gaussian window, to a filter of first order with the lag `offset` ** 2 / 2. Else
+    the lag is 0, as in a swing of one frequency, and what it may do to the scale is uncertain.
     """
     of_first_order = 0.5 * offset ** 2
     possible = max(possible, of_first_order)
@@ -676,13 +674,13 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     The increments have noise of the rate (a random walk of the heading) and of the reference
     heading (an encoder's step), so that neighbours are correlated; the ratio of the two is found
     by restricted likelihood. A measured heading is smoothed by the gyro's output before it serves
-    as the regressor, which makes this the errors-in-variables likelihood.
+    as the regressor (errors in variables).
 
     A robot follows its profile late and smoothly: without delay and lag, a first-order lag of 0.2
     s causes 0.9 % of scale factor error. Against headings, which were measured on the robot
-    itself, the lag is small and taken to second order. Other deviations from a profile
-    (`tracking_error_columns`) are fitted within their priors, and so is a stretch with a turn of
-    its own, weighted by its probability.
+    itself, the lag is small and taken to second order. `tracking_error_columns` are fitted within
+    their priors, and so is a stretch with a turn of its own. `DataRefused` is raised where gyro
+    and motion hardly overlap.
 
     Parameters
     ----------
@@ -694,10 +692,6 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     cross_rotation : of the motion about the two axes across that of the reference, at the times of
         a measured motion, rad, shape (n, 2) or (n, 0); None where it is not known
     bias_wanders : whether it may do so by a random walk; it is then the mean over the motion
-
-    Raises
-    ------
-    DataRefused : gyro and motion hardly overlap
     """
     if cross_rotation is None:
         cross_rotation = np.empty((len(motion.time), 0))

@@ -99,11 +99,7 @@ class CalibrationForecast:
 
     def __init__(self, noise: Noise, duration: float, drive: Motion, drive_duration: float,
                  rest_duration: float = RunLimits.rest_duration):
-        """
-        Prepare for a gyro, whose angle random walk is above 0; all durations are in s.
-
-        The rest begins `SETTLING_TIME` s after the motion; 0 is none. The drive is repeated.
-        """
+        """Prepare for a gyro with noise; durations are in s, a rest of 0 is none."""
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
         cells = min(max(round(drive_duration), 1), 600)
@@ -343,7 +339,7 @@ def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
 
 
 def plain_motion(robot: RobotLimits, duration: float) -> Motion:
-    """Return a motion, s, of one turn there and back with rests, at half of the fastest rate."""
+    """Return a motion, s, of one turn there and back with rests, at half the fastest rate."""
     _refuse_impossible(robot, duration)
     place, half = max(robot.highest, -robot.lowest), 0.5 * duration - robot.rest
     rate = max(0.5 * robot.max_turn_rate(min(place, robot.max_turn_angle(half))), robot.slowest)

@@ -65,11 +65,6 @@ from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import logsumexp, softmax
 
-#: Points of the grid for each size, and passes, each around the likely points of the one before.
-_GRID_POINTS, _GRID_PASSES = 5, 4
-#: Cosines of a wandering bias; faster changes are hardly distinguishable from white noise.
-_COSINE_COUNT = 24
-
 
 @dataclass(frozen=True)
 class BandedNoise:
@@ -225,7 +220,7 @@ def _quasi_differences(columns: Array, carried: Array | None) -> Array:
 
 def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
                         rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
-                        cosine_count: int = _COSINE_COUNT) -> tuple[Array, list[SharedNoise]]:
+                        cosine_count: int = 24) -> tuple[Array, list[SharedNoise]]:
     """
     Return the columns of a wandering bias in increments between points, and its noise parts.
 
@@ -330,6 +325,8 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
 
+    There must be more observations than values, or `ValueError` is raised.
+
     Parameters
     ----------
     observed, columns : shape (n,), and those of the values, shape (n, m)
@@ -340,10 +337,6 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     hierarchical_priors : values with a prior of unknown size
     carried : share of the observation before that is subtracted from each, shape (n,); None where
         the errors of the observations are not autoregressive
-
-    Raises
-    ------
-    ValueError : there are not more observations than values
     """
     count = columns.shape[1]
     if len(observed) <= count:
@@ -355,9 +348,9 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     regression = _Regression(_quasi_differences(observed - columns @ mean, carried),
                              _quasi_differences(together, carried), count, precision, banded,
                              shared, hierarchical_priors)
-    axes = [np.array([low]) if low == high else np.geomspace(low, high, _GRID_POINTS)
+    axes = [np.array([low]) if low == high else np.geomspace(low, high, 5)
             for low, high in (part.size_range for part in regression.parts)]
-    for remaining in reversed(range(_GRID_PASSES)):
+    for remaining in reversed(range(4)):
         sizes, log_likelihoods, all_values, covariances = _evaluate_grid(regression, axes)
         weights = softmax(log_likelihoods)
         if remaining:

@@ -157,11 +157,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
 
 
 def output_delay(log: Log, rate: Array) -> float:
-    """
-    Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s.
-
-    A robot is later than its command; a rate that is held is later than the motion.
-    """
+    """Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s."""
     assert log.time is not None and log.output is not None
     known, output = np.isfinite(rate), bridge_gaps(log.output)
     sample = float(np.median(np.diff(log.time)))

@@ -44,8 +44,6 @@ _MAX_CONDITION_NUMBER = 1e3
 CONFOUNDERS = {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}
 #: rad/s; the error of slower turns is mostly bias, not scale; as published.
 MIN_TURN_RATE = 5.0 * DEGREE
-#: A dwell that turns slower than this is a rest.
-_MAX_REST_RATE = 0.1 * DEGREE
 
 
 class _ColumnTest(NamedTuple):
@@ -445,8 +443,6 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
     return left_out
 
 
-# refusals
-
 def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
     thermal = [effect.name for effect in effects if 'temperature' in effect.inputs]
     if not thermal:
@@ -461,19 +457,15 @@ def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
             f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature')
 
 
-# bins of errors
-
 @dataclass(frozen=True)
 class _Bin:
     """Dwells of nearly one rate, or nearly one temperature."""
 
-    # low, high: ends of the bin, in the unit of what was binned
-    low: float
+    low: float  # in the unit of what was binned
     high: float
     count: int  # of dwells
-    # uncorrected, residual: mean error without the model and with it, rad/s
-    uncorrected: float
-    residual: float
+    uncorrected: float  # mean error without the model, rad/s
+    residual: float  # and with it
     deviation: float  # standard deviation of the mean residual, rad/s
     rms: float  # of the residual, rad/s
 
@@ -562,7 +554,7 @@ def _find_rests(dwells: Dwells) -> tuple[dict[int, tuple[Numbers, Array]], str]:
     sweeps = np.unique(dwells.sweep).tolist()
     for number in sweeps:
         rows = np.flatnonzero(dwells.sweep == number)
-        rests = rows[speed[rows] <= _MAX_REST_RATE]
+        rests = rows[speed[rows] <= 0.1 * DEGREE]
         if len(rests):
             at_rest[number] = rests, np.full(len(rests), 1.0 / len(rests))
         ways = [rows[way * dwells.rate[rows] > 0.0] for way in (1.0, -1.0)]

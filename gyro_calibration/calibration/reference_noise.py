@@ -27,20 +27,12 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
-#: Span over which the errors of gyro and reference are compared, s.
-_COMPARISON_SPAN = 1.0
 #: Samples of a block.
 _BLOCK_SAMPLES = 25
-#: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
-#: the errors of an encoder are at most so many times its rounding error.
-_MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
-#: Least ratio of the errors of a course to the noise of the gyro, also for one that is straight
-#: between fixes (measured: 4.6 to 920, all below 8 on straight lines; odometry: up to 5).
-_COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
+#: The errors of an encoder are at most so many times its rounding error.
+MAX_ROUNDING_RATIO = 1.5
 #: Least noise of a course, rad, over a second or from span to span; RTK in town has 0.4 deg.
 MIN_COURSE_NOISE = 0.25 * DEGREE
-#: Largest ratio of 90 % to 99 % quantile of second differences of straight lines between fixes.
-_MAX_STRAIGHT_RATIO = 0.1
 
 
 def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np.intp], Mask]:
@@ -74,18 +66,13 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
 
 
 def step_evenness(log: Log, step: float) -> float:
-    """
-    Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
-
-    Rounding errors are independent if the rate varies; at a constant rate they are a sawtooth,
-    which passes for tones.
-    """
+    """Return how evenly a shaft moves through its steps, 0 to 1: then errors pass for tones."""
     assert log.time is not None and log.output is not None
     interval = float(np.median(np.diff(log.time)))
     # means over a fifth of a second, as the noise of single samples is too large
     rate = uniform_filter1d(bridge_gaps(log.output),
-                            max(round(0.2 * _COMPARISON_SPAN / interval), 5))
-    count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
+                            max(round(0.2 / interval), 5))
+    count = max(round(2.0 / interval), _BLOCK_SAMPLES)
     blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
     if not len(blocks):
         return 1.0
@@ -127,7 +114,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     # a slow reference has its values at the samples next to its own instants
     apart = np.diff(time)
     interval = float(apart[apart < 2.0 * np.median(apart)].mean())
-    longest = max(round(_COMPARISON_SPAN / interval), 4)
+    longest = max(round(1.0 / interval), 4)
 
     def find_variance(lag: int, delay: float, every: int = 1) -> float:
         """Return the variance of second differences, rad²; nan where too few are known."""
@@ -245,10 +232,10 @@ def is_course(log: Log) -> bool:
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
-    # a heading between slower fixes lies on straight lines
+    # least ratio to the noise of the gyro: measured are 4.6 to 920, below 8 only where a heading
+    # between slower fixes is on straight lines, and up to 5 for odometry
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > _MIN_LOST_SHARE
-              else _COURSE_NOISE_RATIO)
+    larger = 2.0 if usual < 0.1 * large and lost > 0.003 else 8.0
     # an encoder errs by its rounding; a difference over a second has 3 times the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
     return heading_difference(log).total_walk > max(larger * walk, MAX_ROUNDING_RATIO * rounding,

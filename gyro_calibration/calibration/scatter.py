@@ -148,8 +148,6 @@ class Whitener:
         return values
 
 
-# its size
-
 def estimate_scatter(dwells: Dwells) -> Scatter:
     """Return how dwells scatter, by restricted likelihood, and which of them are outlying."""
     kept = find_inliers(dwells)
@@ -260,22 +258,18 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
             values, inverse)
 
 
-# uncertainty of the values
-
 @dataclass(frozen=True)
 class Uncertainty:
     """
     The uncertainty of values fitted to dwells.
 
-    Few dwells and few sweeps do not determine how large the scatter is; the maximum of the
-    likelihood alone would often be at zero, and its intervals too narrow. So the distribution of
-    the values is averaged over possible scatters, weighted by their restricted likelihood: that of
-    the dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
+    Few dwells and few sweeps do not determine how large the scatter is, so the distribution of the
+    values is averaged over possible scatters, weighted by their restricted likelihood: that of the
+    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
     uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
     its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
-    sweeps alone are then those of Student's distribution with as many degrees of freedom as there
-    are sweeps more than values. That sweeps do not differ has the weight of a factor of e in that
-    variance: without it, the intervals of sweeps that do not differ would be too wide.
+    sweeps alone are then those of Student's distribution. That sweeps do not differ has the weight
+    of a factor of e in that variance, without which their intervals would be too wide.
     """
 
     weights: Array  # of possible scatters, shape (k,)
@@ -364,8 +358,6 @@ class Uncertainty:
         widening = self.half_width(0.95) / NORMAL_QUANTILE_975 / np.sqrt(np.diag(covariance))
         return covariance * np.outer(widening, widening)
 
-
-# errors in another run
 
 def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
                        columns: Callable[[Array, Array], Array], covariance: Array) -> Tolerance:

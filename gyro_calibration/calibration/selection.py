@@ -52,10 +52,9 @@ class _EffectChoice:
 
     effect: str  # its name
     taken: bool  # whether it is in the model
-    # error_without, error_with: error of left-out sweeps, rad/s; nan where a fit was not possible
-    error_without: float
+    error_without: float  # of left-out sweeps, rad/s; nan where a fit was not possible
     error_with: float
-    p_value: float  # p-value of the effect; nan as before
+    p_value: float
     reason: str  # one sentence
 
 
@@ -63,11 +62,10 @@ class _EffectChoice:
 class _ConfoundedPair:
     """Two effects that explain the same errors."""
 
-    # taken, other: their names
-    taken: str
+    taken: str  # its name
     other: str
     sigmas: float  # by which the data prefer the one taken; negative for the other
-    distinguishing_rate: float | None  # that would distinguish them, rad/s; None far above
+    distinguishing_rate: float | None  # rad/s; None above three times the fastest
     reason: str  # why it was taken, one sentence
 
     @property
@@ -182,8 +180,6 @@ def _remove_superfluous(fit: Calibration, base: Sequence[Effect],
     return fit
 
 
-# confounders
-
 def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect: Effect
                         | None = None) -> tuple[Calibration, tuple[_ConfoundedPair, ...]]:
     """
@@ -221,12 +217,7 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
 
 
 def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
-    """
-    Return the slowest new rate, rad/s, at which two dwells each way distinguish two fits.
-
-    By one standard deviation more than is needed. None if it is above three times the fastest
-    rate.
-    """
+    """Return the slowest rate, rad/s, at which two dwells each way distinguish fits, or None."""
     known = fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
     deviation = np.full(4, np.median(known) if len(known) else np.nan)
     temperature = np.full(4, fit.model.reference_temperature)
@@ -245,8 +236,6 @@ def try_replace(fit: Calibration, taken: Effect, other: Effect) -> Calibration |
     """Fit another effect in place of one of a fit; None if that is not possible."""
     return try_fit(fit, [other if each is taken else each for each in fit.effects])
 
-
-# reasons
 
 def _explain_choice(fit: Calibration, effect: Effect, significance: float,
                     confounders: Sequence[_ConfoundedPair]) -> _EffectChoice:

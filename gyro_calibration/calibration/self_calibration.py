@@ -123,14 +123,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     """
     Fit a run by one of `METHODS` and refuse one that is not credible.
 
-    Parameters
-    ----------
-    noise : its wander goes into the deviation of the bias; the residual is compared with it
-    reference : errors of the motion, for the standard deviations; by default those of
-        `default_reference_errors`
-    prior : standard deviations of (s, b) about zero before the run, as
-        `GyroModel.prior_deviations` of a fleet, shape (2,); what the run leaves open is drawn to
-        it, in a method that gives a covariance
+    The reference has by default `default_reference_errors`. The prior are standard deviations of
+    (s, b) about zero before the run, as `GyroModel.prior_deviations` of a fleet, shape (2,).
     """
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits, output)
@@ -500,9 +494,8 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
-    It begins later, by up to its length in the limits, where the robot still moves then, and lasts
-    until the robot moves, at most as long as the motion did. None where the log ends before, or
-    the robot drives on.
+    It begins up to its length in the limits later where the robot still moves, and is at most as
+    long as the motion. None where the log ends before, or the robot drives on.
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
@@ -544,10 +537,9 @@ def _deviation_of_mean(rate: Array) -> float:
 def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
                    noise: Noise = Noise(), output: Array | None = None) -> tuple[float, float]:
     """
-    Return the bias of a gyro at rest and its standard deviation, rad/s.
+    Return the bias of a gyro at rest, with the Earth's rate, and its standard deviation, rad/s.
 
-    See Ojeda et al., eq. 1, or 15 for compensated rates. The mean includes the Earth's rate. A
-    slow and steady turn looks like a bias; only the limit on the bias excludes it.
+    See Ojeda et al., eq. 1, or 15 for compensated rates. A slow and steady turn looks like a bias.
     """
     refuse_samples(time, rate, limits, output)
     parts = np.array_split(rate, 10)

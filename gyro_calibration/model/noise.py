@@ -80,11 +80,7 @@ class Noise:
 
 
 def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
-    """
-    Return variance, and covariance with its end, of the mean of a unit process over a calibration.
-
-    It is a Gauss-Markov process, and `BIAS_AVERAGING_TIME` s long.
-    """
+    """Return variance, and covariance with the end, of a unit process's calibration mean."""
     ratio = BIAS_AVERAGING_TIME / time_constant
     decayed = 1.0 - np.exp(-ratio)
     return 2.0 * (ratio - decayed) / ratio ** 2, decayed / ratio
