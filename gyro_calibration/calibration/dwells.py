@@ -146,7 +146,7 @@ def format_list(items: Sequence[str]) -> str:
 # rate tables
 
 def dwells_from_table(log: Log) -> Dwells:
-    """Return the rows of a rate table that have output and reference rate."""
+    """Return the rows of a rate table, by its columns `sweep` and `deviation_dps` if present."""
     output = require_output(log)
     if log.reference_rate is None:
         raise DataRefused('the rows have no time and no reference rate; a rate table needs the '
@@ -263,10 +263,10 @@ class _Samples(NamedTuple):
     time: Array
     output: Array
     rate: Array | None
-    heading: Array
-    step: float
+    heading: Array  # of the reference, or the integral of its rate
+    step: float  # of an encoder, rad
     temperature: Array | None
-    scale: float = 1.0
+    scale: float = 1.0  # approximate ratio of output to reference
 
     @property
     def error(self) -> Array:
@@ -393,7 +393,7 @@ def _find_straight(samples: _Samples) -> list[slice]:
     edges = np.append(first, len(time))
     times, headings = (np.add.reduceat(values, first) / np.diff(edges)
                        for values in (time, samples.heading))
-    # A vibration of the table cancels over a whole number of its periods.
+    # A vibration of the table cancels over whole periods: several lengths.
     deviation = max((float(np.median(np.abs(
         headings[reach:-reach] - 0.5 * (headings[2 * reach:] + headings[:-2 * reach]))))
         for reach in (2, 3, 5) if len(headings) > 2 * reach), default=math.inf)
@@ -445,7 +445,7 @@ def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator
 
 
 def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
-    """Return how many blocks of a ramp are within the tolerance, by the square of time."""
+    """Return how many blocks of a ramp, of a deviation by time squared, are within tolerance."""
     if len(deviation) <= _RAMP_BLOCKS:
         return 0
     ratio = math.sqrt(max(1.0, deviation[_RAMP_BLOCKS] / tolerance))

@@ -13,7 +13,8 @@ Calibrate a gyro against an encoder: scale factor error, bias and the residual h
 
 The input is a log in time with a reference heading, and the method the likelihood of headings, or
 the regression of a course over ground. The error of an encoder is constant while its reading is,
-and known where the reading changes by a step; so readings are used at their steps. The interval of
+and known where the reading changes by a step; so readings are used at their steps (an error of
+step / √12 at each sample would give rests too much weight). The interval of
 the scale is the scatter between pieces of the log, since the error that repeats in each period of
 a swing is no noise of the fit, and at least that between places of the shaft; that of the bias is
 its wander between pieces.

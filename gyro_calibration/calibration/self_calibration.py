@@ -437,8 +437,8 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
             'it; run again and leave it at rest for '
             f'{SETTLING_TIME + limits.rest_duration:g} s after it')
     fit = _add_rest(fit, change, variance)
-    fit.covariance[1, 1] += 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
-    return fit
+    unseen = 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
+    return replace(fit, covariance=fit.covariance + np.diag([0.0, unseen]))
 
 
 def _add_rest(fit: ScaleBiasFit, change: float, variance: float) -> ScaleBiasFit:
