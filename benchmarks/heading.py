@@ -45,7 +45,7 @@ import bounds
 from drives import Course, COURSES, Drive, GYROS, simulate, slow_path
 from gyro_calibration.calibration.self_calibration import (
     fit_heading, self_calibrate, to_model_record)
-from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
 from gyro_calibration.heading.log_compensation import smooth_track
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
@@ -108,7 +108,7 @@ def _integrated(calibration: str, threshold: Threshold | None, known: Known) -> 
     if calibration:
         rate = getattr(known, calibration).correct(rate)
     return Estimate(integrate(time, rate if threshold is None
-                              else filter_rates(threshold, time, rate)))
+                              else ThresholdFilter(threshold).apply_to_all(time, rate)))
 
 
 @lru_cache(1)

@@ -22,7 +22,7 @@ import math
 from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, to_model_record
-from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, Motion, motion_from_rates, ROBOT_MOTION)
@@ -297,7 +297,7 @@ def drive_errors(generator: np.random.Generator) -> Array:
     fits = (fit_heading(time[run], output[run], CALIBRATION_MOTION),
             fit_likelihood(time[run], output[run], CALIBRATION_MOTION, 0.1))
     rates = [output, *(to_model_record(fit, '', '', None).correct(output) for fit in fits)]
-    filtered = [[filter_rates(settings, time, rate) for settings in FILTERS.values()]
+    filtered = [[ThresholdFilter(each).apply_to_all(time, rate) for each in FILTERS.values()]
                 for rate in rates]
     known = np.where(FULL_MOTION.rate_at(time) == 0.0, 0.0, output)
     drive = time >= CALIBRATION_MOTION.duration

@@ -31,6 +31,7 @@ import random
 import struct
 import tempfile
 from typing import Any
+from unittest import mock
 import zlib
 
 from fake_port import SETTINGS
@@ -202,8 +203,7 @@ def check_clock(data: bytes) -> int:
         for stamp in stamps:
             assert math.isfinite(stamp) and stamp > last, (stamp, last)
             last = stamp
-    assert (math.isfinite(clock.period) and clock.period > 0.0
-            and math.isfinite(sum(clock.jitter)))
+    assert math.isfinite(clock.period) and clock.period > 0.0
     assert isinstance(clock.lost_count, int) and clock.lost_count >= 0, clock.lost_count
     return len(data)
 
@@ -233,7 +233,8 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
     """Check that a log is refused in a line, or read the same whole, in blocks, and rewritten."""
     path = _file(data, suffix)
     log = _read(read_log, LogError, path)
-    blocks = _read(lambda path: list(read_log_blocks(path, rows=2)), LogError, path)
+    with mock.patch('gyro_calibration.logs.log.BLOCK_ROWS', 2):
+        blocks = _read(lambda path: list(read_log_blocks(path)), LogError, path)
     assert (log is None) == (blocks is None), 'refused as a whole or in blocks only'
     if log is None:
         return False
@@ -448,7 +449,7 @@ def check_arguments(data: bytes) -> bool:
 _ARGUMENTS = (
     'fit table.csv --out model.yaml --polynomial 3,2 --technology mems', 'turn table.csv --json',
     'diagnose a.csv --model b.yaml --out c',
-    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --window 0.2 --rest',
+    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --rest',
     'allan rest.csv --rate 100 --sensitivity 1e-3',
     'self-calibrate run.csv --turns -5 --marking 1 --reference-drift 1e-3',
     'emulate --protocol csv --model m.yaml --speed 2 --repeat',

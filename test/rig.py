@@ -147,7 +147,7 @@ class Rig:
     def set(self, **parameters):  # noqa: A003
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given.update({names[attribute]: value for attribute, value in parameters.items()})
-        self.pipeline.use_parameters(parameter_values(PARAMETERS, self._given))
+        self.pipeline.values = parameter_values(PARAMETERS, self._given)
 
     def pace_stamps(self, pace):
         """Let the stamps go on from now at another pace than the clock."""

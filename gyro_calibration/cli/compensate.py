@@ -47,9 +47,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--threshold', type=verb.non_negative_number, default=0.0, metavar='DPS',
                         help='rates below it are set to 0, as below 0.3 in the node; '
                         'default: 0, off')
-    parser.add_argument('--window', type=verb.non_negative_number, default=0.2, metavar='S',
-                        help='averaging time of the threshold filter; 0: single samples; '
-                        'default: %(default)g')
     parser.add_argument('--rest', action='store_true', help='detect standstill, as the node does: '
                         'the heading is held there, and the bias is estimated')
     parser.add_argument('--hindsight', action='store_true',
@@ -177,8 +174,8 @@ def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
         with verb.show_progress('heading'):
             blocks = iter([track_log(log, model, given.hindsight, given.log)])
     else:
-        threshold = Threshold(given.threshold * DEGREE, given.window,
-                              model.noise.angle_random_walk)
+        threshold = Threshold(given.threshold * DEGREE,
+                              angle_random_walk=model.noise.angle_random_walk)
         # what is interpolated to the stamps needs the whole log
         logs = [verb.read(given)] if model.moves_stamps else verb.read_blocks(given)
         blocks = integrate_log(logs, model, threshold)

@@ -36,7 +36,7 @@ from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample
 from gyro_calibration.files import InputError, write_atomically
-from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
 from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
@@ -277,12 +277,13 @@ def _evaluate(out: Path, robot: _SimulatedRobot, client: _DemoClient, begin: flo
     true -= true[0]
     calibration = read_model(out / 'calibration.yaml').self_calibration
     assert calibration is not None  # calibrate succeeded, so it is stored
-    corrected, threshold = calibration.correct(raw), Threshold()
+    corrected = calibration.correct(raw)
     headings = {
         'pure integration': integrate(time_, raw),
         'self-calibration': integrate(time_, corrected),
-        'threshold filter': integrate(time_, filter_rates(threshold, time_, raw)),
-        'both': integrate(time_, filter_rates(threshold, time_, corrected)),
+        'threshold filter': integrate(
+            time_, ThresholdFilter(Threshold()).apply_to_all(time_, raw)),
+        'both': integrate(time_, ThresholdFilter(Threshold()).apply_to_all(time_, corrected)),
         'rests tracked': np.interp(time_, stamp, np.unwrap(yaw) - yaw[0])}
     draw_headings(out / 'heading.png', time_ - begin, true, headings)
     write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0], reference_heading=true))

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.dwells import format_list
-from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration, HEADING_ALONE
+from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
 from gyro_calibration.calibration.rate_table import bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS, rms
 from gyro_calibration.calibration.selection import SelectedEffects, TECHNOLOGY_EFFECTS
@@ -32,7 +32,7 @@ from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
-from gyro_calibration.files import InputError, suggest_nearest
+from gyro_calibration.files import suggest_nearest
 from gyro_calibration.logs.log import Array, DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
@@ -61,10 +61,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
-    parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
-                        'matrix C of Ojeda et al., in deg/s and degC')
     verb.add_picture_option(parser, 'the errors before and after')
-    verb.add_picture_option(parser, 'the error over rate and temperature', '--surface')
 
 
 def _parse_effects(text: str) -> list[Effect]:
@@ -88,8 +85,6 @@ def _parse_orders(text: str) -> list[Effect]:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    if given.matrix and not given.polynomial:
-        raise InputError('--matrix needs --polynomial: other effects have no matrix')
     effects = given.effects or given.polynomial or ()
     logs = dict(zip(given.log, verb.read_each(given)))
     with show_progress('fit of effects'):
@@ -100,8 +95,6 @@ def run(given: argparse.Namespace) -> Answer:
                 'technology': given.technology}
     model = replace(found.model, gyro={name: value for name, value in identity.items() if value},
                     origin=verb.make_origin(given.log))
-    if given.surface and not isinstance(found, SelectedEffects):
-        raise InputError(HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
     if given.picture:
@@ -120,19 +113,12 @@ def run(given: argparse.Namespace) -> Answer:
             'reference_temperature_degc': model.reference_temperature,
             'technology': model.gyro.get('technology')}
     if isinstance(found, SelectedEffects):
-        if given.surface:
-            plots.draw_error_surface(given.surface, model, model.rate_range,
-                                     model.temperature_range, found.calibration.used)
         matrix = next((polynomial_to_matrix(term.effect, term.values).tolist()
                        for term in model.terms if term.effect.name == POLYNOMIAL), None)
         lines = list(_dwell_lines(model, found))
         if given.technology and not found.choices:
             lines.append(f'--technology {given.technology} is stored in the model; it had no '
                          'influence, since the effects were given.')
-        if given.matrix and matrix is not None:
-            lines += ['', 'C of eq. 11 for deg/s and degC, highest powers of temperature above, '
-                      'of the output to the left:',
-                      *(' '.join(f'{value: .8e}' for value in row) for row in matrix)]
         data |= {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
                  'remarks': list(found.calibration.dwells.remarks)}
     else:
@@ -146,7 +132,7 @@ def run(given: argparse.Namespace) -> Answer:
                     for name, size in (('rms', rms), ('largest', _largest)) for when, residual in (
                         ('before', found.residual_before), ('after', found.residual_after))},
                  'remarks': list(found.remarks)}
-    return Answer(lines, data, (given.picture, given.surface, given.out))
+    return Answer(lines, data, (given.picture, given.out))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from gyro_calibration.fleet.logs import (
     compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
-    build_models, COMPONENT_LABELS, describe_type, render_fleet_page, summarize_types, table_files)
+    build_models, COMPONENT_LABELS, describe_type, log_table, render_fleet_page, summarize_types)
 from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
@@ -118,7 +118,7 @@ def run(given: argparse.Namespace) -> Answer:
             'types': [type_data(found) for found in types]}
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
                'report.html': render_fleet_page(types, records).encode(),
-               **table_files(types, records)}
+               'logs.csv': log_table(records).encode()}
     names = list(content)
     for found in types:
         for unit, model in build_models(found):

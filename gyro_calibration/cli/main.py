@@ -102,11 +102,7 @@ class _Parser(argparse.ArgumentParser):
         wrong = re.match(r'(?:argument .*: invalid choice: .|unrecognized arguments: )([\w-]+)',
                          message)
         names = re.findall(r'[\w-]+', message.partition('choose from')[2]) or self.options
-        if '--technology' in message and message.startswith('unrecognized arguments'):
-            message += ('; the technology decides between effects in fit, turn and fleet only. '
-                        'diagnose reads it from the model, gyro: {technology: mems}; the answers '
-                        'of other verbs do not depend on it, so omit it')
-        elif wrong:
+        if wrong:
             message += suggest_nearest(wrong[1], names)
         message = re.sub(r'invalid \w+ value: (.*)', r'\1 is no number', message)
         self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')

@@ -19,10 +19,9 @@ from dataclasses import asdict
 from typing import Any
 
 from gyro_calibration.calibration.motion_design import (
-    CalibrationForecast, can_follow, find_best_motion, plain_motion, Plan, Prediction, RobotLimits)
+    CalibrationForecast, can_follow, find_best_motion, plain_motion, Prediction, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.plots import draw_motion
 from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
@@ -45,8 +44,7 @@ _LIMIT_FIELDS = {
     'maximum_heading_deg': ('highest', _NOT_NEGATIVE),
     'rest_s': ('rest', (0.1, 100.0)),
 }
-#: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
-COMPARED_DURATIONS, _MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
+_MAX_DURATION = 300.0  # s, of a motion that is planned
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -56,7 +54,6 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
-    verb.add_picture_option(parser, 'the motion')
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
@@ -79,26 +76,16 @@ def run(given: argparse.Namespace) -> Answer:
                          'run allan on a log at rest, with --model and --out')
     drive = motion_by_name(given.motion)
     given.drive = given.drive or drive.duration
-
-    def find_plan(seconds: float, generations: int = 30) -> tuple[Plan, CalibrationForecast]:
-        forecast = CalibrationForecast(noise, seconds, drive, given.drive)
-        return find_best_motion(robot, forecast, seconds, np.random.default_rng(given.seed),
-                                generations), forecast
-    lengths = [each for each in COMPARED_DURATIONS if each > given.seconds]
-    with show_progress(f'search for the best motion of {given.seconds:g} s') as on_progress:
-        plan, forecast = find_plan(given.seconds, 60)
-        longer = {}
-        for seconds in lengths:
-            on_progress(None, f'for comparison, the best motion of {seconds:g} s')
-            longer[seconds] = find_plan(seconds)[0].prediction
+    with show_progress(f'search for the best motion of {given.seconds:g} s'):
+        forecast = CalibrationForecast(noise, given.seconds, drive, given.drive)
+        plan = find_best_motion(robot, forecast, given.seconds, np.random.default_rng(given.seed),
+                                60)
     built_in = CalibrationForecast(noise, CALIBRATION_MOTION.duration, drive, given.drive).predict(
         CALIBRATION_MOTION)
     rows = {'planned': plan.prediction,
             'plain': forecast.predict(plain_motion(robot, given.seconds)), 'built_in': built_in}
     if given.out:
         write_motion(given.out, plan.motion)
-    if given.picture:
-        draw_motion(given.picture, plan.motion, robot.rate)
     is_built_in_feasible = can_follow(robot, CALIBRATION_MOTION)
     angle, time = plan.motion.heading / DEGREE, plan.motion.time
     rate, planned, plain = plan.motion.rate_at(time), rows['planned'], rows['plain']
@@ -113,7 +100,6 @@ def run(given: argparse.Namespace) -> Answer:
              f'{angle.max():.0f} deg.',
              '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:',
              *(_row(labels[name], row) for name, row in rows.items()),
-             *(_row(f'planned, {seconds:g} s', row) for seconds, row in longer.items()),
              '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} '
              f'times as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
              f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
@@ -124,10 +110,9 @@ def run(given: argparse.Namespace) -> Answer:
     data = {'duration_s': plan.motion.duration, 'time_s': time.tolist(),
             'rate_rad_s': rate.tolist(), **{name: asdict(row) for name, row in rows.items()},
             'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,
-            'heading_gain': heading_gain, 'more_seconds': [{'duration_s': seconds, **asdict(row)}
-                                                           for seconds, row in longer.items()],
-            'drive_s': given.drive, 'seed': given.seed, 'out': given.out}
-    return Answer(lines, data, (given.picture, given.out))
+            'heading_gain': heading_gain, 'drive_s': given.drive, 'seed': given.seed,
+            'out': given.out}
+    return Answer(lines, data, (given.out,))
 
 
 def _read_limits(path: str) -> RobotLimits:

@@ -27,14 +27,10 @@ from typing import Any, TYPE_CHECKING
 
 from gyro_calibration.allan.deviation import AllanChart
 from gyro_calibration.allan.noise_fit import NoiseFit
-from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.files import open_replacement
-from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.motion import Motion
 import numpy as np
 
 if TYPE_CHECKING:
@@ -87,42 +83,6 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
                         'even band is the resolution of the reference.')
 
 
-def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array,
-             motion: Motion) -> Any:
-    """Draw a self-calibration on the clock of its motion: rates, rad/s, and heading errors."""
-    figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1))
-    above.plot(time, rate / DEGREE, color='0.6', linewidth=0.8, label='gyro')
-    above.plot(time, motion.rate_at(time) / DEGREE, color='black', linewidth=1.5,
-               linestyle='--', label=motion.name)
-    above.set(ylabel='rate [deg/s]', title='Run of self-calibration')
-    above.legend(loc='best')
-    true = motion.heading_at(time) - motion.heading_at(time[:1])
-    for values, colour, style, name in ((rate, 'tab:orange', '--', 'before'),
-                                        (corrected, 'tab:blue', '-', 'after')):
-        below.plot(time, (integrate(time, values) - true) / DEGREE, color=colour, linestyle=style,
-                   label=f'{name} self-calibration')
-    below.axhline(0.0, color='black', linewidth=0.5)
-    below.set(xlabel='time [s]', ylabel='heading error [deg]')
-    below.legend(loc='best')
-    return _save_figure(figure, path,
-                        'Above: the rates coincide if the log belongs to the motion. Below: the '
-                        'error before follows the turns; after, it stays near zero.')
-
-
-def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
-    """Draw a motion profile with the rate limit of the robot, rad/s."""
-    figure, ((above,), (below,)) = _panels(2, 1, (9, 6.5), (1, 1))
-    time = np.union1d(np.linspace(0.0, motion.duration, 1000), motion.time)
-    above.plot(time, motion.rate_at(time) / DEGREE, color='black')
-    for sign in (-1.0, 1.0):
-        above.axhline(sign * limit / DEGREE, color='black', linestyle=':', linewidth=1)
-    above.set(ylabel='rate [deg/s]', title=f'Motion of {motion.duration:.3g} s to calibrate by')
-    below.plot(time, motion.heading_at(time) / DEGREE, color='black')
-    below.set(xlabel='time [s]', ylabel='heading [deg]')
-    return _save_figure(figure, path, 'Dotted: rate limit of the robot. Turns both ways separate '
-                        'scale factor error and bias; rests show the bias.')
-
-
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
                names: Mapping[str, str]) -> Any:
     """Draw an Allan chart with the parts of the noise, named by symbol (Hong and Park, fig. 2)."""
@@ -142,72 +102,12 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
         shown = (line > lowest) & (line < highest)
         axes.loglog(times[shown], line[shown] * hour, linestyle=style, linewidth=1.2,
                     color='0.25', label=names[each.term.symbol])
-        symbol, along, up = each.term.symbol, times[shown], line[shown] * hour
-        # IEEE Std 952 reads angle random walk at 1 s; the others are named along their line
-        at = (int(np.argmin(np.abs(along - 1.0))) if symbol == 'N'
-              else len(along) * (1 if symbol in 'BQ' else 2) // 3)
-        # below lines that rise or are close to the sum
-        axes.annotate(symbol, (along[at], up[at]),
-                      xytext={'N': (-9, -16), 'K': (10, -14), 'R': (10, -14)}.get(symbol, (0, 6)),
-                      textcoords='offset points', fontsize=13, weight='bold', ha='center')
     axes.set(xlabel='averaging time [s]', ylabel='Allan deviation [deg/h]',
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
     return _save_figure(figure, path, 'Slope -1/2: white noise, N at 1 s. Flat: flicker, at 0.664 '
                         'B. Slope +1/2: random walk of the bias.')
-
-
-def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
-                       temperature_range: tuple[float, float],
-                       dwells: Dwells | None) -> Any:
-    """Draw the error that a model removes, over output and temperature (Ojeda et al., fig. 6)."""
-    # without a range of temperatures at the reference temperature; dwells are dots
-    output = np.linspace(*rate_range, 161)
-    has_temperature = bool(np.isfinite(temperature_range).all()
-                           and temperature_range[0] < temperature_range[1])
-    figure, panels = _panels(1, 2 if has_temperature else 1,
-                             (11, 5) if has_temperature else (7, 5))
-    if has_temperature:
-        from matplotlib.ticker import MaxNLocator
-        axes, across = panels[0, 0], output / DEGREE
-        up = np.linspace(*temperature_range, 81)
-        grid, warmth = (each.ravel() for each in np.meshgrid(output, up))
-        error = (grid - model.rate(grid, warmth)).reshape(len(up), -1) / DEGREE
-        low, high = float(error.min()), float(error.max())
-        levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(low, max(high, low + 1e-6))
-        largest = float(np.abs(levels).max())
-        axes.grid(False)
-        axes.contourf(across, up, error, levels=levels, cmap=_DIVERGING_COLORMAP, alpha=0.8,
-                      vmin=-largest, vmax=largest, extend='both')
-        lines = axes.contour(across, up, error, levels=levels, colors='black', linewidths=0.8)
-        # each line has its label away from its ends and from the labels of its neighbours
-        places = [tuple(line[round((0.35, 0.5, 0.65)[number % 3] * (len(line) - 1))].tolist())
-                  for number, level in enumerate(lines.allsegs) for line in level
-                  if len(line) > 10]
-        for text in axes.clabel(lines, fontsize=9, manual=places):
-            text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
-        title = 'Error of the gyro by the model [deg/s]'
-        if dwells is not None and dwells.temperature is not None:
-            axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
-            title += '; dots: dwells'
-        axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]', title=title)
-    temperatures = (np.linspace(*temperature_range, 4) if has_temperature
-                    else np.array([model.reference_temperature]))
-    axes = panels[0, -1]
-    if dwells is not None:
-        axes.plot(dwells.output / DEGREE, (dwells.output - dwells.rate) / DEGREE, '.',
-                  color='0.6', markersize=3, label='measured')
-    for temperature, style in zip(temperatures, _LINE_STYLES):
-        error = output - model.rate(output, np.full(len(output), temperature))
-        name = f'model at {temperature:.1f} °C' if has_temperature else 'model'
-        axes.plot(output / DEGREE, error / DEGREE, linestyle=style, color='black', label=name)
-    axes.set(xlabel='gyro output [deg/s]', ylabel='error: output less rate [deg/s]',
-             title='Error over the output')
-    axes.legend(loc='best')
-    return _save_figure(
-        figure, path, 'The error that the model removes; red: the output is above the true rate, '
-        'blue: below it.' if has_temperature else 'The error that the model removes.')
 
 
 def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
@@ -256,21 +156,16 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
                                   ('static bias only', 'the model and its static bias')):
         dots = _draw_dots(axes, errors.turns.rate / DEGREE, error / DEGREE, temperature)
         limit = 1.15 * float(np.abs(error).max()) / DEGREE or 1e-3
-        axes.axvspan(-min_rate / DEGREE, min_rate / DEGREE, facecolor='none', edgecolor='0.7',
-                     hatch='///', linewidth=0)
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set(xlabel='rate [deg/s]', ylabel='error [deg per turn]', ylim=(-limit, limit),
                  title=f'Error of a turn of 360 deg with {words}: '
                  f'largest {np.abs(error).max() / DEGREE:.3g} deg')
-        percent = axes.secondary_yaxis(
-            'right', functions=(lambda degrees: degrees / 3.6, lambda percents: percents * 3.6))
-        percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
     return _save_figure(figure, path, 'Shades of grey: temperature. A step between the senses: '
                         'scale factor error; a curve: nonlinearity; growth towards '
-                        'slow turns: bias or noise. Hatched: slower than '
-                        f'{min_rate / DEGREE:g} deg/s, left out. Scales differ.')
+                        'slow turns: bias or noise. Turns slower than '
+                        f'{min_rate / DEGREE:g} deg/s are left out. Scales differ.')
 
 
 def draw_diagnosis(path: str | Path | None, diagnosis: Diagnosis) -> Any:

@@ -31,10 +31,11 @@ from gyro_calibration.calibration.self_calibration import (
     METHODS, ReferenceErrors, RestCheck, RunLimits, self_calibrate, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.plots import draw_run
+from gyro_calibration.cli.plots import draw_headings
 from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import (
     compensate_log, no_plausible_row_message, plausible_rows)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
@@ -67,7 +68,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f'--reference-{name}', type=verb.non_negative_number, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
                             f'or of the driven profile, {unit}{default}')
-    verb.add_picture_option(parser, 'the run, and its heading error before and after')
+    verb.add_picture_option(parser, 'the heading and its error, before and after')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
 
@@ -198,8 +199,10 @@ class CalibratedRun:
         """Draw the run with its errors before and after, and return the figure."""
         fit = self.fit
         delay = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
-        return draw_run(path, self.time - delay, self.rate,
-                        (self.rate - fit.bias) / (1.0 + fit.scale_factor_error), self.motion)
+        time, true = self.time, self.motion.heading_at(self.time - delay)
+        return draw_headings(path, time, true - true[0], {
+            'before self-calibration': integrate(time, self.rate),
+            'after': integrate(time, (self.rate - fit.bias) / (1.0 + fit.scale_factor_error))})
 
 
 def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,

@@ -28,7 +28,7 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
-from gyro_calibration.files import format_rows, InputError, sha256_digest, write_atomically
+from gyro_calibration.files import InputError, sha256_digest
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.ros_bag import list_recording_files
@@ -51,8 +51,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--slowest', type=verb.positive_number, default=MIN_TURN_RATE / DEGREE,
                         metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
-    parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
-                        'SI units')
     verb.add_picture_option(parser, 'the errors over the rate')
 
 
@@ -79,14 +77,6 @@ def run(given: argparse.Namespace) -> Answer:
             data = {'effects': names, 'left_out': True}
         errors = compute_turn_errors(select_dwells(found, is_inlier), rate[is_inlier],
                                      given.slowest * DEGREE)
-    if given.out:
-        turns, columns = errors.turns, ('sweep', 'reference_rate_rad_s', 'temperature_degc',
-                                        'static_rad_per_turn', 'modelled_rad_per_turn')
-        temperature = (np.full(len(turns), np.nan) if turns.temperature is None
-                       else turns.temperature)
-        rows = zip(turns.location, *(values.tolist() for values in (
-            turns.sweep, turns.rate, temperature, errors.static, errors.modelled)))
-        write_atomically(given.out, format_rows([('place', *columns), *rows]).encode())
     if given.picture:
         draw_turn_errors(given.picture, errors, given.slowest * DEGREE)
     remarks = [*found.remarks, *errors.remarks, *remarks]
@@ -121,7 +111,7 @@ def run(given: argparse.Namespace) -> Answer:
         'static_rad_per_turn': errors.static.tolist(),
         'modelled_rad_per_turn': errors.modelled.tolist(),
         'sweep': turns.sweep.tolist(), 'place': list(turns.location), 'remarks': remarks,
-        **data}, (given.out, given.picture))
+        **data}, (given.picture,))
 
 
 def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,

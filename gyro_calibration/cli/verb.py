@@ -26,7 +26,7 @@ from typing import Any
 
 from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
-from gyro_calibration.logs.columns import AXES, suggest_attitude
+from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
     Array, BLOCK_ROWS, DataRefused, DEGREE, Log, read_log, read_log_blocks, select_rows,
     unwrap_heading)
@@ -99,9 +99,8 @@ class Answer:
         return '\n'.join([*self.lines, *(f'Written to {each}.' for each in self.files if each)])
 
 
-def add_picture_option(parser: argparse.ArgumentParser, what: str,
-                       option: str = '--picture') -> None:
-    parser.add_argument(option, type=_picture_file, metavar='FILE',
+def add_picture_option(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument('--picture', type=_picture_file, metavar='FILE',
                         help=f'draw {what}, .png or .svg')
 
 
@@ -205,13 +204,9 @@ def read(given: argparse.Namespace) -> Log:
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the logs of a verb that takes several; name an attitude that could be a reference."""
+    """Read the logs of a verb that takes several."""
     for path in given.log:
-        log = read(argparse.Namespace(**{**vars(given), 'log': path}))
-        if (log.reference_heading is None and log.reference_rate is None
-                and (attitude := suggest_attitude(log.others))):
-            print_message(f'{path}: for the attitude as reference, add {attitude} to --columns')
-        yield log
+        yield read(argparse.Namespace(**{**vars(given), 'log': path}))
 
 
 def cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
@@ -252,14 +247,14 @@ def add_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     """Read the log of a verb block by block, with a progress bar."""
-    if is_recording(given.log) or given.unwrap:
+    if is_recording(given.log) or given.unwrap or 'attitude' in given.names:
         log = read(given)
         yield from (select_rows(log, slice(begin, begin + BLOCK_ROWS))
                     for begin in range(0, len(log), BLOCK_ROWS))
         return
     with _show_bytes_read(given.log) as on_progress:
-        blocks = read_log_blocks(given.log, given.sensitivity, given.rate,
-                                 on_progress=on_progress, columns=given.names, axis=given.axis)
+        blocks = read_log_blocks(given.log, given.sensitivity, given.rate, given.names,
+                                 given.axis, on_progress)
         for log in cut_to_range(given, blocks):
             yield _orient_output(given, log)
 

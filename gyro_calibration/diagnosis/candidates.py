@@ -31,8 +31,6 @@ from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.interpolate import BSpline
 
-#: Least step rate of an encoder, 1/s, at which a dead zone is searched for.
-_MIN_ENCODER_STEP_RATE = 20.0
 #: Times of a bias step, and of a bump, that are tried in all logs together.
 MAX_STEP_TIMES = 64
 #: Lack of log-likelihood at the ends of the interval of 95 % of the time of a step: a random walk
@@ -40,9 +38,6 @@ MAX_STEP_TIMES = 64
 MAX_STEP_TIME_LACK = -math.log(1.0 - math.sqrt(0.95))
 #: Least change of a channel in a log, K, V and m/s²; with less it counts as missing.
 MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
-
-#: Shortest thermal lag, s; a shorter one equals a sensitivity to the temperature rate.
-_MIN_THERMAL_LAG = 12.0
 
 #: Prefix of the name of structure without a name, which its variable follows; and the name of an
 #: error that is proportional to the rate in a part of a log.
@@ -188,8 +183,9 @@ def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
     of_log: dict[str, list[tuple[float, ...]]] = {
         'warm_up': [(each,) for each in np.geomspace(
             duration / 100.0, duration * 0.7, 9).tolist()],
+        # a shorter one equals a sensitivity to the temperature rate
         'thermal_lag': [(each,) for each in np.geomspace(
-            _MIN_THERMAL_LAG, min(duration, 3000.0), 8).tolist()],
+            12.0, min(duration, 3000.0), 8).tolist()],
         'thermal_hysteresis': [(1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)],
         'bias_temperature': [(middle,)], 'scale_factor_temperature': [(middle,)],
         # that of data sheets, mean and first temperature; of two that are as likely, a few kelvin
@@ -225,10 +221,10 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
                                    half_width=1.5 * spacing)
     if not moves:
         return
-    # At lower rates the quantization of the encoder, or the largest noise of a heading in a log,
-    # passes for a dead zone.
+    # At less than 20 steps of an encoder a second its quantization, or the largest noise of a
+    # heading in a log, passes for a dead zone.
     slowest = max(1e-5 * fastest, *(
-        max(_MIN_ENCODER_STEP_RATE * each.heading_step, each.heading_noise / each.interval
+        max(20.0 * each.heading_step, each.heading_noise / each.interval
             * math.sqrt(2.0 * math.log(each.point_count))) for each in replays))
     distortions = {
         'sine_response': [angle / fastest for angle in (0.5, 1.0, 1.5, 2.0)],

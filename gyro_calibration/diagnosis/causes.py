@@ -110,6 +110,7 @@ CAUSES: dict[str, Cause] = {
     **{name: _cause_of_effect(effect) for name, effect in CATALOGUE.items()},
     **{name: Cause(name, sentence, {name: unit}, frozenset(needs.split()), along, separate_by, of)
        for name, sentence, unit, of, needs, along, separate_by in _OTHER_CAUSES}}
+NOISE_NAMES = tuple(name for name, cause in CAUSES.items() if cause.origin == 'noise')
 
 
 def register_causes(effects: Iterable[Effect]) -> None:
@@ -149,6 +150,13 @@ def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
                 'separate_by': cause.separate_by if confounders else ''}
     return Finding(name, parameters=parameters, p_value=p_value,
                    ambiguous_with=tuple(confounders), **{**defaults, **fields})
+
+
+def sized_finding(name: str, value: float, half_width: float, p_value: float,
+                  confounders: Sequence[str] = (), **fields: Any) -> Finding:
+    """Return a finding of a cause by its size and the half-width of the interval, in SI."""
+    size = Estimate.from_half_width(float(value), half_width, CAUSES[name].unit)
+    return make_finding(name, {name: size}, p_value, confounders, **fields)
 
 
 def mark_suspected(found: Finding) -> Finding:

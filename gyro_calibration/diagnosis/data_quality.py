@@ -23,13 +23,12 @@ units are reported if they are large enough to matter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_output
-from gyro_calibration.diagnosis.causes import CAUSES, make_finding
-from gyro_calibration.diagnosis.findings import Estimate, Finding
+from gyro_calibration.diagnosis.causes import sized_finding
+from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.gates import (
     compare_headings, fit_line, identify_unit_factor, is_implausible_factor, model_scale_factor,
     reference_angle, reference_rate, resample_reference, select_reference, spline_rate,
@@ -49,27 +48,17 @@ from scipy.special import ndtr
 
 #: False-alarm probability of each check.
 FALSE_ALARM_CHANCE = 2e-4
-#: Least step of codes that matters, as a share of the white noise; the same for a step of the
-#: reference, as a share of the variance.
-_MIN_STEP_NOISE_RATIO, _MIN_STEP_VARIANCE_SHARE = 0.2, 0.02
-#: Least number of separate runs of an extreme code, which a repetition fault does not cause.
-_MIN_LIMIT_RUNS = 3
-#: Output of a rest, as a share of the largest; a limit is higher, and a dead band is lower.
-_REST_RATE_SHARE = 0.1
-#: Number of classes of motion, by the expected change near a sample.
-_MOTION_CLASSES = 8
-#: Probability of a repeat from which on single repeats of a coarse output are not tested, and up
-#: to which they are marked as a fault.
-_COARSE_REPEAT_CHANCE, _RARE_REPEAT_CHANCE = 0.3, 0.02
+#: Least step of codes that matters, as a share of the white noise.
+_MIN_STEP_NOISE_RATIO = 0.2
+#: Probability of a repeat from which on single repeats of a coarse output are not tested.
+_COARSE_REPEAT_CHANCE = 0.3
 #: A deviation that noise reaches rarely, in standard deviations: from there to that of outliers
 #: there are at most half as many samples as outliers, as more are a tail of the noise, and samples
 #: whose expected output is as near to a limit are not used, as noise determines whether they are
 #: clipped.
 _RARE_SIGMAS = 4.5
-#: Numbers of neighbours on each side with which a sample is compared, of samples between a jolt in
-#: the output and in the reference, of samples in a block of constant scatter, and of consecutive
-#: outliers, at most.
-_NEIGHBOURS_PER_SIDE, _JOLT_SAMPLES, _SCATTER_BLOCK_SAMPLES, _MAX_OUTLIER_RUN = 3, 10, 256, 2
+#: Number of neighbours on each side with which a sample is compared.
+_NEIGHBOURS_PER_SIDE = 3
 
 
 @dataclass(frozen=True)
@@ -108,29 +97,22 @@ def _local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
     return steps
 
 
-@dataclass(frozen=True)
-class _DeadBand:
-    """A frequent value without other values near it."""
-
-    value: float  # rad/s
-    half_width: float  # distance of the nearest other value, rad/s
-    within: Mask  # the samples in it, shape (n,)
-
-
-def _find_dead_band(codes: QuantizationCodes, output: Array) -> _DeadBand | None:
+def _find_dead_band(codes: QuantizationCodes,
+                    output: Array) -> tuple[float, float, Mask] | None:
+    """Return a frequent value without others near, their distance, and samples in between."""
     counts = np.where(np.abs(codes.values) < _rest_rate_limit(output), codes.counts, 0)
     place = int(np.argmax(counts))
     value = float(codes.values[place])
     half_width = float(np.abs(np.delete(codes.values, place) - value).min(initial=np.inf))
     within = np.abs(output - value) < 0.5 * half_width
-    return (_DeadBand(value, half_width, within)
+    return ((value, half_width, within)
             if counts[place] > 1 and len(find_runs(within)) > 1 and half_width > 1.5 * codes.step
             else None)
 
 
 def _rest_rate_limit(output: Array) -> float:
-    """Return the largest absolute output of a rest, by a quantile that excludes outliers."""
-    return _REST_RATE_SHARE * float(np.quantile(np.abs(output), 0.99))
+    """Return the largest output of a rest, a tenth of the largest one but for outliers."""
+    return 0.1 * float(np.quantile(np.abs(output), 0.99))
 
 
 def _is_beyond(output: Array, low: float, high: float) -> Mask:
@@ -171,7 +153,7 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
                   else -math.inf)
         # The expected output errs by bias wander and nonlinearity, which these samples share.
         if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
-                or fine and len(find_runs(both)) >= _MIN_LIMIT_RUNS):
+                or fine and len(find_runs(both)) > 2):  # a fault repeats it in one or two runs
             found[sign], p_value = float(extreme), min(p_value, chance)
     return -found[-1.0], found[1.0], p_value
 
@@ -179,7 +161,8 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
 # repeated samples
 
 def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
-                           band: _DeadBand | None, valid: Mask) -> tuple[Mask, float]:
+                           band: tuple[float, float, Mask] | None,
+                           valid: Mask) -> tuple[Mask, float]:
     """Mark repeated samples among valid ones; and return the p-value of number or longest run."""
     known, change = valid[1:] & valid[:-1], np.diff(comparison.output)
     same = (change == 0.0) & known
@@ -206,17 +189,17 @@ def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
         # a sample in it repeats while the next is due in it, by its expected output or by a rest
         due = (np.full(len(change), np.median(comparison.output)) if comparison.expected is None
                else comparison.expected[1:])
-        deviation = max(comparison.deviation, 1e-9 * band.half_width)
-        member = _chance_within(np.nan_to_num(due - band.value),
-                                band.half_width + 2.0 * deviation, deviation)
-        within = band.within[:-1]
-        chance = np.where(within, np.maximum(chance, member), chance)
-        width = np.where(within, 2.0 * band.half_width, width)
+        value, half_width, within = band
+        deviation = max(comparison.deviation, 1e-9 * half_width)
+        member = _chance_within(np.nan_to_num(due - value), half_width + 2.0 * deviation,
+                                deviation)
+        chance = np.where(within[:-1], np.maximum(chance, member), chance)
+        width = np.where(within[:-1], 2.0 * half_width, width)
     rare = (chance < _COARSE_REPEAT_CHANCE) & known
     excess, expected_count = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
     by_number = float(stats.poisson.sf(excess - 1, expected_count))
     if by_number < FALSE_ALARM_CHANCE and excess > 1.5 * expected_count:
-        repeats[1:], p_value = same & (chance < _RARE_REPEAT_CHANCE), by_number
+        repeats[1:], p_value = same & (chance < 0.02), by_number
     product, travel = (np.concatenate([[0.0], np.cumsum(each)])
                        for each in (np.log(np.maximum(chance, 1e-12)), expected))
     for run in find_runs(same):
@@ -241,8 +224,8 @@ def _chance_within(expected: Array, half_width: Array | float, deviation: Array 
 
 
 def _motion_classes(motion: Array) -> NDArray[np.intp]:
-    """Return the class of each sample, with as many samples in each class, by its motion."""
-    edges = np.quantile(motion, np.linspace(0.0, 1.0, _MOTION_CLASSES + 1)[1:-1])
+    """Return the class of each sample, with an eighth of the samples each, by its motion."""
+    edges = np.quantile(motion, np.linspace(0.0, 1.0, 9)[1:-1])
     return np.searchsorted(np.unique(edges), motion, side='left')
 
 
@@ -272,9 +255,9 @@ def _find_outliers(comparison: _Comparison, valid: Mask,
         output = output - expected
         padded = np.pad(expected, 2 * _NEIGHBOURS_PER_SIDE, mode='edge')
         expected_change = np.ptp(sliding_window_view(padded, 4 * _NEIGHBOURS_PER_SIDE + 1), axis=1)
-        # from the cubic through two samples on each side
+        # from the cubic through two samples on each side; a jolt of the output is near
         by_cubic = np.abs(np.diff(np.pad(expected, 2, mode='edge'), 4)) / 6.0
-        jumps = maximum_filter1d(by_cubic, 2 * _JOLT_SAMPLES + 1)
+        jumps = maximum_filter1d(by_cubic, 21)
     # the samples about each one, the outer ones at the ends, and those without itself
     size, index = 2 * _NEIGHBOURS_PER_SIDE + 1, np.arange(count)
     first = np.clip(index - _NEIGHBOURS_PER_SIDE, 0, count - size)
@@ -284,7 +267,7 @@ def _find_outliers(comparison: _Comparison, valid: Mask,
     off = np.abs(output - np.median(near, axis=1))
     # in standard deviations: of the samples about it, and of those that move alike, by far ones
     # too if there are enough, for rough motion
-    blocks = max(1, count // _SCATTER_BLOCK_SAMPLES)
+    blocks = max(1, count // 256)
     parts, kept = np.array_split(off, blocks), np.array_split(valid, blocks)
     of_blocks = [_robust_quantile(part[own]) for part, own in zip(parts, kept)]
     scale = np.repeat(maximum_filter1d(of_blocks, 3, mode='nearest'),
@@ -315,7 +298,7 @@ def _find_outliers(comparison: _Comparison, valid: Mask,
     tested = valid & (np.count_nonzero(~valid[neighbours], axis=1) < _NEIGHBOURS_PER_SIDE)
     outlying = (sigmas > limit) & tested
     for run in find_runs(outlying):
-        outlying[run] = run.stop - run.start <= _MAX_OUTLIER_RUN
+        outlying[run] = run.stop - run.start <= 2
     found = int(np.count_nonzero(outlying))
     rare = int(np.count_nonzero((sigmas > _RARE_SIGMAS) & (sigmas <= limit) & tested))
     usual = stats.poisson.isf(0.01, 2.0 * count * stats.norm.sf(_RARE_SIGMAS))
@@ -334,12 +317,8 @@ class DataQuality:
     findings: tuple[Finding, ...]  # one for each cause
     remarks: tuple[str, ...]  # for people, one sentence each
     usable: Mask  # the samples to use, shape (n,)
-    # by which the output is multiplied to be in rad/s; 1 if the unit is right
-    unit_factor: float = 1.0
-    # largest absolute output, rad/s after the factor; None without a limit
-    limit: float | None = None
-    # quantization step of the output, rad/s after the factor; 0 if it does not matter
-    output_step: float = 0.0
+    limit: float | None = None  # largest absolute output, rad/s; None without a limit
+    output_step: float = 0.0  # quantization step of the output, rad/s; 0 if it does not matter
     heading_step: float = 0.0  # quantization step of the reference heading, rad; 0 without one
 
 
@@ -357,17 +336,10 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     resampled = resample_reference(log)
     output, rate = require_output(log), reference_rate(resampled)
     has_output, heading = np.isfinite(output), resampled.reference_heading
+    if log.time is not None and log.reference_rate is None and heading is not None:
+        rate = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
     line = None if rate is None else fit_line(log.time, rate, output)
-    if (rate is not None and line is not None and log.time is not None
-            and log.reference_rate is None and heading is not None):
-        # A smooth rate of a heading errs at the ends of a log and at corners of the motion, and
-        # that by splines by the noise of the heading: the one closer to the output is used.
-        sharp = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
-        off_sharp, off = (float(np.nanmean((output - line.factor * each - line.offset) ** 2))
-                          for each in (sharp, rate))
-        rate = sharp if off_sharp <= off else rate
-        line = fit_line(log.time, rate, output) or line
-    factor, units = 1.0, []
+    units = []
     if rate is not None and line is not None:
         # a factor in addition to the scale factor of the model
         own = 1.0 if model is None else model_scale_factor(model, rate)
@@ -381,21 +353,21 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         if name is not None and (best is None or abs(best.factor - 1.0) >= abs(
                 best.factor - 1.0 / UNIT_FACTORS[name]) or abs(
                 best.factor - 1.0 / UNIT_FACTORS[name]) <= 5.0 * best.deviation):
-            factor = 1.0 / UNIT_FACTORS[name]
-            units = [_sized_finding(
+            is_plausible = not is_implausible_factor(ratio)
+            units = [sized_finding(
                 'unit_error', ratio, NORMAL_QUANTILE_975 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
-                f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
-                f'{name} is {UNIT_FACTORS[name]:.5g}',
-                () if is_implausible_factor(ratio) else ('scale_factor_error',))]
+                ('scale_factor_error',) * is_plausible,
+                evidence=f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
+                f'{name} is {UNIT_FACTORS[name]:.5g}'
+                + '; a new model has it as a scale factor error' * is_plausible)]
     if log.time is None:
-        return DataQuality(tuple(units), notes, has_output, factor)
+        return DataQuality(tuple(units), notes, has_output)
     lost, remarks = _check_stamps(log.time, has_output)
-    output = output * factor
     whole, noise = bridge_gaps(output), white_noise_deviation(output)
     comparison = _Comparison(whole, None, noise, noise)
     if rate is not None and line is not None:
-        expected = factor * (line.factor * rate + line.offset)
+        expected = line.factor * rate + line.offset
         off = (output - expected)[np.isfinite(output) & np.isfinite(expected)]
         noise = min(noise, white_noise_deviation(output - expected))
         comparison = _Comparison(whole, expected, noise, max(
@@ -403,31 +375,8 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     heading = log.reference_heading if log.reference_rate is None else None
     step = (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
             else encoder_step(heading))
-    return _check_samples(DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
+    return _check_samples(DataQuality((*units, *lost), (*notes, *remarks), has_output,
                                       heading_step=step), comparison, model, log.time)
-
-
-def resolve_unit(quality: DataQuality) -> DataQuality:
-    """Return the treatment of the unit; a factor that a gyro may have is a scale factor error."""
-    if quality.unit_factor == 1.0:
-        return quality
-    if is_implausible_factor(quality.unit_factor):
-        note = (f'The output was multiplied by {quality.unit_factor:.6g} first, and a new model '
-                'applies to the corrected output: correct the unit or the sign of the log (its '
-                'column, --sensitivity, --invert) before it is compensated.')
-        return replace(quality, remarks=(*quality.remarks, note))
-    note = (f'The output was not multiplied by {quality.unit_factor:.6g}, as this factor may '
-            'belong to the gyro: a new model contains it as a scale factor error.')
-    return replace(quality, unit_factor=1.0, output_step=quality.output_step / quality.unit_factor,
-                   limit=None if quality.limit is None else quality.limit / quality.unit_factor,
-                   remarks=(*quality.remarks, note))
-
-
-def _sized_finding(name: str, value: float, half_width: float, p_value: float, evidence: str,
-                   confounders: Sequence[str] = ()) -> Finding:
-    return make_finding(
-        name, {name: Estimate.from_half_width(float(value), half_width, CAUSES[name].unit)},
-        p_value, confounders, evidence=evidence)
 
 
 def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[str]]:
@@ -445,8 +394,8 @@ def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[st
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
     if not lost.any() or chance >= FALSE_ALARM_CHANCE:
         return [], remarks
-    return [_sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
-                           stamps.loss_remarks[0].rstrip('.'))], remarks
+    return [sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
+                          evidence=stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
 def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroModel | None,
@@ -465,7 +414,7 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
     valid = has_output & ~at_limit & ~repeated
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(
-        band.within, iterations=_NEIGHBOURS_PER_SIDE)
+        band[2], iterations=_NEIGHBOURS_PER_SIDE)
     outlying, p_outlying, sigmas = _find_outliers(comparison, tested, 0.5 * codes.step)
     valid &= ~outlying
     if comparison.expected is not None:
@@ -481,31 +430,34 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
     matters = codes.step >= _MIN_STEP_NOISE_RATIO * noise
     if matters and codes.step and not is_in_model('quantization', codes.step):
         chance = float(np.exp(-min(codes.counts.sum() * codes.alignment ** 2, 700.0)))
-        findings.append(_sized_finding(
+        findings.append(sized_finding(
             'quantization', codes.step, NORMAL_QUANTILE_975 * codes.step_deviation, chance,
-            f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
+            evidence=f'the output has {len(codes.values)} codes, '
+            f'{codes.step / DEGREE:.4g} deg/s apart, '
             f'where its white noise is {noise / DEGREE:.3g} deg/s'))
     limit = min(-low, high)
     if math.isfinite(limit) and not is_in_model('saturation', limit):
         sides = [f'{value / DEGREE:.5g} deg/s' for value in (low, high) if np.isfinite(value)]
-        findings.append(_sized_finding(
-            'saturation', limit, 0.0, p_limit, f'{np.count_nonzero(at_limit)} samples '
+        findings.append(sized_finding(
+            'saturation', limit, 0.0, p_limit,
+            evidence=f'{np.count_nonzero(at_limit)} samples '
             f'({100.0 * at_limit.mean():.2g} %) have the extreme code {" or ".join(sides)}'))
     for name, fault, p_value in (('stuck_samples', repeated, p_repeated),
                                  ('outliers', outlying, p_outlying)):
         if fault.any():
             count, runs = int(fault.sum()), len(find_runs(fault))
             first = f'the first at {time[int(np.argmax(fault))]:.3f} s'
-            findings.append(_sized_finding(
+            findings.append(sized_finding(
                 name, count, 0.0, p_value,
-                f'{count} single samples differ from their neighbours by up to '
+                evidence=f'{count} single samples differ from their neighbours by up to '
                 f'{sigmas:.0f} sigma, {first}' if name == 'outliers' else
                 f'{count} samples in {runs} run{"s" * (runs > 1)} repeat the one before, '
                 f'{first}; codes and noise do not explain them'))
     interval, step = float(np.median(np.diff(time))), quality.heading_step
-    if step and step ** 2 / 6.0 > _MIN_STEP_VARIANCE_SHARE * (interval * noise) ** 2:
-        findings.append(_sized_finding(
-            'reference_quantization', step, 0.0, 0.0, 'the reference heading comes in steps of '
+    if step and step ** 2 / 6.0 > 0.02 * (interval * noise) ** 2:
+        findings.append(sized_finding(
+            'reference_quantization', step, 0.0, 0.0,
+            evidence='the reference heading comes in steps of '
             f'{step / DEGREE:.4g} deg: its rate over one sample is uncertain by '
             f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
             f'{noise / DEGREE:.3g} deg/s of noise'))

@@ -23,11 +23,11 @@ from dataclasses import replace
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
+from gyro_calibration.diagnosis.causes import NOISE_NAMES
 from gyro_calibration.diagnosis.data_quality import DataQuality
-from gyro_calibration.diagnosis.findings import Change, Finding, Gain, HeadingCurve
+from gyro_calibration.diagnosis.findings import Change, Curve, Finding, Gain
 from gyro_calibration.diagnosis.regression import fit_causes, is_single_event, RegressionFit
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.residuals import NOISE_NAMES
 from gyro_calibration.diagnosis.search import restrict_search, Search, search_causes
 from gyro_calibration.logs.log import Array, Mask
 from gyro_calibration.model.effects import (
@@ -80,8 +80,10 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     figures = figures if given.noise.angle_random_walk else noise
     bounds = {name: ends for name, ends in given.noise_bounds.items()
               if getattr(figures, name) == getattr(given.noise, name)}
-    return add_origin_notes(replace(new, noise=figures, noise_bounds=bounds), given, quality,
-                            findings)
+    used = {term.effect.name for term in new.terms if term not in given.terms}
+    notes = ambiguity_notes([each for each in findings if each.effect in used])
+    return replace(new, noise=figures, noise_bounds=bounds,
+                   origin={**notes, **previous_origins(given)})
 
 
 def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> GyroModel:
@@ -126,22 +128,11 @@ def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
         temperature_range=widen_range(model.temperature_range, temperatures, has_ranges))
 
 
-def add_origin_notes(new: GyroModel, base_model: GyroModel, quality: Sequence[DataQuality],
-                     findings: Sequence[Finding] = ()) -> GyroModel:
-    """Return a new model with its ambiguities, output factors and predecessor in its origin."""
-    used = {term.effect.name for term in new.terms if term not in base_model.terms}
-    notes = origin_notes([each for each in findings if each.effect in used],
-                         [clean.unit_factor for clean in quality])
-    return replace(new, origin={**notes, **previous_origins(base_model)})
-
-
-def origin_notes(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
-    """Return the notes on ambiguous findings and on factors of the output for a model file."""
+def ambiguity_notes(findings: Sequence[Finding]) -> dict[str, object]:
+    """Return the note on ambiguous findings for a model file."""
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
             for each in findings if each.ambiguous_with]
-    output_factors = list(factors) if any(factor != 1.0 for factor in factors) else []
-    return {name: note for name, note in (('ambiguous', sets),
-                                          ('output_multiplied_by', output_factors)) if note}
+    return {'ambiguous': sets} if sets else {}
 
 
 def previous_origins(model: GyroModel) -> dict[str, object]:
@@ -418,11 +409,11 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
             'left': max(left - reference_square / square, 0.0)}
 
 
-def heading_curve(parts: Mapping[str, Array], time: Array) -> HeadingCurve:
+def heading_curve(parts: Mapping[str, Array], time: Array) -> Curve:
     """Return the heading error of a log and its rest, as `heading_error_shares` splits it."""
     total = sum(parts.values(), 0.0 * parts['left'])
     before, after = (np.concatenate([[0.0], np.cumsum(each)]) for each in (total, parts['left']))
-    return HeadingCurve(time, before, after)
+    return Curve('time', 's', time, before, after)
 
 
 def jackknife_change(square_sums: Array, counts: Array) -> Change:

@@ -199,52 +199,20 @@ class Gain(_Record):
 
 @dataclass(frozen=True)
 class Curve:
-    """The residual along one variable, in bins, for charts: arrays of shape (bins,), in SI."""
+    """An error along one variable, for charts: arrays of shape (n,), in SI."""
 
     along: str  # rate, temperature, heading, time, frequency ...
     unit: str  # of `at`, SI
-    at: Array  # middle of each bin
-    # before, after: mean of the residual there, against the model that was given and against the
-    # extended one, rad/s
+    at: Array  # the variable; middles of bins
+    # before, after: measured less simulated there, by the model that was given and by the
+    # extended one
     before: Array
     after: Array
-    # standard deviation of these means by noise alone, slow noise included, rad/s; along
-    # frequency, where amplitudes replace means, the root mean square amplitude
-    deviation: Array
-    # mean error, output less true rate, of the simulation with the given model there, rad/s; the
-    # measured one is the sum of this and `before`
+    # standard deviation of means by noise alone, slow noise included; along frequency, where
+    # amplitudes replace means, the root mean square amplitude
+    deviation: Array | None = None
+    # what is simulated with the given model; the measured one is the sum of this and `before`
     simulated: Array | None = None
-
-
-@dataclass(frozen=True)
-class Trace:
-    """Measured and simulated output over time: arrays of shape (n,), s and rad/s."""
-
-    time: Array  # s, as in the log
-    measured: Array  # output of the gyro
-    # simulated, extended: output of the given and of the extended model for the same motion,
-    # without noise
-    simulated: Array
-    extended: Array
-
-
-@dataclass(frozen=True)
-class HeadingCurve:
-    """Heading error of the simulation over the log: arrays of shape (n,), s, rad."""
-
-    time: Array
-    before: Array
-    after: Array
-
-
-@dataclass(frozen=True)
-class NoiseCurve:
-    """Allan deviations, shape (n,), s and rad/s; simulated is None for a model without noise."""
-
-    averaging_time: Array
-    measured: Array
-    fitted: Array
-    simulated: Array | None
 
 
 @dataclass(frozen=True)
@@ -274,13 +242,16 @@ class Diagnosis(_Record):
     before: GyroModel  # the tested simulation
     model: GyroModel  # the extended one; the same if none is offered
     cannot_show: Mapping[str, str] = field(default_factory=dict)  # cause -> why
-    curves: Sequence[Curve] = ()  # the residual along each variable
-    heading: HeadingCurve | None = None
-    noise_curve: NoiseCurve | None = None
+    # of the mean error of the rate along each variable, rad/s, and of the heading over time, rad
+    curves: Sequence[Curve] = ()
+    heading: Curve | None = None
+    # Allan deviations over the averaging time, rad/s: `before` of the residual, `after` of the
+    # noise that was found, and simulated; None for a model without noise
+    noise_curve: Curve | None = None
     remarks: tuple[str, ...] = ()  # for people, one sentence each
     false_alarm_rate: float = FALSE_ALARM_RATE  # per diagnosis
     logs: tuple[str, ...] = ()  # names of the files
-    trace: Trace | None = None
+    trace: Curve | None = None  # of the output over time, rad/s
     method: str = ''  # how it was computed, for people; empty for the method of logs in time
     gates: tuple[Gate, ...] = ()  # checks before causes were named
     # cause, 'reference' or 'left' -> share in the mean square of the heading error over 60 s

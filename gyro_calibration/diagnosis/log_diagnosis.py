@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells import find_dwells, require_output
+from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
@@ -28,33 +28,31 @@ from gyro_calibration.diagnosis.candidates import (
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
     add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected, next_experiment,
-    REFERENCES, SINGLE_EVENT_REMEDY, untestable_causes)
-from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
+    NOISE_NAMES, REFERENCES, SINGLE_EVENT_REMEDY, sized_finding, untestable_causes)
+from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    add_causes, add_origin_notes, drop_samples, extend_model, heading_contributions,
-    heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
-    unmergeable_causes)
+    add_causes, drop_samples, extend_model, heading_contributions, heading_error_shares,
+    is_scale_implausible, measure_gain, merge_self_calibration, unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
     DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED,
     OnProgress, probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
     VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.gates import (
     check_gates, check_model_units, classify_reference, is_at_rest,
-    is_reference_limiting, is_sample_offset, mismatch_finding, refuse_unusable)
+    is_reference_limiting, is_sample_offset, mismatch_diagnosis, refuse_unusable)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
-    follow_reference, FollowedReference, follows_rate, HIDDEN_CAUSES, is_late)
+    follow_reference, follows_rate, HIDDEN_CAUSES, is_late)
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise, build_problem, fit_causes, forget_fits, is_single_event, RegressionFit,
     SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, heading_error_curve, model_residuals,
-    NOISE_NAMES, residual_curves)
+    residual_curves)
 from gyro_calibration.diagnosis.search import (
     complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
     refine_shape, Scored, Search, search_causes, Selection, start_search)
-from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
@@ -111,16 +109,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
         passed = check_gates(log, model, reference_kind == 'rate_command')
-        failed = mismatch_finding(passed)
-        if failed is None or failed.effect != 'wrapped_heading':
+        mismatch = mismatch_diagnosis(passed, given_model)
+        if mismatch is None or passed[-1].name != 'wrapped_heading':
             refuse_unusable(given[place])
-        if failed is None and model is not None:
+        if mismatch is None and model is not None:
             passed = (*passed, check_model_units(log, model))
-            failed = mismatch_finding(passed)
-        if failed is not None:
-            own = given_model or GyroModel()
-            return Diagnosis((failed,), (), Noise(), own.noise, None, own, own,
-                             logs=tuple(names[place:place + 1]), gates=passed)
+            mismatch = mismatch_diagnosis(passed, given_model)
+        if mismatch is not None:
+            return replace(mismatch, logs=tuple(names[place:place + 1]))
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
     logs, slips = zip(*(_bridge_jumps(log, each.kind, remarks)
@@ -187,10 +183,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                                  is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
     on_progress(None, 'data quality')
-    quality = [resolve_unit(inspect_record(log, model)) for log in logs]
+    quality = [inspect_record(log, model) for log in logs]
     on_progress(None, 'replay of the model')
-    replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
-                      generator, clean.heading_step, clean.output_step, model)
+    replays = [replay(log, clean.usable, generator, clean.heading_step, clean.output_step, model)
                for log, clean in zip(logs, quality)]
     searched = _search_logs(logs, replays, rate, on_progress, is_command)
     search = searched.search
@@ -227,7 +222,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     findings += searched.findings
     # a motion that follows has noise of its own
     if model is not None and not searched.hidden:
-        findings += _noise_findings(found, model, rate, rounds)
+        findings += find_changed_figures(found, model, VALUE_ALARM_SHARE * rate, rounds).values()
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
     inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
@@ -235,7 +230,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     plain = fit_causes(search.problem, [])
     deviation = _mean_bias_deviation(inside, noise)
     best = replace(add_causes(GyroModel(), plain, deviation), noise=noise)
-    before = model or add_origin_notes(best, GyroModel(), quality)
+    before = model or best
     after = extend_model(model, inside, quality, findings, noise, deviation) if offered else before
     # Curves before the extension contain the best bias and scale factor error, unless these differ
     # significantly from those of the model.
@@ -261,8 +256,8 @@ def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: 
                        model: GyroModel | None, rate: float,
                        on_progress: OnProgress) -> Diagnosis:
     """Diagnose a log by spans, if its motion has more of its own than a response to a command."""
-    assert searched.followed is not None and log.reference_rate is not None
-    motion = searched.followed.replays[0]
+    motion = searched.followed
+    assert motion is not None and log.reference_rate is not None
     of_motion = np.where(motion.valid, log.reference_rate + motion.reference - given.reference,
                          np.nan)
     found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
@@ -288,50 +283,33 @@ class _Searched:
     findings: Sequence[Finding] = ()
     unexplained: Sequence[Unexplained] = ()
     remarks: Sequence[str] = ()
-    followed: FollowedReference | None = None
+    followed: Replay | None = None  # the first log, with the motion that follows
 
 
 def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
                  on_progress: OnProgress, is_command: bool) -> _Searched:
     """Search for causes, given the motion that follows where a log follows its reference."""
-    def find_settled(fit: RegressionFit, follows: bool) -> tuple[Mask, Unexplained] | None:
-        """Return the samples in dwells if the residual is larger between them."""
-        if len(logs) > 1 or logs[0].reference_rate is None:
-            return None
-        motion = replace(logs[0], reference_rate=fit.problem.replays[0].channels.rate)
-        return (_find_settled(motion, fit, rate, follows)
-                or _find_settled(logs[0], fit, rate, follows))
-
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
     follows = follows_rate(replays) and (is_command or is_late(plain))
-    settled = None
     if not follows:
         replays = _drop_unknown_ends(plain, rate)
         found = _search_replays(replays, rate, on_progress)
         replays = found.search.problem.replays
-        responds = RESPONSE in {each.cause for each in found.causes}
-        settled = find_settled(fit_causes(found.search.problem, found.causes), responds)
-        if not responds and not settled:
+        if RESPONSE not in {each.cause for each in found.causes}:
             return found
-    followed = follow_reference(replays, follows)
-    moved = fit_causes(build_problem(followed.replays), [])
-    if follows:
-        settled = find_settled(moved, True)
-    replays = ([drop_samples(followed.replays[0], ~settled[0])] if settled
-               else followed.replays)
+    followed, lag = follow_reference(replays, follows)
+    moved = fit_causes(build_problem(followed), [])
+    within = _find_settled(moved, rate) if follows and len(logs) == 1 else None
+    replays = followed if within is None else [drop_samples(followed[0], ~within)]
     found = _search_replays(replays, rate, on_progress, {RESPONSE, *HIDDEN_CAUSES})
     if follows:
-        found = replace(found, findings=[followed.finding()] * (not followed.lag.contains_zero),
-                        followed=followed)
-    elif settled:
-        found = replace(found, unexplained=[settled[1]])
-    else:
-        before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
-                         for each in (fit_causes(plain.problem, []), moved))
-        found = replace(found, unexplained=[Unexplained(
-            'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
-    return replace(found, remarks=[_SETTLED_REMARK] if settled else [])
+        return replace(found, findings=lag, followed=followed[0],
+                       remarks=[] if within is None else [_SETTLED_REMARK])
+    before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
+                     for each in (fit_causes(plain.problem, []), moved))
+    return replace(found, unexplained=[Unexplained(
+        'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
 
 
 def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
@@ -363,49 +341,33 @@ def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgr
     return _Searched(search, causes, without)
 
 
-def _find_settled(log: Log, fit: RegressionFit, false_alarm_rate: float,
-                  follows: bool) -> tuple[Mask, Unexplained] | None:
+def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
     """
-    Return the samples of a log in dwells if the residual is larger between them; otherwise None.
+    Return the samples in dwells of a motion if the residual is larger between them, or None.
 
-    The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
-    with dynamics that no cause describes. The mean squares of the residual, whitened in the second
-    case, are compared stretch by stretch (Mann and Whitney). Unless the response of the motion is
-    among the causes, they have to be twice as large between dwells. Dwells of less than half the
-    range of rates, such as rests alone, do not show what the motion does.
+    The motion then has more of its own than a response to its command. The mean squares of the
+    residual are compared stretch by stretch (Mann and Whitney). Dwells of less than half the range
+    of rates, such as rests alone, do not show what the motion does.
     """
+    replay, = fit.problem.replays
+    time, rate = replay.channels.time, np.asarray(replay.channels.rate)
     try:
-        dwells = find_dwells(log)
+        dwells = find_dwells(Log(time=time, output=replay.channels.output, reference_rate=rate))
     except DataRefused:
         return None
-    channels = fit.problem.replays[0].channels
-    if np.ptp(dwells.rate) < 0.5 * np.ptp(np.asarray(channels.rate)):
+    if np.ptp(dwells.rate) < 0.5 * np.ptp(rate):
         return None
-    time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
-    replay = fit.problem.replays[0]
-    if not follows and len(replay.shared_errors):  # it rests where the rate does
-        return None
-    if follows:  # whitening would spread what is between dwells
-        left, inside = fit.unbiased_residuals[0][replay.valid], within[replay.valid]
-    else:
-        left = fit.whitened_series()[0]
-        at = time[replay.valid][0] + replay.point_interval * np.arange(len(left))
-        inside = within[np.clip(np.searchsorted(time, at), 0, len(time) - 1)]
+    squares, inside = fit.unbiased_residuals[0][replay.valid] ** 2, within[replay.valid]
     begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
-    squares = np.add.reduceat(left ** 2, begin) / np.diff(np.append(begin, len(left)))
-    steady, between = squares[inside[begin]], squares[~inside[begin]]
+    means = np.add.reduceat(squares, begin) / np.diff(np.append(begin, len(squares)))
+    steady, between = means[inside[begin]], means[~inside[begin]]
     if len(replay.shared_errors):
         steady = np.maximum(steady, replay.output_step ** 2 / 12.0)
-    if (min(len(steady), len(between)) < MIN_STRETCHES
-            or not follows and np.median(between) < 2.0 * np.median(steady)):
+    if (min(len(steady), len(between)) < MIN_STRETCHES or mannwhitneyu(
+            between, steady, alternative='greater').pvalue > false_alarm_rate):
         return None
-    chance = float(mannwhitneyu(between, steady, alternative='greater').pvalue)
-    if chance > (1.0 if follows else VALUE_ALARM_SHARE) * false_alarm_rate:
-        return None
-    excess = left[~inside] ** 2 - np.median(steady)
-    return within, Unexplained(
-        'rate_change', float(max(excess.sum(), 0.0) / (left @ left)), chance)
+    return within
 
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
@@ -451,23 +413,10 @@ def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
         deviation = math.hypot(value.deviation, own.get(name, 0.0))
         chance = float(2.0 * norm.sf(abs(value.value) / deviation)) if deviation > 0.0 else 1.0
         if chance < VALUE_ALARM_SHARE * false_alarm_rate:
-            size = _estimate(Value(value.value, deviation), CAUSES[name].unit)
-            yield make_finding(name, {name: size}, chance, confounders,
-                               minimum_detectable=5.4 * deviation,
-                               evidence='it adds to the value of the model, '
-                               f'{abs(value.value) / deviation:.3g} sigma from zero')
-
-
-def _noise_findings(fit: RegressionFit, model: GyroModel, false_alarm_rate: float,
-                    is_rounding_modelled: bool) -> Iterator[Finding]:
-    """Give the noise figures that differ from those of the model."""
-    for name, each in find_changed_figures(fit, model, VALUE_ALARM_SHARE * false_alarm_rate,
-                                           is_rounding_modelled).items():
-        unit = CAUSES[name].unit
-        yield make_finding(name, {name: Estimate(each.value, each.interval, unit)}, each.p_value,
-                           each.alternatives, evidence='the model states '
-                           f'{format_amount(getattr(model.noise, name), unit, name)}, '
-                           f'the log {format_amount(each.value, unit, name)}')
+            yield sized_finding(name, value.value, NORMAL_QUANTILE_975 * deviation, chance,
+                                confounders, minimum_detectable=5.4 * deviation,
+                                evidence='it adds to the value of the model, '
+                                f'{abs(value.value) / deviation:.3g} sigma from zero')
 
 
 def _untestable_causes(search: Search, logs: Sequence[Log],
@@ -497,21 +446,14 @@ def _untestable_causes(search: Search, logs: Sequence[Log],
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,
              selection: Selection, unmergeable: Sequence[Candidate], gain: Gain | None,
              model: GyroModel | None) -> Iterator[str]:
-    """Give remarks on the records, on withdrawn names, and on the model."""
+    """Give remarks on the records, on parts of them, and on the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    reasons = {each.cause: 'there are tones at many frequencies, or it differs between logs, or '
-               'other structure lies along the same variable'
-               for each in selection.unnamed if is_named(each)}
-    reasons |= {each.cause: 'it does not predict held-out stretches, or its size may be 0'
-                for each in selection.refuted}
     for known in selection.unnamed:
         if known.cause == PART_OF_LOG:
             yield (f'From {known.shapes[0]:.4g} s to {known.shapes[1]:.4g} s the scale factor '
                    'differs from that of the rest of the log: an effect of a part of the log.')
-    for name, why in reasons.items():
-        yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     scale = fit.scale_factor_error
     own = {term.effect.name for term in ([] if model is None else model.terms)}
     if is_scale_implausible(fit):
@@ -524,10 +466,6 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
                   else '')
         yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
                f'cannot be merged with the first one{remedy}.')
-    for name in dict.fromkeys(each.cause
-                              for each in fit.causes if is_single_event(each)):
-        yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
-               'whose bias is the mean over the logs.')
     if gain is not None and gain.is_worse:
         yield NOT_OFFERED
 
@@ -621,20 +559,19 @@ def _unexplained_structures(search: Search, fit: RegressionFit,
         name = (CAUSES[known.cause].along if is_named(known)
                 else unnamed_variable(known))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-    least = _residual_variance(search, causes)
-    most = _residual_variance(search, fit.causes)
+
+    def residual_variance(some: Sequence[Candidate]) -> float:
+        """Return the variance of the residual of some causes at the grid points."""
+        left = fit_causes(search.problem, some).unbiased_residuals
+        return float(np.var(np.concatenate([each.resample(rest) for each, rest
+                                            in zip(search.problem.replays, left)])))
+
+    least, most = residual_variance(causes), residual_variance(fit.causes)
     structures = []
     for name, places in variables.items():
-        without = _residual_variance(
-            search, [known for place, known in enumerate(causes) if place not in places])
+        without = residual_variance(
+            [known for place, known in enumerate(causes) if place not in places])
         chance = min(p_value(causes[place].cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures
-
-
-def _residual_variance(search: Search, causes: Sequence[Candidate]) -> float:
-    """Return the variance of the residual of some causes at the grid points."""
-    left = fit_causes(search.problem, causes).unbiased_residuals
-    return float(np.var(np.concatenate([each.resample(rest) for each, rest
-                                        in zip(search.problem.replays, left)])))

@@ -14,9 +14,9 @@ The diagnosis of a log whose reference has errors of its own, such as a course o
 The score of a candidate is summed over stretches. Its variance is that by the noise or that by the
 scatter of the stretches, whichever is larger, and its distribution is Student's, with the
 effective number of stretches less one as the degrees of freedom. The p-value of the best candidate
-is that of a single one times their number; single events are counted separately. A cause is
-established if it is also selected without each fold, and predicts the stretches of the folds
-better than no cause; otherwise it is suspected.
+is that of a single one times their number. A cause is established if it is also selected without
+each fold, and predicts the stretches of the folds better than no cause; otherwise it is suspected.
+Steps of the bias are searched for at all times.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from gyro_calibration.diagnosis.candidates import (
     lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE)
 from gyro_calibration.diagnosis.causes import (
     add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected,
-    SINGLE_EVENT_REMEDY, untestable_causes)
+    SINGLE_EVENT_REMEDY, sized_finding, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_terms, gain_from_squares, heading_curve, heading_error_shares, HEADING_WINDOW,
@@ -45,7 +45,7 @@ from gyro_calibration.diagnosis.extended_model import (
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
     probabilities, Reference, RULED_OUT_DEFICIT, SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR,
-    TIME_LIMIT_REMARK, Trace, VALUE_ALARM_SHARE)
+    TIME_LIMIT_REMARK, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
@@ -62,7 +62,6 @@ from scipy.stats import t as student
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Standard deviations of a value that is found in 95 % of logs.
 _DETECTION_SIGMAS = 4.8
-_CLOCK_REMEDY = ('synchronize the clocks of gyro and reference; the model does not contain it')
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -79,18 +78,8 @@ _METHOD_TEXT = (
 #: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropped_samples',
                   'unit_error', 'quantization', 'saturation'}
-#: Largest number of parts of a log for cross-fitting.
-_FOLD_COUNT = 5
-#: Largest effect along the rate that is established, as a share of the rate: two standard
-#: deviations of the prior of a scale factor error. Larger ones result from several similar columns
-#: that nearly cancel each other.
-_MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
-#: Most steps of the search for the k of a sine response, each of which multiplies its error.
-_SHAPE_STEPS = 20
 #: Correlation of the columns of two steps of the bias above which spans do not distinguish them.
 _MAX_ALIKENESS = 0.999
-#: Variables whose causes are similar to errors of an encoder that repeat with its position.
-_MOTION_VARIABLES = frozenset({'rate', 'heading'})
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
@@ -143,7 +132,8 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     of_record = {each.effect for each in record.findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
-    findings = [replace(each, remedy=_CLOCK_REMEDY)
+    findings = [replace(each, remedy='synchronize the clocks of gyro and reference; the model '
+                                     'does not contain it')
                 if each.effect in of_clocks and each.status == 'established' else each
                 for each in findings]
     changed = any(each.status == 'established' and CAUSES[each.effect].origin == 'gyro'
@@ -203,10 +193,9 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                            if might and _is_possible_instead(fit, other)]
             if own_clock and not of_gyro:
                 known['cause'] = 'The gyro has a time offset from its reference.'
-        yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
-                           max(chance, MIN_PROBABILITY), confounders,
-                           minimum_detectable=_DETECTION_SIGMAS * deviation,
-                           evidence=f'evidence from {effective:.0f} stretches', **known)
+        yield sized_finding(name, value, half, max(chance, MIN_PROBABILITY), confounders,
+                            minimum_detectable=_DETECTION_SIGMAS * deviation,
+                            evidence=f'evidence from {effective:.0f} stretches', **known)
 
 
 def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
@@ -216,9 +205,8 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
         angle, half, chance = oblique_angle(fit.values[places], fit.normal_covariance[
             places, places])
         if chance < false_alarm_rate:
-            yield make_finding(
-                name, {name: Estimate.from_half_width(angle, half, CAUSES[name].unit)},
-                max(chance, MIN_PROBABILITY), remedy=MISALIGNMENT_REMEDY)
+            yield sized_finding(name, angle, half, max(chance, MIN_PROBABILITY),
+                                remedy=MISALIGNMENT_REMEDY)
     name = 'reference_drift'
     if CauseTerm(name) not in fit.causes:
         return
@@ -226,10 +214,9 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
     deviation = math.sqrt(fit.covariance[place, place])
     chance = float(2.0 * student.sf(abs(fit.values[place]) / deviation, fit.freedom[place]))
     if chance < false_alarm_rate:
-        yield make_finding(
-            name, {name: Estimate.from_half_width(float(fit.values[place]), fit.half_width(place),
-                                                  CAUSES[name].unit)},
-            max(chance, MIN_PROBABILITY), ['vibration_rectification'],
+        yield sized_finding(
+            name, fit.values[place], fit.half_width(place), max(chance, MIN_PROBABILITY),
+            ['vibration_rectification'],
             minimum_detectable=_DETECTION_SIGMAS * deviation,
             evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias')
 
@@ -473,7 +460,7 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
                f'{100.0 * done.half_width(0):.2g} %: turn more often, in both directions.')
 
 
-def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
+def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Curve]:
     """Return the residual along the rate, and the measured and simulated rate over time."""
     steps, time = np.diff(fit.spans.time), fit.spans.time
     assert fit.spans.log.output is not None
@@ -485,7 +472,8 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
     return (Curve('rate', 'rad/s', at, given, left, deviation, np.zeros(len(order))),
-            Trace(time[:-1] + 0.5 * steps, measured, measured - before, measured - after))
+            Curve('time', 's', time[:-1] + 0.5 * steps, before, after,
+                  simulated=measured - before))
 
 
 # the search
@@ -524,10 +512,6 @@ def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
            if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
     terms = [CauseTerm(*each) for each in lasting_shapes(
         has, float(time[-1] - time[0]), np.asarray(fit.spans.channels.temperature))]
-    if not fine:
-        terms += [CauseTerm(name, (moment,))
-                  for moment in np.linspace(time[0], time[-1], 22)[1:-1].tolist()
-                  for name in ('bias_step', 'reference_slip')]
     fastest = float(np.abs(fit.spans.channels.rate).max())
     terms += [CauseTerm('clock_rate'),
               *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
@@ -549,8 +533,7 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
     steps = _find_steps(fit, fit_with, (), false_alarm_rate)
     found, candidates = list(steps), _propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in candidates
-               if not each.is_single_event and each.cause != SINE_RESPONSE.name}
+    columns = {each.cause: each for each in candidates if each.cause != SINE_RESPONSE.name}
     rich = [*columns.values(), *(each.cause_term for each in steps)]
     # of a log with fewer spans than columns, the noise is that without them
     rich_fit = (fit_with(*rich)
@@ -596,7 +579,7 @@ def _fit_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm) -> list[
         return [term]
     # beyond a quarter of a wave the output would fall while the rate increases
     largest = 0.5 * math.pi / float(np.abs(spans.channels.rate).max())
-    for _ in range(_SHAPE_STEPS):
+    for _ in range(20):  # each of which multiplies its error
         column, left = _given_design(data, data.whiten_columns(spans.cause_columns(term)))
         square = float(np.sum(column ** 2))
         amplitude = float(left @ column[:, 0]) / square if square > 0.0 else 0.0
@@ -708,7 +691,10 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
         return 0.0
     columns = CATALOGUE[cause.cause].columns(fit.spans.channels, *cause.shapes)
     added = np.abs(np.tensordot(values, np.array(columns), 1)).max()
-    return float(added / np.abs(fit.spans.channels.rate).max()) / _MAX_RELATIVE_EFFECT
+    # of two standard deviations of the prior of a scale factor error, as a share of the rate;
+    # larger ones result from several similar columns that nearly cancel each other
+    return float(added / np.abs(fit.spans.channels.rate).max()) / (
+        2.0 * HEADING_TREATMENT.prior[0])
 
 
 def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[CauseTerm],
@@ -720,13 +706,9 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     places = list(map(slice, [0, *ends], ends))
     evidences = _term_evidences(data, columns, places, terms,
                                 np.ones(len(data.observed), dtype=bool))
-    # single events are never established, and are not counted in the number of the others
-    lasting = sum(not each.is_single_event for each in terms)
-    p_values = [min(evidence.chance * (len(terms) if each.is_single_event else lasting), 1.0)
-                for each, evidence in zip(terms, evidences)]
+    p_values = [min(evidence.chance * len(terms), 1.0) for evidence in evidences]
     strongest = min(range(len(terms)), key=lambda place: (p_values[place], place))
-    level = false_alarm_rate * (1.0 if terms[strongest].is_single_event else SUSPECTED_RATE_FACTOR)
-    if p_values[strongest] > level:
+    if p_values[strongest] > SUSPECTED_RATE_FACTOR * false_alarm_rate:
         return None
     # with one variance for all, as similar causes scatter alike
     likelihoods = [each.gain * each.variance_ratio / evidences[strongest].variance_ratio
@@ -747,7 +729,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     simplest = min(equivalent.values(), key=complexity)
     # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring
     # ones, and fifths of the log
-    numbers, count = np.arange(data.stretch_count), min(_FOLD_COUNT, data.stretch_count)
+    numbers, count = np.arange(data.stretch_count), min(5, data.stretch_count)
     folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
              for sets in ([numbers[fold::count] for fold in range(count)],
                           np.array_split(numbers, count))]
@@ -757,8 +739,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
         {name: gain - likelihoods[place] for name, place in best_of.items()}).items()
         if name in equivalent}
     established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
-                   and selected == 1.0 and not terms[simplest].is_single_event
-                   and evidences[simplest].stretches >= MIN_STRETCHES)
+                   and selected == 1.0 and evidences[simplest].stretches >= MIN_STRETCHES)
     return FoundCause(terms[simplest], max(p_values[simplest], MIN_PROBABILITY), predicted,
                       selected, established, probability)
 
@@ -769,11 +750,10 @@ def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[s
     given, left = _given_design(data, columns, rows)
     clusters = [each[rows] for each in data.clusters]
     least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
+    # along the motion they are similar to errors of an encoder that repeat with its position
     return [_cluster_robust_evidence(
-        given[:, place], left,
-        clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], data.cosines,
-        least[place])
-        for place, each in zip(places, terms)]
+        given[:, place], left, clusters if CAUSES[each.cause].along in ('rate', 'heading')
+        else clusters[:1], data.cosines, least[place]) for place, each in zip(places, terms)]
 
 
 def _given_design(data: WhitenedRegression, columns: Array,

@@ -20,16 +20,16 @@ then, and neither can a slip.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import HEADING_TREATMENT, MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.candidates import effect_candidate
-from gyro_calibration.diagnosis.causes import CAUSES, make_finding
+from gyro_calibration.diagnosis.causes import CAUSES, sized_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
-from gyro_calibration.diagnosis.findings import Estimate, Finding, MIN_PROBABILITY
+from gyro_calibration.diagnosis.findings import Finding, MIN_PROBABILITY
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (
@@ -49,46 +49,8 @@ HIDDEN_CAUSES = frozenset({
 #: Effects of the gyro along the motion, linear in their sizes.
 _MOTION_EFFECTS = ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
                    'heading_sensitivity')
-#: Longest lag of a motion as a share of the duration of a log.
-_MAX_LAG_SHARE = 0.1
-#: Number of lags of a gyro that are compared with longer ones, and probability by which those have
-#: to be likelier.
-_LAGS_OF_GYRO, _LATE_LEVEL = 4, 0.05
-#: Numbers of time constants and sizes of the prior of a response that are tried; and least
-#: variance of a response by its prior, over that by the noise.
-_TIME_CONSTANTS, _PRIOR_SIZES, _MIN_RATIO = 16, 65, 0.01
-#: Largest standard deviation of a scale factor error beside the response, as a share of the prior.
-_MAX_PRIOR_SHARE = 0.5
-#: Limits of acceleration that are tried at first, rad/s², and share to which they are found;
-#: number of samples; number of lags of the response to the limited command, and the longest, s.
-_FIRST_LIMITS, _LIMIT_STEP, _LIMITED_SAMPLES = 0.25 * 2.0 ** np.arange(7), 0.005, 16384
-_LIMITED_LAGS, _LIMITED_LAG = 24, 2.0
-#: Standard deviations of the times of commands that are tried, in samples.
-_CHANGE_DEVIATIONS = 0.1 * 2.0 ** np.arange(6)
-NP = 4
-
-
-@dataclass(frozen=True)
-class FollowedReference:
-    """A motion that follows its reference, and what is reported of it."""
-
-    replays: tuple[Replay, ...]  # the logs, with the motion that follows as the reference
-    lag: Estimate  # mean delay of the motion, s
-    # limits of acceleration away from and towards a rate of 0, rad/s², median of the logs, or inf
-    limits: Array
-
-    def finding(self) -> Finding:
-        """Return the finding of the lag."""
-        away, towards = self.limits.tolist()
-        limited = (f', accelerates by at most {away:.3g} rad/s² and slows down by at most '
-                   f'{towards:.3g} rad/s²' if math.isfinite(away + towards) else '')
-        return make_finding(
-            'reference_lag', {'reference_lag': self.lag},
-            max(float(2.0 * norm.sf(abs(self.lag.estimate) / self.lag.deviation)),
-                MIN_PROBABILITY),
-            evidence=f'the motion is {1e3 * self.lag.estimate:.0f} ms behind the reference rate '
-            f'on average{limited}; the output is compared with the motion that follows',
-            remedy='use a measured rate or heading as the reference')
+#: Least variance of a response by its prior, over that by the noise.
+_MIN_RATIO = 0.01
 
 
 def is_late(fit: RegressionFit) -> bool:
@@ -102,9 +64,9 @@ def is_late(fit: RegressionFit) -> bool:
         return max(likelihood_with(fit, effect_candidate('time_offset', each)) for each in lags)
 
     of_gyro = max(fit.log_likelihood, likelihood(
-        *np.linspace(0.0, MAX_GYRO_LAG, _LAGS_OF_GYRO + 1)[1:].tolist()))
-    return likelihood(*np.geomspace(MAX_GYRO_LAG, LONGEST_LAG, 5 * _LAGS_OF_GYRO)[1:].tolist()
-                      ) > of_gyro - math.log(_LATE_LEVEL)
+        *np.linspace(0.0, MAX_GYRO_LAG, 5)[1:].tolist()))
+    return likelihood(*np.geomspace(MAX_GYRO_LAG, LONGEST_LAG, 20)[1:].tolist()
+                      ) > of_gyro - math.log(0.05)
 
 
 def follows_rate(replays: Sequence[Replay]) -> bool:
@@ -114,31 +76,39 @@ def follows_rate(replays: Sequence[Replay]) -> bool:
                for each in replays)
 
 
-def follow_reference(replays: Sequence[Replay], is_command: bool) -> FollowedReference:
+def follow_reference(replays: Sequence[Replay],
+                     is_command: bool) -> tuple[tuple[Replay, ...], list[Finding]]:
     """
-    Return the motion that follows the reference rate of logs.
+    Return logs with the motion that follows their reference rate, and the finding of its lag.
 
-    Raises `DataRefused` where this is a command and no scale factor error can be known beside the
-    response.
+    There is none if the lag may be 0. Raises `DataRefused` where the rate is a command and no
+    scale factor error can be known beside the response.
     """
-    followed, lags, limits = zip(*(_follow(each, is_command) for each in replays))
-    weights = np.array([each.deviation for each in lags]) ** -2
-    mean = float(np.average([each.estimate for each in lags], weights=weights))
-    return FollowedReference(followed, Estimate.from_half_width(
-        mean, NORMAL_QUANTILE_975 * float(weights.sum() ** -0.5), 's'),
-        np.median(limits, axis=0))
+    followed, lags, deviations, limits = zip(*(_follow(each, is_command) for each in replays))
+    weights = np.array(deviations) ** -2
+    mean, deviation = float(np.average(lags, weights=weights)), float(weights.sum() ** -0.5)
+    away, towards = np.median(limits, axis=0).tolist()
+    limited = (f', accelerates by at most {away:.3g} rad/s² and slows down by at most '
+               f'{towards:.3g} rad/s²' if math.isfinite(away + towards) else '')
+    half = NORMAL_QUANTILE_975 * deviation
+    return followed, [] if abs(mean) <= half else [sized_finding(
+        'reference_lag', mean, half, max(float(2.0 * norm.sf(abs(mean) / deviation)),
+                                         MIN_PROBABILITY),
+        evidence=f'the motion is {1e3 * mean:.0f} ms behind the reference rate on average'
+        f'{limited}; the output is compared with the motion that follows',
+        remedy='use a measured rate or heading as the reference')]
 
 
-def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
+def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Array]:
     """
-    Return a log with the motion that follows, its mean delay, s, and limits of acceleration.
+    Return a log with the motion that follows, its mean delay, s, its deviation, and two limits.
 
-    It is fitted with effects of the gyro along the motion, and with the noise that a first
-    response leaves.
+    These are of acceleration away from and towards a rate of 0, rad/s², or inf. The response is
+    fitted with effects of the gyro along the motion, and with the noise that a first one leaves.
     """
     kernels, lags = response_kernels(replay.interval), kernel_lags(replay.interval)
     longest = lags[[np.flatnonzero(each)[-1] for each in kernels]]
-    kernels = kernels[longest < _MAX_LAG_SHARE * replay.duration]
+    kernels = kernels[longest < 0.1 * replay.duration]
     plain = replace(replay, command=replay.channels.rate)
     grid, command = plain.held_command
     limits = _likely_limits(plain)
@@ -148,14 +118,17 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
     known = time[np.isfinite(plain.reference)]
     begins = np.append(time[0], known[1:][np.diff(known) > LEAD + plain.interval])
     unknown = time - begins[np.searchsorted(begins, time, 'right') - 1] < longest[len(kernels) - 1]
-    tried = [(each, _response_transforms(each, kernels)) for each in (
-        drop_samples(each, unknown) for each in (plain, limited))]
-    fits = [_fit_response(transforms, 1, kernels @ lags) for _, transforms in tried]
+    tried = [drop_samples(each, unknown) for each in (plain, limited)]
+    # of command, delayed commands, and residual
+    transforms = [np.array([cosine_transform(each.resample(values)) for values in (
+        each.channels.rate, *each.delayed_commands(kernels),
+        each.channels.output - each.reference)]) for each in tried]
+    fits = [_fit_response(each, 1, kernels @ lags) for each in transforms]
     # Two limits have to be worth their number (Schwarz), by as many independent errors as there
     # are changes of the command: most errors are after these, and by their time between samples.
     share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
     chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
-    moved, (rate, *seen) = tried[chosen]
+    moved, (rate, *seen) = tried[chosen], transforms[chosen]
     late = moved
     between: Array = np.zeros(len(time))
     fitted, others = fits[chosen], list[Array]()
@@ -181,16 +154,15 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, Estimate, Array]:
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
         others = [column for name in _MOTION_EFFECTS
                   for column in effect_candidate(name).columns(moved)]
-    most = _MAX_PRIOR_SHARE * HEADING_TREATMENT.prior[0]
+    most = 0.5 * HEADING_TREATMENT.prior[0]
     # on average no motion is ahead of its command
     if is_command and (fitted.scale_deviation > most or response @ lags < -LEAD):
         raise DataRefused(
             'the motion follows its command late, and what it does then has the same effect as a '
             'scale factor error, as in a swing that repeats: turn at several rates for several '
             'seconds each, with rests, or use a measured rate or heading as the reference')
-    return (moved, Estimate.from_half_width(
-        float(response @ lags), NORMAL_QUANTILE_975 * fitted.lag_deviation, 's'),
-        limits if chosen else np.full(2, math.inf))
+    return (moved, float(response @ lags), fitted.lag_deviation,
+            limits if chosen else np.full(2, math.inf))
 
 
 def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Array:
@@ -223,7 +195,7 @@ def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Ar
                              * sizes[place:] * sizes[:len(apart)])
     count, added = np.count_nonzero(known), np.zeros(len(command))
     best = count * math.log(whole @ whole) - math.log(count)
-    for deviation in _CHANGE_DEVIATIONS:
+    for deviation in 0.1 * 2.0 ** np.arange(6):  # of the times, in samples
         ratio = (deviation / noise) ** 2
         factor = cholesky_banded(ratio * bands + np.eye(width, 1), lower=True)
         delays = ratio * cho_solve_banded((factor, True), seen)
@@ -236,13 +208,6 @@ def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Ar
         if criterion < best:
             best, added = criterion, tried
     return np.asarray(added[grid])
-
-
-def _response_transforms(replay: Replay, kernels: Array) -> Array:
-    """Return those of command, delayed commands, and residual, shape (k + 2, points - 1)."""
-    return np.array([cosine_transform(replay.resample(each)) for each in (
-        replay.channels.rate, *replay.delayed_commands(kernels),
-        replay.channels.output - replay.reference)])
 
 
 def _limit_acceleration(command: Array, interval: float, limits: Array) -> Array:
@@ -277,11 +242,11 @@ def _likely_limits(replay: Replay) -> Array:
     grid, command = replay.held_command
     output = np.interp(np.arange(len(command)), grid[replay.valid],
                        replay.channels.output[replay.valid])
-    count = min(_LIMITED_SAMPLES, len(command))
+    count = min(16384, len(command))
     changes = np.cumsum(np.diff(command, prepend=command[0]) != 0.0)
     begin = int(np.argmax(changes[count - 1:] - changes[:len(changes) - count + 1]))
     command, output = (each[begin:begin + count] for each in (command, output))
-    late = np.geomspace(1.0, _LIMITED_LAG / replay.interval, _LIMITED_LAGS)
+    late = np.geomspace(1.0, 2.0 / replay.interval, 24)  # up to 2 s
     lags = np.unique(np.rint([*-late[late * replay.interval < LEAD], 0.0, *late])).astype(int)
     count -= int(np.ptp(lags))
     if count < 2 * len(lags):
@@ -297,9 +262,9 @@ def _likely_limits(replay: Replay) -> Array:
             np.ones(count), *columns, output[lags[-1]:][:count]]).T, mode='r'))
         return 2.0 * count * math.log(abs(float(reduced[-1, -1])) + np.finfo(float).tiny)
 
-    first = min(_FIRST_LIMITS, key=lambda each: cost(np.log([each, each])))
+    first = min(0.25 * 2.0 ** np.arange(7), key=lambda each: cost(np.log([each, each])))
     best = minimize(cost, np.log([first, first]), method='Nelder-Mead', options={
-        'xatol': _LIMIT_STEP, 'fatol': 1.0})
+        'xatol': 0.005, 'fatol': 1.0})
     return np.exp(best.x)
 
 
@@ -337,13 +302,13 @@ def _fit_response(transforms: Array, own_count: int, lags: Array) -> _Response:
     free, rest = (each - basis @ (basis.T @ each) for each in (delayed, left[:, 0]))
     total = float(rest @ rest)
     best = None
-    for constant in np.geomspace(0.1 * LEAD, LONGEST_LAG, _TIME_CONSTANTS):
+    for constant in np.geomspace(0.1 * LEAD, LONGEST_LAG, 16):
         steps = -np.diff(np.exp(-(lags + LEAD) / constant), append=0.0)
         walk = np.triu(np.ones((len(lags), len(lags)))) * np.sqrt(steps)
         walk *= np.gradient(lags)[:, None]
         along, powers, vectors = np.linalg.svd(free @ walk, full_matrices=False)
         squares = (along.T @ rest) ** 2
-        for size in np.geomspace(1e-2, 1e14, _PRIOR_SIZES) / powers[0] ** 2:
+        for size in np.geomspace(1e-2, 1e14, 65) / powers[0] ** 2:
             ratios = size * powers ** 2
             within = total - float(squares @ (ratios / (1.0 + ratios)))
             criterion = count * math.log(within) + float(np.log1p(ratios).sum())

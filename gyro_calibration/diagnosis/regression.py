@@ -23,7 +23,7 @@ Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candid
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -44,10 +44,9 @@ from scipy.special import logsumexp
 Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
-#: Longest averaging interval of filtered noise, s, and largest significant ratio of its power in
-#: the last to that in the second quarter of the frequencies; of a smoothed record before causes
-#: are fitted (jumps have 0.18, noise not less).
-_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
+#: Largest ratio of the power of noise in the last to that in the second quarter of the frequencies
+#: of a smoothed record before causes are fitted (jumps have 0.18, noise not less).
+SMOOTHED_RATIO = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -514,110 +513,40 @@ def group_columns(problem: RegressionProblem, columns: Array,
     return ColumnGroups(columns, groups, of_width)
 
 
-def _left_of_columns(fit: RegressionFit,
-                     groups: ColumnGroups) -> Iterator[tuple[Indices, Array, Array]]:
-    """
-    Give what a fit leaves of groups of columns, for each width.
-
-    These are the places of the groups of which it leaves something, shape (n,), the products of
-    the columns of each group under each noise, shape (g, n, width, width), and the products of the
-    columns with the residual, shape (g, n, width).
-    """
+def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
+    """Return the evidence of groups of columns given a fit, -inf if unidentifiable."""
+    # products, under each noise, of what the fit leaves of the columns: with the residual, and own
     crossing = fit.problem.products(groups.columns, fit.rows)
     crossing, pull = crossing[:, :, :-1], crossing[:, :, -1]
     towards = crossing @ fit.inverse_information
     pull = pull - np.einsum('gpq,gq->gp', towards, fit.scores)
     own = np.einsum('gpq,gpq->gp', crossing, towards)
+    squares, likelihood = fit.residual_squares[:, None], fit.noise_log_likelihood[:, None]
+    found = np.full(len(groups.groups), -np.inf)
     for places, members, whole in groups.of_width:
-        left = whole.copy()
-        for row, column in np.ndindex(left.shape[2:]):
+        width, left = members.shape[1], whole.copy()
+        for row, column in np.ndindex(width, width):
             one, other = members[:, row], members[:, column]
             left[:, :, row, column] -= (own[:, one] if row == column else np.einsum(
                 'gnq,gnq->gn', crossing[:, one], towards[:, other]))
         of_left, of_whole = (np.einsum('gnpp->gnp', each) for each in (left, whole))
         shown = (of_left > MIN_INDEPENDENT_SHARE * of_whole).all(axis=(0, 2))
-        if len(members[0]) > 1:  # columns that depend on each other count as one
-            left = left * (1.0 + 1e-10 * np.eye(len(members[0])))
-        yield places[shown], left[:, shown], pull[:, members[shown]]
-
-
-def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
-    """Return the evidence of groups of columns given a fit, -inf if unidentifiable."""
-    squares, likelihood = fit.residual_squares[:, None], fit.noise_log_likelihood[:, None]
-    found = np.full(len(groups.groups), -np.inf)
-    for places, products, pull in _left_of_columns(fit, groups):
-        width = pull.shape[2]
-        explained = np.einsum('gnp,gnp->gn', pull,
-                              np.linalg.solve(products, pull[..., None])[..., 0])
+        # columns that depend on each other count as one
+        products = left[:, shown] * (1.0 + 1e-10 * np.eye(width) * (width > 1))
+        pulls = pull[:, members[shown]]
+        explained = np.einsum('gnp,gnp->gn', pulls,
+                              np.linalg.solve(products, pulls[..., None])[..., 0])
         ratio = np.log1p(-np.minimum(explained / squares, 1.0 - 1e-9))
         scale = 0.5 * (width * np.log(squares) - np.linalg.slogdet(products)[1])
         change = scale - 0.5 * (fit.degrees_of_freedom - width) * ratio
-        found[places] = (logsumexp(likelihood + change, axis=0) - logsumexp(likelihood)
-                         - scale[fit.best_noise])
+        found[places[shown]] = (logsumexp(likelihood + change, axis=0) - logsumexp(likelihood)
+                                - scale[fit.best_noise])
     return found
 
 
 def likelihood_with(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the log-likelihood of a fit with one more cause, whose shapes are fixed."""
-    if not is_rate_distortion(candidate.cause):
-        columns = candidate_transforms(candidate, fit.distorted)
-        if len(columns) == 1:  # several may depend on each other
-            return _fit_with_column(fit, columns, candidate.amplitude)[0]
     return fit_causes(fit.problem, [*fit.causes, candidate]).log_likelihood
-
-
-def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
-    """Return the amplitude that fits best for a cause whose amplitude is fixed."""
-    return _fit_with_column(fit, candidate_transforms(candidate, fit.distorted), None)[1]
-
-
-def _fit_with_column(fit: RegressionFit, column: Array,
-                     amplitude: float | None) -> tuple[float, float]:
-    """Return the log-likelihood with one more column, shape (1, m), and its coefficient."""
-    places, products, pulls = next(_left_of_columns(fit, group_columns(
-        fit.problem, column / fit.problem.deviation, [[0]])))
-    if not len(places):
-        return fit.log_likelihood, 0.0
-    product, pull = products[:, 0, 0, 0], pulls[:, 0, 0]
-    values = pull / product if amplitude is None else np.full_like(pull, amplitude)
-    likelihood, log_likelihood = _changed_likelihood(
-        fit, amplitude is None, fit.residual_squares + values * (values * product - 2.0 * pull),
-        np.log(product) * (amplitude is None))
-    probable = np.exp(likelihood - likelihood.max())
-    return log_likelihood, float(np.average(values, weights=probable * (probable > 1e-3)))
-
-
-def likelihood_without(fit: RegressionFit, cause_index: int) -> float:
-    """Return the log-likelihood of a fit without one of its causes."""
-    removed, known = fit.causes[cause_index], fit.column_owners
-    if is_rate_distortion(removed.cause) or removed.amplitude is not None or fit.lacks_columns:
-        return fit_causes(fit.problem, [*fit.causes[:cause_index],
-                                        *fit.causes[cause_index + 1:]]).log_likelihood
-    own = [rank for rank, (place, _) in enumerate(known) if place == cause_index]
-    covariance = fit.inverse_information[:, own]
-    values = np.einsum('gpq,gq->gp', covariance, fit.scores)
-    covariance = covariance[:, :, own]
-    squares = fit.residual_squares + np.einsum(
-        'gp,gp->g', values, np.linalg.solve(covariance, values[:, :, None])[:, :, 0])
-    return _changed_likelihood(fit, -len(own), squares, np.linalg.slogdet(covariance)[1])[1]
-
-
-def _changed_likelihood(fit: RegressionFit, added: int, squares: Array,
-                        determinants: Array) -> tuple[Array, float]:
-    """
-    Return the likelihood of each noise, and that of a fit, with more or fewer columns.
-
-    Given are the squares that they leave, and the logarithm of the factor of the determinant of
-    the information, shape (g,).
-    """
-    freedom = fit.degrees_of_freedom
-    likelihood = fit.noise_log_likelihood + 0.5 * (
-        freedom * np.log(fit.residual_squares) - (freedom - added) * np.log(squares)
-        - determinants)
-    best = int(likelihood.argmax())
-    logarithm = np.linalg.slogdet(fit.information[best])[1] + determinants[best]
-    return likelihood, float(logsumexp(likelihood) + 0.5 * (
-        logarithm - (len(fit.columns) + added) * np.log(squares[best])))
 
 
 # deviations of discontinuous shapes
@@ -656,7 +585,7 @@ def _profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -
 # filtered noise
 
 def average_filtered_noise(fit: RegressionFit,
-                           max_ratio: float = _MAX_FILTERED_RATIO) -> RegressionFit:
+                           max_ratio: float = 0.7) -> RegressionFit:
     """
     Average neighbouring points of logs whose noise is filtered, until no filter shows.
 
@@ -673,7 +602,7 @@ def average_filtered_noise(fit: RegressionFit,
             # 4.5 standard deviations; that of the logarithm of a median of n is 2.33 over root n
             by_chance = np.exp(-4.5 * 2.33 * np.sqrt(8.0 / len(whitened)))
             is_filtered = (last < min(by_chance, max_ratio) * second
-                           and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME)
+                           and 2.0 * each.point_interval <= 0.25)  # s
             decimations.append(each.decimation * (1 + is_filtered))
         if decimations == [each.decimation for each in fit.problem.replays]:
             return fit

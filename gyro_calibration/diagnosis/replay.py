@@ -108,11 +108,6 @@ def band_starts(count: int) -> NDArray[np.intp]:
     return np.unique([edge for edge in edges if edge < count])
 
 
-#: Share of a variance that is small, of two noises; and largest steps between neighbouring random
-#: walks, as logarithm of the ratio of their variances and in its standard deviations.
-_SMALL_NOISE_SHARE, _WALK_STEP, _WALK_SIGMAS = 0.1, 0.9, 3.0
-
-
 def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) -> list[NoiseShape]:
     """
     Return a grid of noises that a residual may have.
@@ -123,13 +118,14 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     one of them is small beside the other at all frequencies are left out. The variance of a walk
     alone is known the better, the more coefficients it dominates.
     """
-    small, lowest = _SMALL_NOISE_SHARE, (math.pi / duration) ** 2
+    # a share of a variance that is small; and the largest logarithm of the ratio of neighbours
+    small, lowest, step = 0.1, (math.pi / duration) ** 2, 0.9
     highest, alone = 1.0 / interval ** 2, [small * lowest]
     while alone[-1] < highest:
         sigma = math.sqrt(2.0 * math.pi / (duration * math.sqrt(alone[-1])))
-        alone.append(alone[-1] * math.exp(min(_WALK_SIGMAS * sigma, _WALK_STEP)))
+        alone.append(alone[-1] * math.exp(min(3.0 * sigma, step)))
     walks = [0.0, *np.geomspace(alone[0], highest, 1 + math.ceil(
-        math.log(highest / alone[0]) / _WALK_STEP))]
+        math.log(highest / alone[0]) / step))]
     times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
     # by their spectral density at frequency 0 relative to white noise
     strong = [(level, time) for time in times for level in np.geomspace(0.3, 1000.0, 7)]
@@ -142,22 +138,14 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
               for walk in walks[::4] for corner in corners)]
 
 
-#: Largest number of points of the grid; with more, neighbours are averaged.
-_MAX_POINTS = 50_000
-#: Number of terms of the rounding error of an output, their least size as a share of the noise,
-#: and least noise in steps.
-_ROUNDING_TERMS, _LEAST_ROUNDING, _LEAST_ROUNDED_NOISE = 32, 1e-2, 1e-3
+#: Least noise of a rounded output, in steps.
+_LEAST_ROUNDED_NOISE = 1e-3
 #: Samples in a block of `_without_noise`. The shorter, the less noise is left in a rest next to a
 #: motion; the longer, the slower are the rates that are known.
 _BLOCK_SAMPLES = 16
 #: Samples next to a gap of at least as many whose rate is not used: the error at the end of a
 #: spline is 0.43 times as large from sample to sample. Shorter gaps change the slope by little.
 _GAP_MARGIN_SAMPLES = 6
-#: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
-#: sign are 3 sigma. Share of bends by noise or jitter that pass for corners; 13 samples are left
-#: out at each.
-_CORNER_NOISE_SHARE, _CORNER_CHANCE = 0.1, 1e-3
-
 
 #: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1.
 LEAD, LONGEST_LAG, _LAG_RATIO = 0.1, 20.0, 0.05
@@ -433,7 +421,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
         noise = heading_step / math.sqrt(12.0) or _largest_heading_noise(
             _residual_without_delay(time, log.output, smooth)[kept], place, interval)
         smooth = _without_noise(smooth, noise / interval)
-    every = max(1, math.ceil((place[-1] + 1) / _MAX_POINTS))
+    # of more than 50 000 points, neighbours are averaged
+    every = max(1, math.ceil((place[-1] + 1) / 50_000))
     if model is not None and log.temperature is None:  # simulated at the reference temperature
         prepared_log = replace(prepared_log,
                                temperature=np.full(len(log), model.reference_temperature))
@@ -525,9 +514,9 @@ def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tu
     """
     expected = _fit_rounded_output(output[valid], rate[valid], step, rate)
     noise = max(white_noise_deviation((output - expected)[valid]), _LEAST_ROUNDED_NOISE * step)
-    order = 2.0 * math.pi / step * np.arange(1, _ROUNDING_TERMS + 1)[:, None]
+    order = 2.0 * math.pi / step * np.arange(1, 33)[:, None]
     size = 2.0 / order * np.exp(-0.5 * order ** 2 * max(noise ** 2 - step ** 2 / 12.0, 0.0))
-    size = size[size[:, 0] > _LEAST_ROUNDING * noise] / math.sqrt(2.0)
+    size = size[size[:, 0] > 0.01 * noise] / math.sqrt(2.0)
     angle = order[:len(size)] * expected
     return np.concatenate([size * np.cos(angle), size * np.sin(angle)]) / noise, noise
 
@@ -671,8 +660,9 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     bend = np.abs(np.diff(np.pad(rate, 3, mode='edge'), 6)) / 72.0
     white = white_noise_deviation((output - rate)[valid])
     usual = white_noise_deviation(rate, 6) * math.sqrt(math.comb(12, 6)) / 72.0
-    sharp = maximum_filter1d(bend > max(_CORNER_NOISE_SHARE * white + rounding,
-                                        -float(ndtri(0.5 * _CORNER_CHANCE)) * usual),
+    # a thousand bends of a tenth of the white noise and one sign are 3 sigma; and as many bends by
+    # noise or jitter are to pass for a corner
+    sharp = maximum_filter1d(bend > max(0.1 * white + rounding, -float(ndtri(5e-4)) * usual),
                              2 * _GAP_MARGIN_SAMPLES + 1)
     rounded = rounding > math.sqrt(6.0) * white  # most of what looks white is of the steps
     return np.zeros_like(sharp) if rounded else sharp

@@ -30,8 +30,7 @@ from typing import Any
 import warnings
 
 import gyro_calibration
-from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, HeadingCurve, NoiseCurve, Trace)
+from gyro_calibration.diagnosis.findings import Curve, Diagnosis, Estimate
 from gyro_calibration.diagnosis.words import (
     as_sentence, cause_paragraphs, cause_title, display_unit, format_amount, format_number,
     format_quantity, headline, is_model_extended, lists, noise_rows, readable_name, verdict_phrase)
@@ -43,19 +42,14 @@ import numpy as np
 
 #: Parts of a curve of which only the extremes are drawn.
 _THINNED_PARTS = 90
-#: The variable of the curve of amplitudes instead of means.
-_SPECTRUM_VARIABLE = 'frequency'
 
 _METHOD_TEXT = (
     '{logs} replayed through the simulation, with motion and temperature as recorded. The '
     'residual, measured less simulated output, was compared with every cause of the catalogue, '
-    'under a noise of angle random walk, flicker and rate random walk that was fitted together '
-    'with the causes. A cause is named if its evidence exceeds that of the strongest of all '
-    'causes in noise that was simulated for this log, so that {share} of logs without any cause '
-    'give an alarm. Causes were added one at a time, refined, exchanged, and removed if another '
-    'one explains more. Causes that explain the data equally well are given as a set, of which '
-    'the simplest is in the model. Bias and scale factor are fitted in any case. The gain was '
-    'measured on held-out parts; intervals are of 95 %.')
+    'under a grid of noises. Causes were added one at a time, the strongest first, each if noise '
+    'alone is improbable: of logs without any cause, {share} give an alarm. Then they were '
+    'confirmed on held-out stretches. Of causes that explain the data equally well the simplest '
+    'is in the model. The gain was measured on held-out parts; intervals are of 95 %.')
 
 
 def render_report(diagnosis: Diagnosis) -> str:
@@ -85,11 +79,10 @@ def render_page(title: str, body: Markup) -> str:
 
 def _without_extension(diagnosis: Diagnosis) -> Diagnosis:
     """Return the diagnosis without curves after the extension."""
-    heading, trace = diagnosis.heading, diagnosis.trace
-    return replace(diagnosis,
-                   curves=[replace(curve, after=curve.before) for curve in diagnosis.curves],
-                   heading=None if heading is None else replace(heading, after=heading.before),
-                   trace=None if trace is None else replace(trace, extended=trace.simulated))
+    heading, trace = (each and replace(each, after=each.before)
+                      for each in (diagnosis.heading, diagnosis.trace))
+    return replace(diagnosis, heading=heading, trace=trace,
+                   curves=[replace(each, after=each.before) for each in diagnosis.curves])
 
 
 def _divide_curves(diagnosis: Diagnosis) -> tuple[list[tuple[int, Curve]], ...]:
@@ -114,8 +107,7 @@ def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
     curves, others = _divide_curves(diagnosis)
     misfit: list[Markup] = []
     if diagnosis.trace is not None:
-        misfit += [element('p', 'The stretch where they differ most:'),
-                   _side_by_side(map(draw_chart, _trace_charts(diagnosis.trace)))]
+        misfit.append(_side_by_side(map(draw_chart, _trace_charts(diagnosis.trace))))
     for place, curve in curves or others:
         before, after = (format_amount(float(np.abs(each[np.isfinite(each)]).max(initial=0.0)),
                                        'rad/s') for each in (curve.before, curve.after))
@@ -183,18 +175,19 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
 
 # charts
 
-def _trace_charts(trace: Trace) -> Iterator[Chart]:
-    time, measured, simulated, extended = _thin_points(
-        trace.time, trace.measured, trace.simulated, trace.extended)
+def _trace_charts(trace: Curve) -> Iterator[Chart]:
+    time, before, after, simulated = _thin_points(
+        trace.at, trace.before, trace.after, np.asarray(trace.simulated))
+    measured = simulated + before
     unit, factor = _rate_unit(measured)
     lines = [Line('measured', 'measured', factor * measured),
              Line('simulated', 'simulated', factor * simulated)]
     yield Chart('trace', 'Output of the gyro', 'Measured and simulated output over time.', 'time',
                 's', time, 'output', unit, lines)
-    unit, factor = _rate_unit(measured - simulated)
+    unit, factor = _rate_unit(before)
     yield Chart('difference', 'Measured less simulated', 'Residual over time.',
                 'time', 's', time, 'residual', unit,
-                _before_and_after(factor * (measured - simulated), factor * (measured - extended)))
+                _before_and_after(factor * before, factor * after))
 
 
 def _before_and_after(before: Array, after: Array, deviation: Array | None = None) -> list[Line]:
@@ -219,11 +212,11 @@ def _time_unit(time: Array) -> tuple[str, float]:
 
 def _error_charts(curve: Curve, place: int) -> Iterator[Chart]:
     """Give the error of the gyro as simulated and as measured, where it is known."""
-    if curve.simulated is None or curve.along == _SPECTRUM_VARIABLE:
+    if curve.simulated is None:
         return
     measured = curve.simulated + curve.before
     unit, factor = _rate_unit(measured)
-    lines = [Line('measured', 'measured', factor * measured, factor * curve.deviation,
+    lines = [Line('measured', 'measured', factor * measured, factor * np.asarray(curve.deviation),
                   draw_dots=True), Line('simulated', 'simulated', factor * curve.simulated)]
     if not np.array_equal(curve.before, curve.after, equal_nan=True):
         lines.append(Line('simulated, extended', 'after', factor * (measured - curve.after)))
@@ -240,36 +233,36 @@ def _horizontal(curve: Curve) -> tuple[str, str, Array]:
 
 def _residual_chart(curve: Curve, place: int) -> Chart:
     name, title = f'residual-{place}', f'Residual along {readable_name(curve.along)}'
-    if curve.along == _SPECTRUM_VARIABLE:
+    if curve.along == 'frequency':  # amplitudes instead of means
         lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE),
-                 Line('usual', 'simulated', curve.deviation / DEGREE)]
+                 Line('usual', 'simulated', np.asarray(curve.deviation) / DEGREE)]
         return Chart(name, title, 'Largest amplitude of the residual in bands of frequency, and '
                      'the usual one there; a line that stands out is a tone.', *_horizontal(curve),
                      'amplitude', 'deg/s', lines, is_logarithmic=True)
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     lines = _before_and_after(factor * curve.before, factor * curve.after,
-                              factor * curve.deviation)
+                              factor * np.asarray(curve.deviation))
     return Chart(name, title, 'Mean of the residual, with 95 % bands of noise alone.',
                  *_horizontal(curve), 'residual', unit, lines)
 
 
-def _heading_chart(curve: HeadingCurve) -> Chart:
-    time, before, after = _thin_points(curve.time, curve.before, curve.after)
+def _heading_chart(curve: Curve) -> Chart:
+    time, before, after = _thin_points(curve.at, curve.before, curve.after)
     unit, factor = _time_unit(time)
     return Chart('heading', 'Heading error over the log', 'Heading error of the simulation.',
                  'time', unit, factor * time, 'heading error', 'deg',
                  _before_and_after(before / DEGREE, after / DEGREE))
 
 
-def _allan_chart(curve: NoiseCurve) -> Chart:
+def _allan_chart(curve: Curve) -> Chart:
     unit, factor = display_unit('rad/s', 'bias_instability')
-    lines = [Line('residual', 'measured', factor * curve.measured, draw_dots=True),
-             Line('noise as found', 'after', factor * curve.fitted)]
+    lines = [Line('residual', 'measured', factor * curve.before, draw_dots=True),
+             Line('noise as found', 'after', factor * curve.after)]
     if curve.simulated is not None:
         lines.append(Line('noise of the simulation', 'simulated', factor * curve.simulated))
     return Chart('noise', 'Allan deviation of the residual',
                  'Allan deviation over averaging time, of the residual and of the noise that is '
-                 'simulated.', 'averaging time', 's', curve.averaging_time, 'Allan deviation',
+                 'simulated.', 'averaging time', 's', curve.at, 'Allan deviation',
                  unit, lines, is_logarithmic=True)
 
 

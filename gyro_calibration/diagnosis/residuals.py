@@ -25,11 +25,13 @@ from typing import TypeAlias
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
-from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve, RULED_OUT_DEFICIT
+from gyro_calibration.diagnosis.causes import CAUSES, make_finding, NOISE_NAMES
+from gyro_calibration.diagnosis.findings import Curve, Estimate, Finding, RULED_OUT_DEFICIT
 from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, NoiseShape, Replay, spline_derivative_gain)
 from gyro_calibration.diagnosis.search import VALUE_PENALTY
+from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
@@ -39,7 +41,6 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 
-NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 #: Standard deviation of a Gauss-Markov process whose Allan deviation has its peak at the floor by
 #: a bias instability of 1: the peak is at 1.89 correlation times.
 _MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
@@ -60,16 +61,6 @@ _CURVE_VARIABLES: Sequence[tuple[str, str, str, Callable[[Replay], Array]]] = (
     ('specific_force', 'm/s²', 'specific_force', lambda each: each.channels.specific_force),
     ('vibration', '(m/s²)²', 'specific_force', lambda each: each.lagged('vibration', 1.0)),
     ('supply', 'V', 'supply', lambda each: np.asarray(each.channels.supply)))
-
-
-@dataclass(frozen=True)
-class _ChangedFigure:
-    """A noise figure that differs from that of the model, beside others that do."""
-
-    value: float
-    interval: tuple[float, float]  # of 95 %
-    p_value: float
-    alternatives: tuple[str, ...]  # names of the figures whose change explains as much
 
 
 @dataclass(frozen=True)
@@ -154,7 +145,7 @@ def fit_noise_parameters(fit: RegressionFit, is_rounding_modelled: bool = False)
 
 
 def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
-                         is_rounding_modelled: bool) -> dict[str, _ChangedFigure]:
+                         is_rounding_modelled: bool) -> dict[str, Finding]:
     """
     Find the noise figures that differ from those of a model, one by one, the clearest first.
 
@@ -174,16 +165,16 @@ def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
         limits[place] = 2.0 * math.log(max(low, 1e-12)), 2.0 * math.log(max(high, 1e-12))
     if any(each.heading_step for each in fit.problem.replays):
         del limits[0]
-    found = _changed_figures(bands, limits, level)
+    found = _changed_figures(bands, limits, level, expected)
     if not is_rounding_modelled and bands.known_variance.any():
         other = _changed_figures(replace(bands, known_variance=0.0 * bands.known_variance), limits,
-                                 level)
+                                 level, expected)
         found = {name: each for name, each in other.items() if name in found}
     return found
 
 
-def _changed_figures(bands: BandEnergies, limits: Limits,
-                     level: float) -> dict[str, _ChangedFigure]:
+def _changed_figures(bands: BandEnergies, limits: Limits, level: float,
+                     expected: Noise) -> dict[str, Finding]:
     kinds = [bands]
     for own in bands.markov_variances.T:
         kinds.append(replace(bands, unit_variances=bands.unit_variances.copy()))
@@ -217,9 +208,13 @@ def _changed_figures(bands: BandEnergies, limits: Limits,
             others = (NOISE_NAMES[other] for other in sorted(limits.keys() - changed)
                       if likeliest(changed - {place} | {other})[0] - cost
                       < 2.0 * RULED_OUT_DEFICIT)
-            found[NOISE_NAMES[place]] = _ChangedFigure(
-                float(np.exp(0.5 * figures[place])),
-                _likelihood_interval(kind, place, figures, held(changed)), p_value, tuple(others))
+            name, value = NOISE_NAMES[place], float(np.exp(0.5 * figures[place]))
+            size = Estimate(value, _likelihood_interval(kind, place, figures, held(changed)),
+                            CAUSES[name].unit)
+            states, shows = (format_amount(each, size.unit, name)
+                             for each in (getattr(expected, name), value))
+            found[name] = make_finding(name, {name: size}, p_value, tuple(others),
+                                       evidence=f'the model states {states}, the log {shows}')
     return found
 
 
@@ -347,22 +342,23 @@ def _amplitude_spectrum(before: Sequence[Array], after: RegressionFit) -> Curve:
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
     counts = np.diff(np.append(edges, len(frequency)))
     usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges) / counts)
-    return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
+    return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual)
 
 
-def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> HeadingCurve:
+def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Curve:
     """Return the heading error over the first log, by its residual before and after extension."""
     each = after.problem.replays[0]
     lines = [np.cumsum(each.resample(left[0])) * each.point_interval
              for left in (before, after.unbiased_residuals)]
-    return HeadingCurve(np.arange(each.point_count) * each.point_interval, *lines)
+    return Curve('time', 's', np.arange(each.point_count) * each.point_interval, *lines)
 
 
-def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> NoiseCurve:
+def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> Curve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
     each = fit.problem.replays[0]
     allan = allan_deviation(each.resample(fit.residuals[0]), each.point_interval)
     times = allan.time
-    return NoiseCurve(
-        times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
-        np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk else None)
+    return Curve(
+        'averaging time', 's', times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
+        simulated=(np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk
+                   else None))

@@ -34,9 +34,8 @@ from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
     OnProgress, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.diagnosis.regression import (
-    build_problem, column_evidence, ColumnGroups, fit_causes, free_amplitude, group_columns,
-    Indices, is_rate_distortion, likelihood_with, likelihood_without, MIN_INDEPENDENT_SHARE,
-    RegressionFit, RegressionProblem)
+    build_problem, column_evidence, ColumnGroups, fit_causes, group_columns, Indices,
+    is_rate_distortion, likelihood_with, MIN_INDEPENDENT_SHARE, RegressionFit, RegressionProblem)
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, inverse_cosine_transform, Replay)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
@@ -54,27 +53,17 @@ VALUE_PENALTY, _UNNAMED_PENALTY = 1.2, 4.0
 #: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
 #: a disturbance that is not periodic.
 _MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
-#: Least number of periods of a tone in a log; slower variations are bias wander.
-_MIN_TONE_PERIODS = 20
 #: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
 _SLIP_DURATIONS, _MAX_SLIPS = (0.0, 0.1, 0.4), 20
 #: Least time between two slips, and between a slip and a gap where the heading is rounded, s.
 _SLIP_INTERVAL = 1.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
 _MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
-#: Half-width of the range in which a shape is refined, in logarithms.
-_SHAPE_RANGE = 0.8
-#: Effects of fixed amplitude that grow with their shapes.
-_GROWING_EFFECTS = ('sine_response', 'time_offset', 'bandwidth', 'clock_rate')
 #: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
 #: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
 #: same level, so that no single stretch establishes a cause.
 _LEVEL = 0.05
 MIN_PREDICTION_SIGMAS, _MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
-#: Number of stretches of all logs together.
-_STRETCH_COUNT = 64
-#: Variables whose causes are named only if they have the same size in all logs.
-_REPEATING_VARIABLES = ('temperature', 'temperature_rate')
 
 Causes = tuple[Candidate, ...]
 #: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
@@ -237,11 +226,14 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
     """Return a cause with its best shape near the given one, and the likelihood with it."""
     places = fitted_shape_indices(candidate) if candidate.cause != 'reference_slip' else []
     half = candidate.half_width
-    half_range = half or _SHAPE_RANGE
+    half_range = half or 0.8  # in logarithms
     # those of smooth columns follow by Gauss-Newton steps
     for place in places[:1] if smooth_shapes(candidate) else places:
-        if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
-            ratio = free_amplitude(fit, candidate)
+        # those of fixed amplitude that grow with their shapes begin with that of a free amplitude
+        if candidate.cause in ('sine_response', 'time_offset', 'bandwidth', 'clock_rate'):
+            free = replace(candidate, cause='column', amplitude=None)
+            ratio = fit_causes(fit.problem, [*fit.causes, free]).coefficients(
+                len(fit.causes))[0].value
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
@@ -289,7 +281,7 @@ def _find_tones(fit: RegressionFit) -> list[Scored]:
         each, white = fit.problem.replays[run], left[run]
         # Zero padding: a tone between two frequencies of the log would lose half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
-        lowest = 2 * _MIN_TONE_PERIODS
+        lowest = 40  # of 20 periods in the log; slower variations are bias wander
         if len(power) > 2 * lowest:
             best = lowest + int(power[lowest:-2].argmax())
             frequency = 0.5 * best / each.duration
@@ -538,7 +530,7 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
     """
     fit = fit_causes(search.problem, causes)
     rest = _without(causes, cause_index)
-    without = likelihood_without(fit, cause_index)
+    without = fit_causes(search.problem, rest).log_likelihood
     if is_rate_distortion(causes[cause_index].cause) and any(
             is_rate_distortion(each.cause) for each in rest):
         without = max(without, fit_causes(
@@ -594,8 +586,8 @@ def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
             continue
         # as far as it is one along a temperature, with its own size in each log but the last
         alone = [replace(each, log_index=run, values=()) for run in range(
-            len(problem.replays) - 1) if CAUSES[each.cause].along in _REPEATING_VARIABLES
-            and each.amplitude is None]
+            len(problem.replays) - 1) if each.amplitude is None
+            and CAUSES[each.cause].along in ('temperature', 'temperature_rate')]
         more = 2.0 * (fit_causes(problem, [*causes, *alone]).log_likelihood
                       - fit_causes(problem, causes).log_likelihood) if alone else 0.0
         if not alone or chi2.sf(
@@ -621,7 +613,6 @@ class Selection:
     alternatives: Sequence[Sequence[Scored]]
     unnamed: Causes  # structure without a name, and causes whose names it withdraws
     suspected: Causes
-    refuted: Causes  # causes that are not confirmed, and not suspected
 
 
 def confirm_causes(search: Search, causes: Causes) -> Selection:
@@ -640,8 +631,7 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
                           and each.cause not in {other.cause for other in selected} and p_value(
                               each.cause, likelihood - score)
                           < SUSPECTED_RATE_FACTOR * search.rate)[:1]
-    return Selection(named, alternatives, unnamed, suspected,
-                     tuple(each for each in removed if not _is_lasting(each)))
+    return Selection(named, alternatives, unnamed, suspected)
 
 
 def _remove_unconfirmed(search: Search, causes: Causes,
@@ -689,7 +679,7 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """
     full, found = fit_causes(search.problem, causes), []
     left = full.whitened_series()
-    count = max(_STRETCH_COUNT // len(left), 1)
+    count = max(64 // len(left), 1)  # stretches of each log
     stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
                               for run, each in enumerate(left)])
     off = np.concatenate(left)

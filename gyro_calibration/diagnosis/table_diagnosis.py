@@ -33,13 +33,13 @@ from gyro_calibration.calibration.selection import (
     BASIC_EFFECTS, distinguishing_rate, FALSE_ALARM_RATE, find_supported_effects,
     MIN_DISTINGUISHING_SIGMAS, resolve_confounders, TECHNOLOGY_EFFECTS, try_fit, try_replace)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies, Cause, CAUSES, make_finding, REFERENCES, untestable_causes)
-from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
+    add_remedies, Cause, CAUSES, make_finding, REFERENCES, sized_finding, untestable_causes)
+from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    gain_from_squares, HEADING_WINDOW, origin_notes, previous_origins, widen_range)
+    ambiguity_notes, gain_from_squares, HEADING_WINDOW, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
     Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
-from gyro_calibration.diagnosis.gates import refuse_unusable
+from gyro_calibration.diagnosis.gates import check_gates, mismatch_diagnosis, refuse_unusable
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, CUBIC_NONLINEARITY, Effect,
@@ -88,8 +88,10 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     if not np.ptp(dwells.rate) > 0.0:
         raise DataRefused('all dwells have one rate, which does not separate scale factor and '
                           'bias; record several rates, both ways')
-    record = resolve_unit(inspect_record(log, model))
-    dwells = replace(dwells, output=dwells.output * record.unit_factor)
+    gates = check_gates(log)
+    if (mismatch := mismatch_diagnosis(gates, model)) is not None:
+        return mismatch
+    record = inspect_record(log, model)
     named = _name_causes(dwells, model)
     structures, gains = _find_structure(named.fit)
     # structure along the variable of a cause, above a tenth of what that explains
@@ -110,15 +112,14 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     findings = add_remedies([*record.findings, *_outlier_findings(named.fit), *(
         _cause_finding(named, effect) for effect in strongest_first)], {}, after)
     if after is not before:
-        notes = origin_notes(findings, [record.unit_factor])
-        after = replace(after, origin={**after.origin, **notes})
+        after = replace(after, origin={**after.origin, **ambiguity_notes(findings)})
     return Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
         _error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
                  *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
-        method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE))
+        method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE), gates=gates)
 
 
 # the steps
@@ -165,9 +166,9 @@ def _outlier_findings(fit: Calibration) -> Iterator[Finding]:
     sigmas = np.abs(fit.residual[outlying]) / np.sqrt(np.diag(fit.prediction_covariance(dwells)))
     chance = min(1.0, len(fit.dwells) * 2.0 * float(student.sf(sigmas.max(), freedom)))
     if chance < 0.05 * FALSE_ALARM_RATE:
-        yield make_finding(
-            'outliers', {'outliers': Estimate.from_half_width(float(len(dwells)), 0.0, '1')},
-            chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
+        yield sized_finding(
+            'outliers', len(dwells), 0.0, chance,
+            cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
             evidence=f'{len(dwells)} of {len(fit.dwells)} dwells are up to '
             f'{sigmas.max():.0f} sigma from the others: {format_list(dwells.location)}',
             along='rate')

@@ -17,7 +17,7 @@ import math
 import re
 import textwrap
 
-from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.causes import CAUSES, NOISE_NAMES
 from gyro_calibration.diagnosis.findings import (
     DETECTION_POWER, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
 from gyro_calibration.files import to_printable
@@ -35,8 +35,6 @@ _PARAMETER_UNITS = {
     **dict.fromkeys(['unit_error', 'outliers', 'stuck_samples', 'dropped_samples'], ('', 1.0))}
 #: Unit -> (value below which a finer unit is used, finer unit, factor to it).
 _FINER_UNITS = {'s': (0.5, 'ms', 1e3), '%': (0.01, 'ppm', 1e4)}
-_NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
-                'rate_random_walk': 'rad/s/√s'}
 #: Largest number of causes in one sentence.
 _MAX_NAMED_CAUSES = 3
 
@@ -322,9 +320,9 @@ def lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
 def noise_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Return the name of each noise figure, that of the residual, and that of the simulation."""
     def format_value(value: float, name: str) -> str:
-        return format_amount(value, _NOISE_UNITS[name], name) if value else 'none'
+        return format_amount(value, CAUSES[name].unit, name) if value else 'none'
     return [(readable_name(name), format_value(getattr(diagnosis.noise, name), name),
-             format_value(getattr(diagnosis.simulated, name), name)) for name in _NOISE_UNITS]
+             format_value(getattr(diagnosis.simulated, name), name)) for name in NOISE_NAMES]
 
 
 def terminal_lines(diagnosis: Diagnosis) -> Iterator[str]:

@@ -30,8 +30,7 @@ import threading
 from typing import NamedTuple
 
 from gyro_calibration.driver.protocols import (
-    AUTO, BAUDS, Decoder, find_protocol, Protocol, Recognition, recognize_protocol, Sample,
-    Settings)
+    AUTO, BAUDS, Decoder, find_protocol, Protocol, recognize_protocol, Sample, Settings)
 from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
 import serial
 
@@ -211,7 +210,6 @@ class Connection:
             ConnectionCounts(), 0, _ATTEMPT_INTERVAL, 0)
         self.baud, self.last_error = 0, ''
         self.path = ''  # the device of the port when it was last opened, links resolved
-        self.detected = ''  # result of the recognition by listening, in a sentence
         self.open_count, self.waited_duration = 0, 0.0  # s
         self.longest_gap = 0.0  # between two samples, s; 0 while none exceeds 1.5 periods
         self._is_auto = protocol == AUTO
@@ -263,7 +261,6 @@ class Connection:
         self._set_state('listening')
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:
-            tried: list[Recognition] = []
             for baud in self._bauds:
                 port.set_baud(baud)
                 # within 1 s after the first byte
@@ -276,26 +273,21 @@ class Connection:
                     if not data and now - opened > _SILENCE_TIMEOUT:
                         self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), end)
                     if data and now >= due:
-                        recognized = recognize_protocol(data, self._settings)
+                        found = recognize_protocol(data, self._settings)
                         due, last = now + _ATTEMPT_INTERVAL, min(last, now + _LISTENING_DURATION)
-                        if recognized.protocol is not None or now >= last:
+                        if found is not None or now >= last:
                             break
-                if stop.is_set():
-                    return
-                tried.append(recognized)
-                found = recognized.protocol
                 if found is not None:
-                    self.detected = recognized.summary
                     try:
                         self._set_protocol(found, baud)
                     except ValueError as error:
                         raise PortError(f'{found.name} comes on {self._pattern}, but '
                                         f'{error}') from error
                     return
-            best = max(tried, key=lambda each: each.explained_share)
             self._report_or_raise(
                 f'bytes come on {self._pattern}, but no protocol was recognized at '
-                f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.summary}', end)
+                f'{", ".join(map(str, self._bauds))} bit/s: set protocol, or for csv name as many '
+                'columns as a line has numbers', end)
 
     def _report_or_raise(self, problem: str, deadline: float) -> None:
         """Report a problem while the port stays open; raise `PortError` after a time."""

@@ -18,9 +18,9 @@ Estimation and removal of clock skew from network delay measurements, INFOCOM 19
 the sequence of the device, or its time, or a count. Lost samples without other evidence show as
 well: all later samples are late by whole periods; and samples counted twice arrive early.
 
-`_ClockStepDetector` detects that a clock was set: a computer without a battery starts with a wrong
-date and is set by months when it finds a time server. `NodeTimeConverter` converts a steady clock
-to stamps of such a clock, `HostTimeConverter` converts its stamps to a continuous time.
+A computer without a battery starts with a wrong date and is set by months when it finds a time
+server. `NodeTimeConverter` converts a steady clock to stamps of such a clock, `HostTimeConverter`
+converts its stamps to a continuous time.
 
 No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
 """
@@ -44,8 +44,7 @@ _SETTLING_DURATION = 2.0
 _SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line, so that no rate is off by the correction
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-#: Averaging time of the jitter, and time for which older stamps may come after a clock was set, s.
-_RECENT_DURATION = 10.0
+_RECENT_DURATION = 10.0  # s; in which older stamps may come after a clock was set
 #: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz
 #: on: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
 _MIN_LATENESS = 0.5e-3
@@ -216,7 +215,6 @@ class SampleClock:
         self._last_number, self._slew_offset = 0.0, 0.0
         self._uncertain_losses, self._uncertain_since, self._newly_lost = 0, 0.0, 0
         self._last_stamp, self._last_arrival = min_stamp, -math.inf
-        self._mean_squares = 0.0, 0.0
         # while the port was open: missing in the sequence or in the time of the device, damaged,
         # or shown by the lateness of all later samples
         self.lost_count = 0
@@ -230,11 +228,6 @@ class SampleClock:
     def is_settled(self) -> bool:
         """Whether the line spans enough time to know the period."""
         return self._line.time_span() >= _SETTLING_DURATION
-
-    @property
-    def jitter(self) -> tuple[float, float]:
-        """Root mean squares over 10 s of lateness, and of stamps against the line, s."""
-        return math.sqrt(self._mean_squares[0]), math.sqrt(self._mean_squares[1])
 
     def interrupt(self) -> None:
         """Start a new line, as after a loss of the port; no samples count as lost meanwhile."""
@@ -277,15 +270,6 @@ class SampleClock:
         slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANT)
         self._slew_offset = min(slew, arrival - line.value_at(number))
         stamps = [line.value_at(each) + self._slew_offset for each in numbers]
-
-        # mean square of a lateness that is linear from the first sample to the last
-        first, last = (arrival - stamp + self._slew_offset for stamp in (stamps[0], stamps[-1]))
-        late, (past, past_after) = ((first * first + first * last + last * last) / 3.0,
-                                    self._mean_squares)
-        weight = min(1.0, len(stamps) * self.period / _RECENT_DURATION)
-        self._mean_squares = (
-            past + weight * (late - past),
-            past_after + weight * (self._slew_offset * self._slew_offset - past_after))
 
         # increasing stamps
         if stamps[0] < self._last_stamp + _MIN_STAMP_STEP:

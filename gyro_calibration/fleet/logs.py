@@ -11,7 +11,7 @@
 """
 The logs of a fleet: of which unit, type and drive each is, and its record.
 
-Unit, type and drive are in a table, in notes, in metadata or in the names of files. The record has
+Unit, type and drive are in a table, in notes or in the names of files. The record has
 the calibration and the diagnosis. A single log does not distinguish slow effects (a ramp, a
 warm-up, the temperature) from the wander of the bias. Each is fitted alone with scale factor error
 and bias, to the increments of the heading over spans, with the noise of `noise_grid`. An effect
@@ -53,11 +53,10 @@ from gyro_calibration.logs.columns import find_delimiter
 from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES, read_log
 from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
 from gyro_calibration.logs.recording import read_recording
-from gyro_calibration.logs.ros_bag import is_recording, list_recording_files, read_metadata
+from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.settings_file import read_settings
 import numpy as np
 
 #: Fields of a log in a table, in addition to its path.
@@ -65,11 +64,9 @@ _ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 _LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
-#: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
+#: Notes and names, such as "unit: 7" and rc_car_h_unit1.csv.gz.
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)
-_WORDED_NOTE = re.compile(r'\b(unit|drive) (\w*\d\w*|[a-z](?=[,;.)]|$))',
-                          re.IGNORECASE | re.MULTILINE)
 _FILE_NAME_PATTERNS = {
     'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
     'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
@@ -220,8 +217,8 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
 
 
 def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None) -> FleetLog:
-    """Return an entry with its empty fields filled from file name, notes or metadata."""
-    # in order of precedence: table, pattern of the user, notes and metadata, usual file names
+    """Return an entry with its empty fields filled from file name or notes."""
+    # in order of precedence: table, pattern of the user, notes, usual file names
     stem = re.sub(f'({"|".join(map(re.escape, sorted(_LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
@@ -237,20 +234,9 @@ def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None) -> Fleet
 
 
 def _read_notes(path: str) -> dict[str, str]:
-    """Return the fields in the notes of a log, or in the metadata of a recording."""
-    stated: dict[str, str] = {}
-    recordings = [Path(path)] if path.endswith('.mcap') else []
-    if os.path.isdir(path):
-        recordings = sorted(Path(path).glob('*.mcap'))
-        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-            content = read_settings(Path(path) / 'metadata.yaml')
-            custom = content['rosbag2_bagfile_information']['custom_data'] or {}
-            stated.update({str(name).lower(): str(value) for name, value in custom.items()})
-    for each in recordings:
-        with suppress(OSError):  # reported where the log is read
-            stated.update({name.lower(): value for name, value in read_metadata(each).items()})
+    """Return the fields in the notes of a log; none of a recording."""
     if os.path.isdir(path) or not path.lower().endswith(('.csv', '.csv.gz')):
-        return stated
+        return {}
     with open_regular_file(path) as file:
         try:
             data = (gzip.GzipFile(fileobj=file).read(_MAX_NOTE_BYTES) if path.endswith('.gz')
@@ -259,9 +245,8 @@ def _read_notes(path: str) -> dict[str, str]:
             return {}
     lines = takewhile(lambda line: line.startswith('#'),
                       data.decode(errors='replace').splitlines())
-    text = '\n'.join(lines)
-    return {name.lower(): value for notes in (_WORDED_NOTE, _KEYED_NOTE)
-            for name, value in reversed(notes.findall(text))}
+    return {name.lower(): value
+            for name, value in reversed(_KEYED_NOTE.findall('\n'.join(lines)))}
 
 
 # the record of a log

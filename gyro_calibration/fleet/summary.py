@@ -11,14 +11,13 @@
 """
 From the records of logs to the errors of the type, the unit and the reference.
 
-They are sentences, data, models, one page that needs nothing else, and tables in CSV.
+They are sentences, data, models, one page that needs nothing else, and a table of the logs.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
-import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -358,7 +357,7 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
             tolerance=Tolerance(**tolerances))
 
 
-# the page, and tables for other programs
+# the page, and a table for other programs
 
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
@@ -425,27 +424,14 @@ def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
     units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
     drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
               for each in of_type if each.drives]
-    dates = []  # values of logs, less those of their units, over their dates
-    for each in values if len(summary.dates) > 1 else ():
-        measure, factor = display_unit(each.unit, each.name)
-        label, dated = readable_name(each.name), [one for one in each.records if one['date']]
-        place = np.array([summary.dates.index(one['date']) + 1.0 for one in dated])
-        difference: Array = np.array([
-            one['values'][each.name]['value'] - each.units[one['unit']].value for one in dated])
-        dates.append(Chart(
-            f'{key}-{each.name}-dates', f'{label} less that of the unit',
-            f'dates: {", ".join(summary.dates)}', 'date', '', place, label, measure,
-            [Line('log', 'measured', factor * difference, draw_dots=True)],
-            x_names=summary.dates))
     for heading, charts, text, more in (
             ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
              of_units),
             ('drives', drives, 'An error that all units of a drive have in common is assigned to '
-             'its reference or to the vehicle.', None),
-            ('over time', dates, '', None)):
+             'its reference or to the vehicle.', None)):
         if charts or more:
             yield element('section', element('h2', f'{name}: {heading}'),
-                          element('p', text, class_='quiet') if text else None,
+                          element('p', text, class_='quiet'),
                           element('div', *map(draw_chart, charts), class_='pairs'), more)
 
 
@@ -480,33 +466,12 @@ def _interval_chart(value: _ValueSummary, key: str, kind: str, intervals: Mappin
                  lines, x_names=list(intervals))
 
 
-def table_files(types: Sequence[_TypeSummary],
-                records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
-    """Return the content of files by name: values of logs, and of units, one row each, in SI."""
-    found, log_rows, unit_rows = {}, [], []
+def log_table(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the values of logs as CSV, one row a log, in SI."""
+    rows = []
     for record in records:
-        log_rows.append({key: record.get(key) for key in _COLUMNS})
+        rows.append({key: record.get(key) for key in _COLUMNS})
         for name, value in (record.get('values', {}) | record.get('slow', {})).items():
-            log_rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
-    for summary in types:
-        for unit, (name, each) in itertools.product(summary.units, summary.values.items()):
-            if unit not in each.units:
-                continue
-            estimate, following = each.units[unit], each.next_power_on[unit]
-            row = {'type': summary.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
-                   'estimate': estimate.value, 'standard_deviation': estimate.deviation,
-                   'low': estimate.low, 'high': estimate.high,
-                   'from_type': each.type_deviation[unit].value,
-                   'next_low': following.low, 'next_high': following.high,
-                   'stands_out': unit in {alarm.name for alarm in each.outlying_units}}
-            for over, slopes in each.unit_slopes.items():
-                row |= {f'{over}_slope': slopes[unit].value,
-                        f'{over}_slope_low': slopes[unit].low,
-                        f'{over}_slope_high': slopes[unit].high}
-            unit_rows.append(row)
-    for name, rows in (('logs', log_rows), ('units', unit_rows)):
-        columns = dict.fromkeys(key for row in rows for key in row)
-        if columns:
-            found[f'{name}.csv'] = format_rows(
-                [columns, *([row.get(key) for key in columns] for row in rows)]).encode()
-    return found
+            rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
+    columns = dict.fromkeys(key for row in rows for key in row)
+    return format_rows([columns, *([row.get(key) for key in columns] for row in rows)])

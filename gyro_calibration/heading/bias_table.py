@@ -339,13 +339,11 @@ class BiasTable:
         return (self._written_entries != tuple(self.entries)
                 and (ending or abs(now - self._write_time) >= MIN_WRITE_INTERVAL))
 
-    def mark_written(self, now: float) -> None:
-        """Record that the table was written."""
-        self._written_entries, self._write_time = tuple(self.entries), now
-
-    def mark_write_failed(self, now: float) -> None:
-        """Record that it could not be written; it is tried again later, and at the end."""
+    def mark_write(self, now: float, is_written: bool = True) -> None:
+        """Record a write; one that failed is tried again later, and at the end."""
         self._write_time = now
+        if is_written:
+            self._written_entries = tuple(self.entries)
 
 
 @dataclass(frozen=True)
@@ -475,7 +473,7 @@ def write_bias_table(path: str | Path, table: BiasTable,
     content = {'format': _FORMAT, 'version': _VERSION, 'model': table.digest, 'entries': entries,
                'jumps': [_common_fields(each) for each in table.jumps]}
     written = write_atomically(path, (_HEADER + format_settings(content)).encode())
-    table.mark_written(now)
+    table.mark_write(now)
     return message, written
 
 

@@ -116,11 +116,6 @@ class HeadingEstimator:
         self.is_calibrated_this_run = False
         self._restart(now)
 
-    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
-        """Use other settings of the tracker."""
-        self._settings = settings
-        self.tracker.configure(settings)
-
     def reset(self) -> None:
         """Set the heading to zero."""
         self.heading_before_resets += self.tracker.heading
@@ -242,17 +237,6 @@ class HeadingEstimator:
         """Return the age of the variance of the bias, s, which a propagated one includes."""
         return (self.age(now) if self.current_model.self_calibration is None
                 else max(now - self._start_time, 0.0))
-
-    @property
-    def current_calibration(self) -> SelfCalibration:
-        """Return the calibration at this temperature; an unknown scale has infinite variance."""
-        used = (self.current_model.self_calibration
-                or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0))))
-        assert used.covariance is not None  # an unknown one is assumed
-        variance = self.bias_variance / used.scale ** 2
-        change, _ = self._bias_change(self._time, self.temperature, 0.0)
-        return replace(used, bias=used.bias + float(change),
-                       covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
 
     @property
     def bias_variance(self) -> float:

@@ -30,7 +30,7 @@ from collections import deque
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.stamps import SHORT_RATIO
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
@@ -209,20 +209,16 @@ class ThresholdFilter:
         variance = sum(each * each for each in rates) / len(rates) - mean * mean
         return rate if 0.0 < explained < variance * (time - window[0][0]) else 0.0
 
+    def apply_to_all(self, time: Array, rate: Array) -> Array:
+        """Return the rates of the next n samples, rad/s, or zeros, shape (n,)."""
+        return rate if not self.settings.rate else np.array(
+            [self.apply(*each) for each in zip(time.tolist(), rate.tolist())])
+
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
-    heading = np.empty(len(time))
-    heading[:1] = begin
-    for first in range(1, len(time), CACHE_BLOCK_SAMPLES):
-        stop = min(first + CACHE_BLOCK_SAMPLES, len(time))
-        here, before = slice(first, stop), slice(first - 1, stop - 1)
-        turned = rate[here] + rate[before]
-        turned *= 0.5
-        turned *= time[here] - time[before]
-        turned[0] += heading[first - 1]
-        np.cumsum(turned, out=heading[here])
-    return heading
+    turned = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
+    return np.cumsum(np.append(begin, turned))[:len(time)]
 
 
 def integrate_with_curvature(time: Array, rate: Array) -> Array:
@@ -230,25 +226,6 @@ def integrate_with_curvature(time: Array, rate: Array) -> Array:
     slope = np.gradient(rate, time)
     step = float(np.median(np.diff(time)))
     return integrate(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
-
-
-def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
-    """Return what `ThresholdFilter` makes of a whole log, rad/s, shape (n,)."""
-    if not settings.rate:
-        return rate
-    end = np.arange(1, len(rate) + 1)
-    begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
-    # each window is summed by itself: one large value would ruin a running sum from there on
-    bounded, count = np.clip(rate, -MAX_RATE, MAX_RATE), end - begin
-    windows = np.stack([begin, end], axis=1).ravel()
-    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
-                     for values in (bounded, bounded * bounded))
-    mean = sums / count
-    # motion if a window varies by more than the noise
-    variance = squares / count - mean * mean
-    explained = 9.0 * settings.angle_random_walk ** 2 * count
-    shakes = (explained > 0.0) & (explained < variance * (time - time[begin]))
-    return np.where((np.abs(mean) < settings.rate) & ~shakes, 0.0, rate)
 
 
 class BlockIntegrator:
@@ -261,8 +238,8 @@ class BlockIntegrator:
 
     def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
         """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
-        self._settings, self._noise, self._covariance = settings, noise, covariance
-        self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
+        self._filter, self._noise, self._covariance = ThresholdFilter(settings), noise, covariance
+        self._recent: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self._last_rows: Array = np.zeros((3 + len(covariance), 0))
         self._integrals: Array = np.zeros(3 + len(covariance))
         self._gap_variance, self.intervals = 0.0, Intervals()
@@ -276,12 +253,13 @@ class BlockIntegrator:
         """
         if not len(time):
             return rate, rate, rate
-        carried = len(self._window[0])
-        time, rate = (np.concatenate(pair) for pair in zip(self._window, (time, rate)))
-        filtered = filter_rates(self._settings, time, rate)[carried:]
-        kept = (filtered == rate[carried:]).astype(float)
-        begin = np.searchsorted(time, time[-1] - max(self._settings.window, RECENT_DURATION))
-        self._window, recent = (time[begin:], rate[begin:]), (time, rate)
+        filtered = self._filter.apply_to_all(time, rate)
+        kept = (filtered == rate).astype(float)
+        carried = len(self._recent[0])
+        recent = np.append(self._recent[0], time), np.append(self._recent[1], rate)
+        time, rate = recent
+        begin = np.searchsorted(time, time[-1] - RECENT_DURATION)
+        self._recent = time[begin:], rate[begin:]
 
         # from the last sample of the block before on
         before = min(carried, 1)

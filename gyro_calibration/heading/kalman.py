@@ -174,15 +174,6 @@ class HeadingState:
                 float(step.observation @ self.covariance @ step.observation
                       + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
 
-    def expected_rest_angles(self, durations: Array, lost: Array, sensitivities: Array
-                             ) -> tuple[Array, Array]:
-        """Return the same of k integrals, by values as in `heading_variances`, (k,) each."""
-        seen, variances = _integrated_wander(self.noise, np.round(durations, 6))
-        rows = np.concatenate([seen, -sensitivities], axis=1)
-        return rows @ self.mean, (
-            ((rows @ self.covariance) * rows).sum(axis=1) + variances + lost
-            + self.noise.angle_random_walk ** 2 * durations)
-
     @cached_property
     def wander_rate(self) -> tuple[float, float]:
         """Return the sum of random walk and flicker, rad/s, and its variance."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import lru_cache
 import math
 
@@ -30,7 +30,6 @@ from gyro_calibration.heading.kalman import (
 from gyro_calibration.logs.log import Array, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is tested, s.
@@ -98,12 +97,6 @@ def chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     return float(chdtri(degrees_of_freedom, chance))
 
 
-def _chi_squared_quantiles(degrees_of_freedom: Array, chance: float) -> Array:
-    """Return the values that chi squared exceeds with a probability, shape (k,)."""
-    return np.array([chi_squared_quantile(max(round(each), 1), chance)
-                     for each in degrees_of_freedom.tolist()])
-
-
 class EnergyDetector:
     """The energy of the last `WINDOW_DURATION` s."""
 
@@ -112,11 +105,11 @@ class EnergyDetector:
         # ratio of the noise of the samples to that of the model, by the quietest windows, and the
         # largest deviation of a single sample at rest, rad/s
         self.noise_factor, self.sudden_limit = 1.0, math.inf
-        self._blocks = deque[Block]()
+        self._blocks: Array = np.zeros((5, 0))  # rows of `Block`
         self._ratios = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
         self._since_last_window = 0.0
         # of the next blocks: quiet, noise factor, and limit of the samples after it, rad/s
-        self.results_ahead = deque[tuple[bool | None, float, float]]()
+        self._results = deque[tuple[bool | None, float, float]]()
         self.configure(noise, false_alarms)
 
     def configure(self, noise: Noise, false_alarms: float) -> None:
@@ -128,47 +121,15 @@ class EnergyDetector:
 
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
-        self._blocks.clear()
-        self.results_ahead.clear()
+        self._blocks = self._blocks[:, :0]
+        self._results.clear()
 
     def add(self, block: Block) -> bool | None:
         """Add a block; tell whether the window contains only noise; None until it is full."""
-        if self.results_ahead:
-            quiet, self.noise_factor, self.sudden_limit = self.results_ahead.popleft()
-            return quiet
-        blocks = self._blocks
-        blocks.append(block)
-        duration, count = 0.0, 0
-        for each in blocks:
-            duration += each.duration
-            count += each.count
-        while (duration - blocks[0].duration >= WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
-               and count - blocks[0].count >= _MIN_WINDOW_SAMPLES):
-            duration -= blocks[0].duration
-            count -= blocks.popleft().count
-        total = squares = differences = means = 0.0
-        for each in blocks:
-            total += each.rate_sum
-            squares += each.square_sum
-            differences += each.difference_square_sum
-            means += each.rate_sum * each.rate_sum / each.count
-        if (duration < WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
-                or count < _MIN_WINDOW_SAMPLES):
-            return None
-        model_variance = self._noise.rate_variance(duration / count)
-        energy = (squares - total * total / count) / (count - 1)
-        self.noise_factor = self._next_noise_factor(
-            self.noise_factor, block.duration, count, energy / model_variance,
-            0.5 * differences / count / model_variance)
-        model_variance *= self.noise_factor ** 2
-        self.sudden_limit = self._sample_limit(duration / count, model_variance)
-        if energy >= model_variance * chi_squared_quantile(
-                count - 1, self._false_alarm_chance) / (count - 1):
-            return False
-        # motion is slower than the samples, so that means over blocks show it far better
-        freedom = len(blocks) - 1
-        return bool(freedom < 2 or means - total * total / count
-                    < model_variance * chi_squared_quantile(freedom, self._false_alarm_chance))
+        if not self._results:
+            self.look_ahead(np.array([astuple(block)]).T)
+        quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
+        return quiet
 
     def _next_noise_factor(self, factor: float, duration: float, count: float, energy: float,
                            differences: float) -> float:
@@ -192,22 +153,9 @@ class EnergyDetector:
         return (mean_threshold_sigmas(round(interval, 9), self._sample_false_alarms)
                 * math.sqrt(variance))
 
-    def quiet_ahead(self, number: int) -> tuple[bool | None, float]:
-        """Return whether a block ahead is quiet, and the limit of its samples."""
-        limit = self.results_ahead[number - 1][2] if number else self.sudden_limit
-        return self.results_ahead[number][0], limit
-
-    def skip(self, count: int) -> None:
-        """Add blocks that were looked at, without their results."""
-        for _ in range(count):
-            _, self.noise_factor, self.sudden_limit = self.results_ahead.popleft()
-
     def look_ahead(self, blocks: Array) -> None:
         """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
-        # as `add` does one by one
-        before = np.array([(each.duration, each.count, each.rate_sum, each.square_sum,
-                            each.difference_square_sum) for each in self._blocks])
-        sums, kept = np.hstack([before.reshape(-1, 5).T, blocks]), len(before)
+        sums, kept = np.hstack([self._blocks, blocks]), self._blocks.shape[1]
         sums = np.vstack([sums, sums[2] ** 2 / sums[1]])
         until = np.cumsum(np.pad(sums[:2], ((0, 0), (1, 0))), axis=1)
         end = np.arange(kept, sums.shape[1]) + 1
@@ -229,14 +177,12 @@ class EnergyDetector:
             factors.append(factor)
         variance *= np.square(factors)
         # motion is slower than the samples, so that means over blocks show it far better
-        quiet = (energy * freedom < variance * _chi_squared_quantiles(
-            freedom, self._false_alarm_chance)) & (
-            (end - begin < 3) | (means - total * total / count < variance
-                                 * _chi_squared_quantiles(end - begin - 1.0,
-                                                          self._false_alarm_chance)))
-        self._blocks = deque(Block(duration, round(count), *others) for duration, count, *others
-                             in sums[:5, begin[-1]:].T.tolist())
-        self.results_ahead.extend(
+        of_samples, of_blocks = (chdtri(np.maximum(each, 1.0), self._false_alarm_chance)
+                                 for each in (freedom, end - begin - 1.0))
+        quiet = (energy * freedom < variance * of_samples) & (
+            (end - begin < 3) | (means - total * total / count < variance * of_blocks))
+        self._blocks = sums[:5, begin[-1]:]
+        self._results.extend(
             (each, factor, self._sample_limit(*sampled)) if known
             else (None, factor, self.sudden_limit) for known, each, factor, *sampled in zip(
                 full.tolist(), quiet.tolist(), factors, interval.tolist(), variance.tolist()))
@@ -361,9 +307,9 @@ class Epoch:
     ambiguity_variance: float  # of the bias, (rad/s)²
     begin_time: float  # of the heading, s
     mixture_variance: float  # of the heading, beyond that of the state, rad²
-    #: Last samples of its blocks, and integrals of the rates since the state: durations, s, lost
-    #: variances, rad², and sensitivities, shape (k, m).
-    open_integrals: list[tuple[NDArray[np.intp], Array, Array, Array]]
+    #: Of each block, its last sample, and of the integral of the rates since the state: duration,
+    #: s, lost variance, rad², and sensitivity, shape (m,).
+    open_integrals: list[tuple[int, float, float, Array]]
     end_index: int = -1  # after its last sample
 
 
@@ -401,9 +347,6 @@ class EvenSamples:
         self.block_sums = np.array([self._sum_by_blocks(values) for values in (
             self.intervals, np.ones(count), self.rate, self.rate * self.rate, steps * steps)])
         self.block_angles = self._sum_by_blocks(self.angles)
-        self.block_squares = self.block_angles ** 2 / np.maximum(
-            self.block_sums[0], MIN_SAMPLE_INTERVAL)
-        self.block_ends = np.array(self.block_stops) - 1
         self._pending_retention = 1.0 - self.intervals / CORRECTION_TIME
         self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
@@ -466,10 +409,9 @@ class EvenSamples:
         if not moving:
             return
         # the variance of the heading in motion
-        opens = [each for epoch in moving for each in epoch.open_integrals]
-        states = [epoch.state for epoch in moving for places, *_ in epoch.open_integrals
-                  for _ in places]
-        places, *turns = map(np.concatenate, zip(*opens))
+        states = [epoch.state for epoch in moving for _ in epoch.open_integrals]
+        places, *turns = map(np.array, zip(*(
+            each for epoch in moving for each in epoch.open_integrals)))
         variances = heading_variances(states, *turns)
         white = np.array([state.noise.angle_random_walk ** 2 for state in states])
         until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1

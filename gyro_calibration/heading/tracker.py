@@ -38,7 +38,6 @@ from gyro_calibration.logs.log import (
     Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, Number)
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
@@ -59,8 +58,6 @@ NOISE_TOLERANCE = 1.25
 _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
 #: Last blocks of a rest in memory, among which its end is located.
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
-#: Last blocks in motion that may be held for a rest.
-_MAX_WINDOW_BLOCKS = round(WINDOW_DURATION / BLOCK_DURATION) + 2
 #: States of a rest in memory.
 _MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 1
 
@@ -115,7 +112,7 @@ class HeadingTracker:
         self.refused_count = self.outlier_count = self.rebuild_count = 0
         self._rebuild_message, self._settings = '', settings
         self._initialize(noise, covariance, age)
-        self.configure(settings)
+        self._configure()
 
     def _initialize(self, noise: Noise, covariance: Array, age: float | None, heading: float = 0.0,
                     variance: float = 0.0) -> None:
@@ -152,11 +149,9 @@ class HeadingTracker:
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
 
-    def configure(self, settings: TrackerSettings) -> None:  # noqa: A003
-        """Go on with other settings."""
-        self._settings = settings
-        self._state = self._state.with_added_variance(HEADING_INDEX, self._filtered_turn ** 2)
-        self._filtered_turn = 0.0
+    def _configure(self) -> None:
+        """Go on with the noise of another calibration."""
+        settings = self._settings
         self._detects_rest = (settings.false_alarms > 0.0
                               and self._model_noise.angle_random_walk > 0.0)
         self._energy.configure(self._model_noise, settings.false_alarms)
@@ -195,7 +190,7 @@ class HeadingTracker:
         self._energy.clear()
         self._sensitivity_slope = sensitivity_slope
         self._use_state(noise, covariance, heading, variance, age)
-        self.configure(self._settings)
+        self._configure()
 
     def reset(self) -> None:
         """Set the heading to zero, without uncertainty."""
@@ -403,23 +398,18 @@ class HeadingTracker:
                             self.is_resting, found[begin:end])
         if not self._block.duration:
             piece.epochs.append(self._new_epoch(-1))
-        number = 0
-        while number < len(piece.block_stops):
+        for number, until in enumerate(piece.block_stops):
             if number == piece.whole_blocks.start and piece.whole_blocks:
                 self._energy.look_ahead(piece.block_sums[:, number:piece.whole_blocks.stop])
-            if number in piece.whole_blocks:
-                number += self._pass_blocks(piece, number)
-            until = piece.block_stops[number]
-            number += 1
-            if number - 1 in piece.whole_blocks and self._take_block(piece, number - 1):
+            if number in piece.whole_blocks and self._take_block(piece, number):
                 if self._state_version != piece.epochs[-1].state_version:
                     piece.close_epoch(until - 1)
                     piece.epochs.append(self._new_epoch(until - 1))
                 elif not self.is_resting:
                     piece.epochs[-1].open_integrals.append(self._open_row(until - 1))
                 continue
-            piece.close_epoch(piece.block_starts[number - 1])
-            for place in range(piece.block_starts[number - 1], until):
+            piece.close_epoch(piece.block_starts[number])
+            for place in range(piece.block_starts[number], until):
                 piece.last_at_rest = self.is_resting
                 known = float(usual[place])
                 self._take_sample(*given.sample(begin + place), gap=(0, known))
@@ -439,127 +429,11 @@ class HeadingTracker:
                      self._pending_correction, self.bias_ambiguity ** 2, self._heading_begin_time,
                      self._mixture_variance, [self._open_row(place)])
 
-    def _open_row(self, place: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
+    def _open_row(self, place: int) -> tuple[int, float, float, Array]:
         """Return the open integral after a sample as that of an `Epoch`."""
         turn = self._with_unbiased_sensitivity(self._open_integral)
-        return (np.array([place]), np.array([turn.duration]),
-                np.array([turn.lost_variance + turn.extra_noise_variance]),
-                turn.sensitivity[None, :])
-
-    def _pass_blocks(self, piece: EvenSamples, number: int) -> int:
-        """Take the whole blocks before the next in which a decision falls; return their number."""
-        if (piece.wheels is not None or not self._energy.results_ahead
-                or piece.last_at_rest != self.is_resting):
-            return 0
-        if self.is_resting:
-            until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
-            begin, end = piece.block_starts[number], piece.block_stops[until - 1]
-            rates = np.abs(piece.rate[begin:end] - self._wander_rate
-                           + piece.rest_sensitivity[begin:end] @ self._calibration_errors)
-            peaks = np.maximum.reduceat(rates, np.array(piece.block_starts[number:until]) - begin)
-            duration, passed = self._open_integral.duration, until - number - 1
-            for place, (peak, more) in enumerate(zip(
-                    peaks.tolist(), piece.block_sums[0, number:until].tolist())):
-                quiet, limit = self._energy.quiet_ahead(place)
-                duration += more
-                if (quiet is False or peak > math.hypot(limit, self._bias_margin)
-                        or duration >= _STEP_DURATION - TIME_TOLERANCE):
-                    passed = place
-                    break
-        else:
-            passed = self._count_moving_blocks(piece, number)
-        if not passed:
-            return 0
-        here = slice(number, number + passed)
-        durations, angles, squares = (
-            piece.block_sums[0, here], piece.block_angles[here], piece.block_squares[here])
-        rows = piece.sensitivity_integrals[self.is_resting][here]
-        whole = RateIntegral(
-            float(durations.sum()), float(angles.sum()), rows.sum(axis=0), block_count=passed,
-            block_square_sum=float(squares.sum()))
-        last = slice(-_MAX_WINDOW_BLOCKS if not self.is_resting else None, None)
-        (self._rest_blocks if self.is_resting else self._recent_blocks).extend(
-            RateIntegral(duration, angle, row, block_count=1, block_square_sum=square)
-            for duration, angle, row, square in zip(
-                durations[last].tolist(), angles[last].tolist(), rows[last],
-                squares[last].tolist()))
-        if not self.is_resting:
-            turn, ends = self._open_integral, piece.block_ends[here]
-            totals = turn.duration + np.cumsum(durations)
-            piece.epochs[-1].open_integrals.append((
-                ends, totals, np.full(passed, turn.lost_variance + turn.extra_noise_variance),
-                self._unbiased_sensitivity(totals, turn.sensitivity + np.cumsum(rows, axis=0),
-                                           None if piece.still is None else piece.still[ends])))
-            self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
-        self._integrate_blocks(piece, here, whole)
-        self._open_integral += whole
-        self._open_variance = None
-        self._wheel_motion_time = self._last_time
-        self._energy.skip(passed)
-        return passed
-
-    def _integrate_blocks(self, piece: EvenSamples, here: slice, turn: RateIntegral) -> None:
-        """Integrate the heading over whole blocks, and adopt their last sample."""
-        turned = self._corrected_angle(turn)
-        if self.is_resting:
-            self.deleted_heading += turned
-        else:
-            decayed = float(piece.block_retentions[here].prod())
-            self.heading += turned + self._pending_correction * (1.0 - decayed)
-            self._pending_correction *= decayed
-        last = piece.block_stops[here.stop - 1] - 1
-        time, rate = float(piece.time[last]), float(piece.rate[last])
-        used = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
-        self._last_sample = time, rate, rate, used[last]
-        self._interval, self._last_time = float(piece.intervals[last]), time
-        self._still_sensitivity = None if piece.still is None else piece.still[last]
-
-    def _count_moving_blocks(self, piece: EvenSamples, number: int) -> int:
-        """Return how many of the next whole blocks are in motion before a decision."""
-        until = min(number + _MAX_REST_BLOCKS, piece.whole_blocks.stop)
-        begin, end = 0, len(self._recent_blocks)
-        durations = [*(each.duration for each in self._recent_blocks),
-                     *piece.block_sums[0, number:until].tolist()]
-        held, tested, first = self._held_integral.duration, list[int](), list[int]()
-        beyond = self._open_integral.duration - held
-        while end < len(durations) - 1:
-            held += durations[end]
-            end += 1
-            while (end - begin > 2
-                   and held - durations[begin] >= WINDOW_DURATION - TIME_TOLERANCE):
-                held -= durations[begin]
-                beyond += durations[begin]
-                begin += 1
-            quiet, _ = self._energy.quiet_ahead(end - len(self._recent_blocks) - 1)
-            if (quiet and self._quiet_duration != WINDOW_DURATION
-                    or beyond >= _STEP_DURATION - TIME_TOLERANCE):
-                end -= 1
-                break
-            if quiet and held >= WINDOW_DURATION - TIME_TOLERANCE and end - begin > 1:
-                tested.append(end)
-                first.append(begin + 1)
-        if tested:
-            # whether the mean over each of these parts is that of a rest
-            recent, here = self._recent_blocks, slice(number, until)
-            rows = np.zeros((len(durations) + 1, 3 + len(self._calibration_errors)))
-            rows[1:, 0] = durations
-            for row, each in zip(rows[1:], recent):
-                row[1], row[2] = each.angle, each.lost_variance + each.extra_noise_variance
-                row[3:] = each.sensitivity
-            rows[1 + len(recent):, 1] = piece.block_angles[here]
-            rows[1 + len(recent):, 3:] = piece.sensitivity_integrals[False][here]
-            sums, last = np.cumsum(rows, axis=0), np.array(tested)
-            parts = sums[last] - sums[first]
-            if piece.still is not None:
-                parts[:, 3:] = parts[:, :1] * piece.still[
-                    piece.block_ends[here][last - len(recent) - 1]]
-            expected, variances = self._state.expected_rest_angles(
-                parts[:, 0], parts[:, 2], parts[:, 3:])
-            stands = (np.abs(parts[:, 1] - expected)
-                      < self._sigmas[WINDOW_DURATION] * np.sqrt(variances))
-            if stands.any():
-                end = tested[int(np.argmax(stands))] - 1
-        return max(end - len(self._recent_blocks), 0)
+        return (place, turn.duration, turn.lost_variance + turn.extra_noise_variance,
+                turn.sensitivity)
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
@@ -583,7 +457,17 @@ class HeadingTracker:
                                 * (self._last_sample[3] - rows[begin - 1]))
             piece.last_at_rest = self.is_resting
         self._block.duration = part.duration
-        self._integrate_blocks(piece, slice(number, number + 1), part)
+        turned = self._corrected_angle(part)
+        if self.is_resting:
+            self.deleted_heading += turned
+        else:
+            decayed = float(piece.block_retentions[number])
+            self.heading += turned + self._pending_correction * (1.0 - decayed)
+            self._pending_correction *= decayed
+        time, rate = float(piece.time[end - 1]), float(piece.rate[end - 1])
+        self._last_sample = time, rate, rate, rows[end - 1]
+        self._interval, self._last_time = float(piece.intervals[end - 1]), time
+        self._still_sensitivity = None if piece.still is None else piece.still[end - 1]
         self._end_block(driven, moved[-1] if moved else None)
         if not -math.inf < self.heading < math.inf:
             self._rebuild_state()
@@ -982,16 +866,9 @@ class HeadingTracker:
         if (self._sensitivity_slope is None or self._still_sensitivity is None
                 or turn.is_unobserved):
             return turn
-        return replace(turn, sensitivity=self._unbiased_sensitivity(
-            turn.duration, turn.sensitivity, self._still_sensitivity))
-
-    def _unbiased_sensitivity(self, duration: Number, sensitivity: Array,
-                              still: Array | None) -> Array:
-        """Return sensitivities for rates without their bias, (m,), or (k, m) by durations (k,)."""
-        if self._sensitivity_slope is None or still is None:
-            return sensitivity
-        bias = self._wander_rate - still @ self._calibration_errors
-        return sensitivity - np.multiply.outer(duration * bias, self._sensitivity_slope)
+        bias = self._wander_rate - self._still_sensitivity @ self._calibration_errors
+        return replace(turn, sensitivity=turn.sensitivity
+                       - turn.duration * bias * self._sensitivity_slope)
 
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
@@ -1032,7 +909,7 @@ class HeadingTracker:
         self.rebuild_count += 1
         self._rebuild_message = ('the state was not finite and was initialized again; '
                                  'the heading error may be up to a full turn')
-        self.configure(self._settings)
+        self._configure()
 
     def _corrected_angle(self, part: RateIntegral) -> float:
         """Return the integral of the rates less their error as estimated at rest, rad."""

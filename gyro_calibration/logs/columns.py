@@ -15,12 +15,8 @@ A name of the log format states quantity and unit. The user assigns other names,
 `gyro=wz:deg/s`; without a unit, SI is assumed.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-import difflib
-import itertools
+from collections.abc import Mapping, Sequence
 import math
-import re
-import shlex
 from typing import NamedTuple
 
 from gyro_calibration.files import InputError, suggest_nearest, to_printable
@@ -73,17 +69,6 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'moving': ('moving', _NO_UNIT),
     'attitude': ('reference_heading', _NO_UNIT),
 }
-#: Name of a quantity in options -> pattern of column names in other programs, in lower case,
-#: letters only, before the unit.
-_COLUMN_ALIASES = {
-    'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
-    'gyro': r'w|wz|gz|(gyro|gyr|gyroscope|omega)(rotation|rate)?z?|angvelz|yawrate|'
-            r'.*(angularvelocity|rotationrate)z',
-    'temperature': r'temp|temperature|tempc|gyrotemp|imutemp|dietemp|tgyro',
-    'rate': r'ref|reference|referencerate|refrate|truerate|tablerate|ratetable',
-    'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
-    'supply': r'vdd|vcc|supply|voltage|volts',
-}
 
 
 class Column(NamedTuple):
@@ -127,7 +112,7 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                                  f'{", ".join(units)}{suggest_nearest(unit, units)}')
             if column not in header:
                 raise InputError(f'{name}={given}: there is no column {column} among '
-                                 f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
+                                 f'{excerpt(",".join(header))}{suggest_nearest(column, header)}')
             offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
             found[part] = Column(header.index(column), units[unit], offset)
     asked = {column.position for column in found.values()}
@@ -140,8 +125,9 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                              f'the {quantity}; keep one of them')
         found[quantity] = Column(index, factor)
     if not {'output', 'counts'} & set(found):
-        raise InputError(f'no gyro column among {_shorten(",".join(header))}; '
-                         f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggest_columns(header)}')
+        raise InputError(f'no gyro column among {excerpt(",".join(header))}; wanted a header '
+                         'with gyro_dps, gyro_rad_s or gyro_counts, and # before the lines above '
+                         'it, or other names, as by --columns time=NAME:s,gyro=NAME:deg/s')
     return found
 
 
@@ -156,44 +142,6 @@ def find_delimiter(line: str) -> str:
     return max(',;\t', key=line.count)
 
 
-def is_header(header: Sequence[str], user_columns: Mapping[str, str], axis: str) -> bool:
-    """Tell whether a row contains at least one known column name."""
-    named = {text for names in user_columns.values() for name in (names, *names.split('/'))
-             for text in (name, name.rpartition(':')[0])}
-    return any(name in named or _strip_axis(name, axis) in COLUMNS for name in header)
-
-
-def suggest_columns(header: Sequence[str]) -> str:
-    """Suggest the option --columns for a header, or another name; '' without a suggestion."""
-    names = [name for name in header if name not in COLUMNS and name == _shorten(name)
-             and not set(name) & set(',=:')]
-    wanted = dict[str, str]()
-    for quantity, alias in _COLUMN_ALIASES.items():
-        endings = {re.sub('[^a-z]', '', unit.lower()): unit
-                   for unit in _OPTION_QUANTITIES[quantity][1]}
-        endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
-        for name, (end, unit) in itertools.product(names, {**endings, '': 'UNIT'}.items()):
-            letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
-            if letters.endswith(end) and re.fullmatch(alias, letters.removesuffix(end)):
-                wanted.setdefault(quantity, f'{quantity}={name}:{unit}')
-    if 'gyro' in wanted:
-        attitude = '' if 'heading' in wanted else suggest_attitude(names)
-        text = ','.join(filter(None, [*wanted.values(), attitude]))
-        units = (', with a unit in place of each UNIT, such as s, ms, deg/s, rad/s, deg, rad'
-                 if 'UNIT' in text else '')
-        return f'; perhaps --columns {shlex.quote(text)} is meant{units}'
-    for name in header:
-        if name not in COLUMNS and (close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
-            return f'; perhaps {close[0]} is meant by {_shorten(name)}'
-    return ''
-
-
-def suggest_attitude(names: Iterable[str]) -> str:
-    """Return what names the columns of a quaternion in --columns; '' without one."""
-    found = {name[-2:].lower(): name for name in names}
-    parts = [found.get(f'q{axis}', '') for axis in ('w', *AXES)]
-    return f'attitude={"/".join(parts)}' if all(parts) else ''
-
-
-def _shorten(text: str) -> str:
-    return to_printable(text[:100])[:100]
+def excerpt(text: str) -> str:
+    """Return the first 100 characters of a text of a file, for a message."""
+    return to_printable(text[:100])

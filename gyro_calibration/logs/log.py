@@ -34,10 +34,10 @@ import zlib
 
 from gyro_calibration.files import (
     describe_error, format_rows, InputError, MAX_EXPANSION_RATIO, MAX_MAGNITUDE,
-    MIN_EXPANSION_BYTES, open_regular_file, open_replacement, to_printable)
+    MIN_EXPANSION_BYTES, open_regular_file, open_replacement)
 from gyro_calibration.logs.columns import (
-    ATTITUDE, AXES, Column, COLUMNS, DEGREE, find_columns, find_delimiter, is_header, QUANTITIES,
-    ROTATIONS, suggest_columns)
+    ATTITUDE, AXES, Column, COLUMNS, DEGREE, excerpt, find_columns, find_delimiter, QUANTITIES,
+    ROTATIONS)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -61,7 +61,6 @@ _MAX_LOG_VALUES = 1 << 29
 
 #: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
 MAX_TIME = 1e12
-_ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes where they are not `MAX_MAGNITUDE`: a single larger one decides a fit, degC.
 _MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
@@ -133,43 +132,47 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
     """
     blocks, numbers = [], 0
-    for block in read_log_blocks(path, sensitivity, rate, on_progress=on_progress,
-                                 columns=columns, axis=axis):
-        present = [quantity for quantity in QUANTITIES if getattr(block, quantity) is not None]
-        numbers += len(block) * (len(present) + 10 * len(block.others))
+    for block in _read_blocks(path, sensitivity, rate, columns, axis, on_progress):
+        arrays, others, notes = block
+        numbers += len(next(iter(arrays.values()))) * (len(arrays) + 10 * len(others))
         if numbers > _MAX_LOG_VALUES:
             raise LogError(f'{path}: has more than {_MAX_LOG_VALUES} numbers, which is above the '
                            'limit of memory; split it')
         blocks.append(block)
-    arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])
-              for quantity in present}
-    others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks))
-              for name in block.others}
-    return Log(**arrays, notes=block.notes, others=others)
+    arrays = {quantity: np.concatenate([block[0][quantity] for block in blocks])
+              for quantity in arrays}
+    others = {name: tuple(itertools.chain.from_iterable(block[1][name] for block in blocks))
+              for name in others}
+    _replace_attitude(arrays, axis)
+    return Log(**arrays, notes=notes, others=others)
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-                    rows: int = BLOCK_ROWS, on_progress: Callable[[int], object] | None = None,
-                    columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
+                    columns: Mapping[str, str] = {}, axis: str = 'z',
+                    on_progress: Callable[[int], object] | None = None) -> Iterator[Log]:
     """
     Read a log file as `read_log`, in blocks, so that memory does not grow with its length.
 
-    A block has `rows` rows, at least 2; the last one may have fewer, as may blocks with texts that
-    span lines. After each, `on_progress` takes the number of bytes read, unless from a pipe.
+    A block has `BLOCK_ROWS` rows; the last one may have fewer, as may blocks with texts that span
+    lines. The columns name no attitude, which needs the whole log.
     """
+    for arrays, others, notes in _read_blocks(path, sensitivity, rate, columns, axis,
+                                              on_progress):
+        yield Log(**arrays, notes=notes, others=others)
+
+
+def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None,
+                 columns: Mapping[str, str], axis: str, on_progress: Callable[[int], object] | None
+                 ) -> Iterator[tuple[dict[str, Any], dict[str, tuple[str, ...]], tuple[str, ...]]]:
+    """Give quantity -> values in SI, other columns as text, and the notes, of each block."""
+    # after each block, `on_progress` takes the number of bytes read, unless from a pipe
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
-    rotation = _AxisRotation(axis)
     with _convert_read_errors(path), open_regular_file(
             path, allow_pipes=True) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
-        if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
-            raise LogError('is a recording of ROS 1; wanted a log file or a ROS 2 recording: '
-                           'convert it, by pip install rosbags and '
-                           f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
-        table, first_line, first_rows = _read_header(_limit_length(lines), columns, axis)
-        lines = itertools.chain(first_rows, lines)
+        table, first_line = _read_header(_limit_length(lines), columns, axis)
         if table.delimiter == ' ':  # of which there may be several
             lines = (' '.join(line.split()) + '\n' for line in lines)
         budget = ExpansionBudget(path) if compressed and file.seekable() else None
@@ -178,7 +181,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
         while True:
             block, length = list[str](), 0  # fewer lines where they are long
             while (length < _MAX_BLOCK_LENGTH and (
-                    more := list(itertools.islice(lines, min(rows - len(block), 256))))):
+                    more := list(itertools.islice(lines, min(BLOCK_ROWS - len(block), 256))))):
                 block += more
                 length += sum(map(len, more))
             if not block:
@@ -193,11 +196,10 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             last = _refuse_unordered_time(places, arrays.get('time'), last)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
-            rotation.replace_attitude(arrays)
             if on_progress is not None and file.seekable():
                 on_progress(file.tell())
             if count > 1:
-                yield Log(**arrays, notes=table.notes, others=others)
+                yield arrays, others, table.notes
         if count < 2:
             raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
                            'more')
@@ -269,12 +271,8 @@ class _FileHeader(NamedTuple):
 
 
 def _read_header(lines: Iterator[str], columns: Mapping[str, str],
-                 axis: str) -> tuple[_FileHeader, int, list[str]]:
-    """
-    Return notes and header, the number of the next line, and the rows that were read.
-
-    Without a header, the names of columns are their numbers, from 1 on.
-    """
+                 axis: str) -> tuple[_FileHeader, int]:
+    """Return notes and header, and the number of the next line."""
     notes, line = [], next(lines, '')
     while line.startswith(('#', 'sep=')):  # spreadsheets write the delimiter into the first line
         notes.append(line.removeprefix('#').strip())
@@ -284,23 +282,8 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
         delimiter, line = ' ', ' '.join(line.split())
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
-    try:
-        has_names = not np.isfinite([_to_number(name.replace(',', '.')) for name in header]).all()
-    except ValueError:
-        has_names = True
-    if not has_names:
-        header = [str(1 + place) for place in range(len(header))]
-    if not is_header(header, columns, axis):
-        if not header:
-            raise LogError('has no line with the names of columns; record again, or name another '
-                           'file')
-        place = ('NAME:s', 'NAME:deg/s') if has_names else ('1:s', '2:deg/s')
-        meant = suggest_columns(header) or (
-            '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
-            f'lines above it, or name the columns{"" if has_names else ", by number"}, as by '
-            '--columns time={},gyro={}'.format(*place))
-        raise LogError(f'line {len(notes) + 1} is no header with a known column: '
-                       f'{excerpt(line.strip())}{meant}')
+    if not header:
+        raise LogError('has no line with the names of columns; record again, or name another file')
     found = find_columns(header, columns, axis)
     positions = {column.position for column in found.values()}
     # the other names, made unique: a second x becomes x.1
@@ -315,7 +298,7 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
         if index not in positions and name not in COLUMNS:
             others[unique] = index
     return (_FileHeader(tuple(notes), header, found, others, delimiter),
-            len(notes) + has_names * rows.line_num + 1, [] if has_names else [line])
+            len(notes) + rows.line_num + 1)
 
 
 def _parse_numeric_rows(lines: list[str], first_line: int,
@@ -395,11 +378,6 @@ def mask_invalid(values: Array, quantity: str) -> Mask:
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
 
-def excerpt(text: str) -> str:
-    """Return the first 100 characters of a text of a file, for a message."""
-    return to_printable(text[:100])
-
-
 def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,
                            previous_time: float, place: str = 'line') -> float:
     """Refuse time that does not increase or is too large; return the last time."""
@@ -438,7 +416,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     if (count := len(next(iter(arrays.values())))) < 2:
         raise LogError(f'the table has {count} of the 2 rows that are needed at least; record '
                        'more')
-    _AxisRotation(axis).replace_attitude(arrays)
+    _replace_attitude(arrays, axis)
     return Log(**arrays)
 
 
@@ -478,66 +456,40 @@ def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
     return replace(log, **arrays, others=others)
 
 
-class _AxisRotation:
+def _replace_attitude(arrays: dict[str, Array], axis: str) -> None:
     """
-    Integrates attitudes to the angle that a gyro with one axis turns, tilted or not.
+    Replace the parts of a quaternion, in quantity -> values, by the `ROTATIONS`.
 
-    The rotations between neighbouring attitudes are added by their component along the axis of
-    the sensor, less what coning adds to it (Bortz 1971). A quaternion turns axes of the sensor
-    into those of the room. Over a gap in which the axis of the rotation changes, that component is
-    not the angle: there the gyro's own angle is taken, if it drifts by less.
+    The rotation about an axis is the angle that a gyro with this axis turns, tilted or not: the
+    rotations between neighbouring attitudes are added by their component along the axis of the
+    sensor, less what coning adds to it (Bortz 1971). A quaternion turns axes of the sensor into
+    those of the room. Over a gap in which the axis of the rotation changes, that component is not
+    the angle: there the gyro's own angle is taken, if it drifts by less.
     """
-
-    def __init__(self, axis: str):
-        self._axis = AXES.index(axis)
-        self._angles = np.zeros(3)  # about the axis and the next two
-        self._output = np.empty((0, 3))  # time, output and its integral
-        self._last = np.empty((0, 6))  # time, integral of the output, quaternion
-
-    def replace_attitude(self, arrays: dict[str, Array]) -> None:
-        """Replace the parts of a quaternion, in quantity -> values, by the `ROTATIONS`."""
-        if ATTITUDE[0] not in arrays:
-            return
-        attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
-        known = np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < 0.4  # as in recordings
-        count, angles = len(attitude), np.full((len(attitude), 3), np.nan)
-        # time, s or rows, and the integral of the output, rad, nan without an output
-        first, begin = (self._output[-1, 0] + 1.0, self._output[-1, 2]) if len(
-            self._output) else (0.0, 0.0)
-        time = arrays.get('time', first + np.arange(count))
-        output = arrays.get('output', np.full(count, np.nan))
-        measured = np.isfinite(output)
-        if measured.any():
-            output = np.interp(time, time[measured], output[measured])
-        at, rate = (np.append(self._output[-1:, column], values)
-                    for column, values in enumerate((time, output)))
-        steps = 0.5 * np.diff(at) * (rate[1:] + rate[:-1])
-        by_gyro = begin + np.cumsum(np.append(np.zeros(count - len(steps)), steps))
-        self._output = np.array([[time[-1], output[-1], by_gyro[-1]]])
-        if known.any():
-            rows = np.column_stack([time, by_gyro, attitude])[known]
-            path = np.concatenate([self._last, rows])
-            turned = self._turned(path)[max(len(self._last) - 1, 0):]
-            turned = turned if len(self._last) else np.insert(turned, 0, 0.0, axis=0)
-            angles[known] = self._angles + np.cumsum(turned, axis=0)
-            self._angles, self._last = angles[known][-1], rows
-        arrays |= zip(ROTATIONS, angles.T)
-
-    def _turned(self, path: Array) -> Array:
-        """Return the angles from row to row of time, integral and quaternion, rad, (n - 1, 3)."""
-        if len(path) < 2:
-            return np.empty((0, 3))
-        time, apart, by_gyro = path[:, 0], np.diff(path[:, 0]), np.diff(path[:, 1])
-        attitude = Rotation.from_quat(path[:, [3, 4, 5, 2]])
-        step = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
-        usual = apart < 1.5 * np.median(apart)
-        coning = np.cross(step[:-1], step[1:]) / 12.0
-        turned = step.copy()
-        turned[1:] -= np.where((usual[:-1] & usual[1:])[:, None], coning, 0.0)
-        turned = np.roll(turned, -self._axis, axis=1)
-        gap = np.flatnonzero(~usual)
-        if not len(gap) or not np.isfinite(by_gyro).all():
-            return turned
+    if ATTITUDE[0] not in arrays:
+        return
+    quaternions = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
+    known = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 0.4  # as in recordings
+    angles = np.full((len(known), 3), np.nan)
+    arrays |= zip(ROTATIONS, angles.T)
+    if known.sum() < 2:
+        return
+    # time, s or rows, and the integral of the output, rad, nan without an output
+    time = arrays.get('time', np.arange(float(len(known))))
+    output = arrays.get('output', np.full(len(known), np.nan))
+    if (measured := np.isfinite(output)).any():
+        output = np.interp(time, time[measured], output[measured])
+    angle = np.append(0.0, np.cumsum(0.5 * np.diff(time) * (output[1:] + output[:-1])))
+    time, by_gyro = time[known], np.diff(angle[known])
+    apart, attitude = np.diff(time), Rotation.from_quat(quaternions[known][:, [1, 2, 3, 0]])
+    step = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+    usual = apart < 1.5 * np.median(apart)
+    turned = step.copy()
+    turned[1:] -= np.where((usual[:-1] & usual[1:])[:, None],
+                           np.cross(step[:-1], step[1:]) / 12.0, 0.0)
+    turned = np.roll(turned, -AXES.index(axis), axis=1)
+    gap = np.flatnonzero(~usual)
+    if len(gap) and np.isfinite(by_gyro).all():
         difference = by_gyro - turned[:, 0]
         drift = abs(difference[usual].sum()) / apart[usual].sum()
         turned[gap, 0] += 2.0 * np.pi * np.rint(difference[gap] / (2.0 * np.pi))
@@ -552,7 +504,7 @@ class _AxisRotation:
             largest = np.maximum(largest, added)
         unsure = gap[largest > drift * apart[gap]]
         turned[unsure] = np.column_stack([by_gyro[unsure], np.zeros((len(unsure), 2))])
-        return turned
+    angles[known] = np.insert(np.cumsum(turned, axis=0), 0, 0.0, axis=0)
 
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.

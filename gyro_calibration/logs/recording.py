@@ -258,10 +258,6 @@ class _LogBuilder:
             raise LogError(f'no topic {wanted}{self._list_topics()}; name one of them by '
                            f'{_ROLES[role][0]}')
         kind = self._contents.topics[topic]
-        if kind in self._contents.undefined:
-            raise LogError(f'{topic} is {kind}, of which the recording has no definition; convert '
-                           'it by ros2 bag convert of ROS 2 Iron or later, where the package '
-                           f'{kind.partition("/")[0]} is sourced')
         definition = self._contents.definitions.get(kind)
         found = cdr.parse_layout(definition).quantities if definition else {}
         if not _ROLES[role][2] & set(found) and (wrong := topic_type_fault(role, topic, kind)):

@@ -30,7 +30,6 @@ from itertools import repeat
 import os
 from pathlib import Path
 import re
-import shutil
 import sqlite3
 import struct
 import sys
@@ -41,7 +40,8 @@ import zlib
 
 from gyro_calibration.files import describe_error, open_regular_file, remedy, to_printable
 from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
-from gyro_calibration.logs.log import excerpt, ExpansionBudget, LogError
+from gyro_calibration.logs.columns import excerpt
+from gyro_calibration.logs.log import ExpansionBudget, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
 MAX_RECORD_BYTES = 1 << 28
@@ -70,8 +70,6 @@ class Contents:
     #: Topic -> message type; type with known quantities -> definition.
     topics: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
-    #: Types of which the recording has no definition.
-    undefined: set[str] = field(default_factory=set)
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -85,8 +83,6 @@ class Contents:
         if kind not in self.definitions and encoding == 'cdr':
             with suppress(MessageError):
                 definition = DEFINITIONS.get(kind, definition)
-                if not definition:
-                    self.undefined.add(kind)
                 if parse_layout(definition).quantities:
                     self.definitions[kind] = definition
         return (topic, kind) if encoding == 'cdr' and kind in self.definitions else None
@@ -228,22 +224,22 @@ def _read_mcap(source: Path, path: Path, contents: Contents,
                               'and was read up to there')
 
 
-def _iter_records(stream: BinaryIO, end: int, contents: Contents,
-                  wanted: tuple[_RecordCode, ...] = _USED_RECORDS) -> Iterator[tuple[int, bytes]]:
+def _iter_records(stream: BinaryIO, end: int,
+                  contents: Contents) -> Iterator[tuple[int, bytes]]:
     """Give code and content of the records of a file or a chunk, also of a truncated chunk."""
     while len(head := stream.read(9)) == 9:
         code, length = struct.unpack('<BQ', head)
         left = end - stream.tell()
-        if code == _RecordCode.CHUNK in wanted and left < length <= MAX_RECORD_BYTES:
+        if code == _RecordCode.CHUNK and left < length <= MAX_RECORD_BYTES:
             yield code, stream.read()
             return
         if length > left or code == 0:
             stream.seek(-9, io.SEEK_CUR)
             return
-        if code in wanted and length <= MAX_RECORD_BYTES:
+        if code in _USED_RECORDS and length <= MAX_RECORD_BYTES:
             yield code, stream.read(length)
             continue
-        contents.skipped_parts += code in wanted
+        contents.skipped_parts += code in _USED_RECORDS
         stream.seek(length, io.SEEK_CUR)
         if code == _RecordCode.DATA_END:
             yield code, b''
@@ -288,10 +284,12 @@ class _McapReader:
                 self._channels[number] = self._contents.add_topic(
                     topic, kind, _read_text(body, place)[0], definition)
             elif code == _RecordCode.METADATA:
-                name, pairs = _parse_metadata(body)
-                if name == METADATA_NAME:  # written by this program
-                    self._contents.recorder_notes += [
-                        _to_short_line(f'{key}: {value}') for key, value in pairs.items()]
+                name, place = _read_text(body, 0)
+                place += 4
+                while name == METADATA_NAME and place < len(body):  # written by this program
+                    key, place = _read_text(body, place)
+                    value, place = _read_text(body, place)
+                    self._contents.recorder_notes.append(_to_short_line(f'{key}: {value}'))
         except (_DamagedPart, struct.error):
             self._contents.skipped_parts += 1
 
@@ -305,27 +303,6 @@ def _read_text(body: bytes, offset: int) -> tuple[str, int]:
     if end > len(body):
         raise _DamagedPart
     return body[offset + 4:end].decode(errors='replace'), end
-
-
-def _parse_metadata(body: bytes) -> tuple[str, dict[str, str]]:
-    name, place = _read_text(body, 0)
-    pairs, place = {}, place + 4
-    while place < len(body):
-        key, place = _read_text(body, place)
-        pairs[key], place = _read_text(body, place)
-    return name, pairs
-
-
-def read_metadata(path: str | Path) -> dict[str, str]:
-    """Return the pairs of all undamaged metadata records of an MCAP file."""
-    found: dict[str, str] = {}
-    with open_regular_file(path) as file:
-        if file.read(len(_MAGIC)) == _MAGIC:
-            for code, body in _iter_records(file, os.fstat(file.fileno()).st_size, Contents(),
-                                            (_RecordCode.METADATA,)):
-                with suppress(_DamagedPart, struct.error):
-                    found |= _parse_metadata(body)[1] if code == _RecordCode.METADATA else {}
-    return found
 
 
 def _pack_record(code: _RecordCode, *content: bytes) -> bytes:
@@ -478,51 +455,39 @@ def _read_database(source: Path, path: Path, contents: Contents,
 @contextmanager
 def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """Open a database read-only, and give it with the names of its tables of stored columns."""
-    # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
-    # count corrected. Computed columns are not read: their cost is not limited by the size of the
-    # file.
-    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
-        reason: Exception | None = None
-        for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
-            file = source
-            if mode == 'copy':
-                file, mode = Path(shutil.copy(source, folder)), 'mode=ro'
-                with open(file, 'r+b') as copy:
-                    head = copy.read(100)
-                    if len(head) == 100:
-                        size = int.from_bytes(head[16:18], 'big')
-                        size = 1 << 16 if size == 1 else max(size, 1)
-                        copy.seek(28)
-                        copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
+    # Tried in turn: with the journal of a killed writer, and without it. Computed columns are not
+    # read: their cost is not limited by the size of the file.
+    reason: Exception | None = None
+    for mode in ('mode=ro', 'mode=ro&immutable=1'):
+        try:
+            database = sqlite3.connect(f'file:{quote(str(source.resolve()))}?{mode}', uri=True)
+        except _DATABASE_ERRORS as error:
+            reason = error
+            continue
+        with closing(database):
             try:
-                database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
+                database.text_factory = partial(str, encoding='utf-8', errors='replace')
+                # The smallest row of a file has a dozen bytes and takes some 30 steps of
+                # SQLite. A query is ended after a million steps plus ten per byte.
+                thousands = repeat(0, source.stat().st_size // 100 + 1000)
+                database.set_progress_handler(partial(next, thousands, 1), 1000)
+                if sys.version_info >= (3, 11):
+                    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
+                database.execute('PRAGMA trusted_schema = OFF')
+                tables = {name for name, text in database.execute(
+                    "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+                    if name in ('topics', 'messages', 'message_definitions')
+                    and str(text).upper().startswith('CREATE TABLE')
+                    and not any(hidden for *_, hidden in database.execute(
+                        f'PRAGMA table_xinfo({name})'))}
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
-            with closing(database):
-                try:
-                    database.text_factory = partial(str, encoding='utf-8', errors='replace')
-                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
-                    # SQLite. A query is ended after a million steps plus ten per byte.
-                    thousands = repeat(0, file.stat().st_size // 100 + 1000)
-                    database.set_progress_handler(partial(next, thousands, 1), 1000)
-                    if sys.version_info >= (3, 11):
-                        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
-                    database.execute('PRAGMA trusted_schema = OFF')
-                    tables = {name for name, text in database.execute(
-                        "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-                        if name in ('topics', 'messages', 'message_definitions')
-                        and str(text).upper().startswith('CREATE TABLE')
-                        and not any(hidden for *_, hidden in database.execute(
-                            f'PRAGMA table_xinfo({name})'))}
-                except _DATABASE_ERRORS as error:
-                    reason = error
-                    continue
-                if not {'topics', 'messages'} <= tables:
-                    raise LogError('is a database, but not a ROS 2 recording with tables of '
-                                   'stored columns; name a recording')
-                yield database, tables
-                return
+            if not {'topics', 'messages'} <= tables:
+                raise LogError('is a database, but not a ROS 2 recording with tables of '
+                               'stored columns; name a recording')
+            yield database, tables
+            return
     raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '
                    'name a recording, or record again')
 

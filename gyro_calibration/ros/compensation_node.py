@@ -73,7 +73,7 @@ class CompensationNode(Node):
         """Read the model and the last calibration; without them raw rates are published."""
         super().__init__('compensation_node')
         values = declare_parameters(self, PARAMETERS,
-                                    lambda changed: self._pipeline.use_parameters(changed))
+                                    lambda changed: setattr(self._pipeline, 'values', changed))
         clock = _NodeClock(self)
         self._velocity: Publisher | None = None
         self._velocity_type = TwistStamped if values.cmd_vel_stamped else Twist

@@ -155,9 +155,8 @@ class DriverNode(Node):
             self._last_problem = ''
             found = self._connection
             assert found.protocol is not None  # it is known before samples come
-            detected = f' ({found.detected})' if found.detected else ''
             self._report.event = (f'samples of {found.protocol.name} come on {found.path} at '
-                                  f'{found.baud} bit/s{detected}')
+                                  f'{found.baud} bit/s')
             self.get_logger().info(self._report.event)
         elif state.problem:
             return
@@ -228,16 +227,14 @@ class DriverReport:
         return level, message, {
             'port': self._port, 'device': connection.path, 'state': state.name,
             'protocol': protocol.name if protocol else '', 'baud': connection.baud,
-            'detected': connection.detected, 'reopened': max(0, connection.open_count - 1),
+            'reopened': max(0, connection.open_count - 1),
             'waiting_s': f'{state.retry_delay:.1f}',
             'waited_s': f'{connection.waited_duration:.1f}',
             'last_error': connection.last_error, **vars(counts), 'rate_hz': f'{self._rate:.1f}',
             'longest_gap_s': f'{connection.longest_gap:.3f}', 'clock_steps': self._clock_steps,
             **({} if clock is None or protocol is None else {
                 'period_ms': f'{1e3 * clock.period:.6g}',
-                'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
-                'jitter_before_ms': f'{1e3 * clock.jitter[0]:.3g}',
-                'jitter_after_ms': f'{1e3 * clock.jitter[1]:.3g}'}),
+                'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}'}),
             **({} if last is None else {'temperature_degc': f'{last:.2f}'}),
             **{name: f'{value:.4g}' for name, value in self._health.items()},
             'last_event': self.event,

@@ -40,7 +40,6 @@ from gyro_calibration.heading.integration import MAX_GAP, Threshold
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
     CalibrationSession, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
@@ -63,10 +62,10 @@ PARAMETERS = (
                   's', (0.01, 60.0)),
     NodeParameter('stationary.method', 'rest',
                   'How standstill is found: by the statistics of the rate, by the threshold '
-                  'filter, or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),
+                  'filter, or not at all.', choices=('rest', 'threshold', 'none')),
     NodeParameter('stationary.threshold', Threshold.rate,
                   'Threshold filter: a mean rate over 0.2 s below it is zero; 0 switches it off.',
-                  'rad/s', (0.0, 0.1), True),
+                  'rad/s', (0.0, 0.1)),
     NodeParameter('assumed.bias', Assumptions.bias,
                   'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
     NodeParameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
@@ -126,15 +125,6 @@ class _Journal:
     channels: set[str] = field(default_factory=set)  # further ones in the samples
 
 
-def _tracker_settings(values: SimpleNamespace, noise: Noise) -> TrackerSettings:
-    """Return the settings of the tracker; with unknown noise the threshold filter is used."""
-    rate = 0.0 if values.stationary_method == 'none' else values.stationary_threshold
-    threshold = Threshold(rate, angle_random_walk=noise.angle_random_walk)
-    # rests that are taken for motion, 1/h of rest
-    alarms = 0.1 if values.stationary_method == 'rest' else 0.0
-    return TrackerSettings(alarms, threshold, values.maximum_gap)
-
-
 class Pipeline:
     """Computes corrected rates and the heading from raw samples; faults are sentences or ''."""
 
@@ -148,13 +138,17 @@ class Pipeline:
             calibration_file.with_name(f'{calibration_file.stem}_biases.yaml'),
             Prior(coefficient=coefficient))
         noise = store.model.noise
-        self._tracking_settings = _tracker_settings(values, noise)
+        method = values.stationary_method
+        self._standstill_rate = 0.0 if method == 'none' else values.stationary_threshold
+        # of rests 0.1 per hour are taken for motion; with unknown noise the threshold is used
         self.estimator = HeadingEstimator(
             store.model, store.table,
             Assumptions(values.assumed_bias, values.assumed_scale_factor_error, coefficient),
-            self._tracking_settings, clock.date())
+            TrackerSettings(0.1 if method == 'rest' else 0.0, Threshold(
+                self._standstill_rate, angle_random_walk=noise.angle_random_walk),
+                values.maximum_gap), clock.date())
         # false alarms: 0.001 per hour of rest
-        self.monitor = HealthMonitor(noise, 0.001, self._tracking_settings.threshold.rate)
+        self.monitor = HealthMonitor(noise, 0.001, self._standstill_rate)
         self.wheels, self.journal = Wheels(), _Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
@@ -562,20 +556,12 @@ class Pipeline:
         bias, deviation = self.estimator.tracker.bias
         rate = sum(each for _, each in self._recent_rates) / len(self._recent_rates) - bias
         noise = self.store.model.noise.angle_random_walk / math.sqrt(_TURN_CHECK_DURATION)
-        if abs(rate) > 4.0 * math.hypot(deviation, noise, self._tracking_settings.threshold.rate):
+        if abs(rate) > 4.0 * math.hypot(deviation, noise, self._standstill_rate):
             return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: stop the robot, or, if '
                     'it stands, call calibrate_bias first')
         return ''
 
     # Periodic calls
-
-    def use_parameters(self, values: SimpleNamespace) -> None:  # noqa: A003
-        self.values = values
-        tracking = _tracker_settings(values, self.store.model.noise)
-        if tracking != self._tracking_settings:
-            self._tracking_settings = tracking
-            self.estimator.configure(tracking)
-            self.monitor.standstill_rate = tracking.threshold.rate
 
     def poll(self, receivers: int) -> None:
         """Check that time and samples advance; to be called several times per second."""

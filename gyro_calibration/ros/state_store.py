@@ -122,7 +122,7 @@ class StateStore:
             self.table_written_time, self.shared_hint = now, ''
             self._file_versions[self._bias_file] = written
         except OSError as error:
-            self.table.mark_write_failed(now)
+            self.table.mark_write(now, is_written=False)
             self.table_hint = to_printable('the bias table cannot be written '
                                            f'({describe_error(error)}): '
                                            f'{remedy(error, self._bias_file)}')

@@ -201,18 +201,6 @@ def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(run, tmp_path
     assert answer['modelled']['rms_rad_per_turn'] < 0.3 * answer['static']['rms_rad_per_turn']
 
 
-def test_the_file_has_a_row_for_every_turn(run, log, model, tmp_path):
-    assert run(log, '--model', model, '--slowest', 25, '--out', tmp_path / 'turn.csv')[0] == 0
-    header, *rows = (tmp_path / 'turn.csv').read_text().splitlines()
-    assert header == ('place,sweep,reference_rate_rad_s,temperature_degc,'
-                      'static_rad_per_turn,modelled_rad_per_turn')
-    assert len(rows) == 32
-    place, sweep, rate, temperature, *errors = rows[0].split(',')
-    assert (place, sweep, float(rate) / DEGREE, float(temperature)) == (
-        'row 1', '0', pytest.approx(-60.0), 20.0)
-    assert float(errors[0]) == pytest.approx(-TURN * 0.01)
-
-
 def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
     lines = log.read_text().splitlines()
     cells = lines[4].split(',')

@@ -58,11 +58,6 @@ def test_lines_for_people_are_not_too_long_and_data_are_strict(run, table, words
     assert bool(answer['choices']) == (not words)
 
 
-def test_the_matrix_is_given_with_a_polynomial(run, table):
-    code, text, _ = run('fit', table, '--polynomial', '3,2', '--matrix')
-    assert code == 0 and len(text.partition('C of eq. 11')[2].splitlines()) == 4
-
-
 def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     # the record player of the blog, an L3G4200D at 70 mdps a count, turned clockwise
     (tmp_path / 'player.csv').write_text(

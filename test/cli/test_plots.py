@@ -16,11 +16,9 @@ from functools import cache
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects, MIN_TURN_RATE
 from gyro_calibration.cli.plots import (
-    draw_error_surface, draw_headings, draw_motion, draw_reference, draw_residuals, draw_run,
-    draw_turn_errors)
+    draw_headings, draw_reference, draw_residuals, draw_turn_errors)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
-from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
 
@@ -51,15 +49,6 @@ def without_temperature():
     return fit_effects(replace(MEASURED, temperature=None), (BIAS, SCALE_FACTOR_ERROR))
 
 
-def draw_surface(path, fit, dwells=None):
-    return draw_error_surface(path, fit.model, fit.model.rate_range, fit.model.temperature_range,
-                              dwells)
-
-
-def fitted(fit):
-    return select_dwells(fit.dwells, fit.scatter.inliers)
-
-
 def draw_turns(path, fit):
     kept = fit.scatter.inliers
     return draw_turn_errors(path, compute_turn_errors(select_dwells(fit.dwells, kept),
@@ -78,23 +67,12 @@ def draw_encoder(path):
     return draw_reference(path, time, 3.0 * np.sin(time), 0.01 * time, 1e-4 * np.sin(5.0 * time))
 
 
-def draw_calibration_run(path):
-    time = np.linspace(0.0, CALIBRATION_MOTION.duration, 1000)
-    rate = 1.03 * CALIBRATION_MOTION.rate_at(time) + 0.002
-    return draw_run(path, time, rate, (rate - 0.002) / 1.03, CALIBRATION_MOTION)
-
-
 PICTURES = {
     'turns': lambda path: draw_turns(path, warm()),
     'turns without temperature': lambda path: draw_turns(path, without_temperature()),
-    'surface': lambda path: draw_surface(path, warm(), fitted(warm())),
-    'surface without dwells': lambda path: draw_surface(path, warm()),
-    'surface without temperature': lambda path: draw_surface(path, without_temperature(),
-                                                             fitted(without_temperature())),
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
-    'headings': draw_drive, 'encoder': draw_encoder, 'run': draw_calibration_run,
-    'motion': lambda path: draw_motion(path, CALIBRATION_MOTION, 1.0)}
+    'headings': draw_drive, 'encoder': draw_encoder}
 
 
 @pytest.fixture(scope='module')

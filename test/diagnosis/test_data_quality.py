@@ -215,12 +215,11 @@ def test_quantization_and_saturation_of_the_model_are_no_findings(generator):
 
 @pytest.mark.parametrize('name', [name for name, factor in UNIT_FACTORS.items()
                                   if 1e-2 < abs(factor) < 100.0 and name != '1000000/1048576'])
-def test_a_wrong_unit_is_named_and_corrected(name, generator):
+def test_a_wrong_unit_is_named(name, generator):
     log = swing(generator, scale=1.0)
     quality = inspect_record(replace(log, output=log.output * UNIT_FACTORS[name]))
     assert [finding.effect for finding in quality.findings] == ['unit_error']
-    assert (f'and {name} is' in quality.findings[0].evidence
-            and quality.unit_factor * UNIT_FACTORS[name] == pytest.approx(1.0))
+    assert f'and {name} is' in quality.findings[0].evidence
 
 
 @pytest.mark.parametrize('factor, deviation, name', [

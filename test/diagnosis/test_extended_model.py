@@ -202,8 +202,7 @@ def test_a_factor_that_may_be_of_the_gyro_stays_in_the_model(model):
     found = diagnosed(log, model)
     assert (names(found) == ['unit_error']
             and value(found.model, 'scale_factor_error') == pytest.approx(0.024, abs=5e-4))
-    assert ('output_multiplied_by' not in found.model.origin
-            and any('was not multiplied' in remark for remark in found.remarks))
+    assert 'as a scale factor error' in found.findings[0].evidence
 
 
 @pytest.mark.parametrize('name, size', [('saturation', 0.9), ('quantization', 2.5e-4)])

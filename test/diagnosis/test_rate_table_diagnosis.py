@@ -165,12 +165,14 @@ def test_what_is_not_in_the_catalogue_gets_no_name(waves):
             and found.unexplained[0].share_of_variance > 0.3)
 
 
-def test_outlying_dwells_and_wrong_units_are_reported_and_not_fitted():
+def test_outlying_dwells_are_not_fitted_and_a_wrong_unit_is_the_only_finding():
     generator = np.random.default_rng(13)
     table = Table().measure(GyroModel(LINEAR), generator)
     wild = table.output + np.where(np.arange(len(table)) == 50, 1.0 * DEGREE, 0.0)
-    found = diagnose_table(replace(table, output=wild * DEGREE), None)
-    assert names(found) == ['unit_error', 'outliers'] and 'row 51' in found.findings[1].evidence
+    wrong = diagnose_table(replace(table, output=wild * DEGREE), None)
+    assert names(wrong) == ['unit_error'] and wrong.verdict == 'mismatched'
+    found = diagnose_table(replace(table, output=wild), None)
+    assert names(found) == ['outliers'] and 'row 51' in found.findings[0].evidence
     assert found.before.terms[1].values[0] == pytest.approx(0.01, abs=1e-3)
 
 

@@ -21,8 +21,7 @@ import subprocess
 from gyro_calibration.diagnosis import report
 from gyro_calibration.diagnosis.causes import mark_suspected
 from gyro_calibration.diagnosis.findings import (
-    Change, Curve, Diagnosis, Estimate, Finding, Gain, HeadingCurve, NoiseCurve, Reference, Trace,
-    Unexplained)
+    Change, Curve, Diagnosis, Estimate, Finding, Gain, Reference, Unexplained)
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import (
     format_probability, format_quantity, headline, terminal_lines)
@@ -96,22 +95,22 @@ def heading_curve(count):
     time = np.linspace(0.0, 900.0, count)
     walk = (
         np.cumsum(np.random.default_rng(3).standard_normal(count)) * 0.4 / np.sqrt(count) * DEGREE)
-    return HeadingCurve(time, walk + 9.0 * DEGREE * (time / 900.0) ** 2, walk)
+    return Curve('time', 's', time, walk + 9.0 * DEGREE * (time / 900.0) ** 2, walk)
 
 
 def noise_curve():
     times = np.geomspace(0.02, 300.0, 50)
     fitted = np.sqrt(1.3e-4 ** 2 / times + (0.664 * 2e-5) ** 2)
-    return NoiseCurve(times, fitted * (1.0 + 0.05 * np.sin(np.arange(50.0))), fitted,
-                      np.sqrt(1e-8 / times + 1e-12 * times / 3.0))
+    return Curve('averaging time', 's', times,
+                 fitted * (1.0 + 0.05 * np.sin(np.arange(50.0))), fitted,
+                 simulated=np.sqrt(1e-8 / times + 1e-12 * times / 3.0))
 
 
 def trace():
     time = np.linspace(412.0, 424.0, 600)
-    rate = (60.0 * DEGREE * np.sin(1.2 * time)
-            + 0.1 * DEGREE * np.random.default_rng(4).standard_normal(600))
-    return Trace(time, rate, 60.0 * DEGREE * np.sin(1.2 * time) - 0.4 * DEGREE,
-                 60.0 * DEGREE * np.sin(1.2 * time))
+    noise = 0.1 * DEGREE * np.random.default_rng(4).standard_normal(600)
+    return Curve('time', 's', time, noise + 0.4 * DEGREE, noise,
+                 simulated=60.0 * DEGREE * np.sin(1.2 * time) - 0.4 * DEGREE)
 
 
 def unexplained():
@@ -174,7 +173,7 @@ def holes():
               replace(whole.curves[0], before=missing, after=missing),
               Curve('time', 's', np.array([]), np.array([]), np.array([]), np.array([]))]
     return replace(whole, findings=(found,), curves=curves,
-                   heading=HeadingCurve(np.array([0.0]), np.array([0.0]), np.array([0.0])))
+                   heading=Curve('time', 's', *np.zeros((3, 1))))
 
 
 MADE = {each.__name__: each

@@ -10,15 +10,13 @@
 
 """The search covers all logs, pays for all that it could have found, and bounds each value."""
 
-from dataclasses import replace
 import math
 
 from diagnosed import diagnosis_of, established, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate, effect_candidate, generic_terms, is_named, propose_candidates)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.regression import (
-    build_problem, fit_causes, likelihood_with, likelihood_without)
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
     confirm_causes, evidence_for, held_out_sigmas, MIN_PREDICTION_SIGMAS, p_value, refine_jointly,
@@ -223,20 +221,3 @@ def test_columns_that_nearly_depend_on_each_other_leave_a_positive_residual():
     assert (fit.residual_squares > 0.0).all()
     units = fit.columns / np.linalg.norm(fit.columns, axis=1)[:, None]
     assert np.linalg.svd(units, compute_uv=False)[-1] ** 2 > 0.5e-9
-
-
-def test_the_likelihood_with_one_cause_more_or_less_is_that_of_a_new_fit():
-    rate = 0.5 * np.cos(0.1 * TIME) * np.sin(0.013 * TIME)
-    search = start_search([laid(replace(
-        resting(1.01 * rate + 2e-3 * rate ** 3 + 1e-3 * np.exp(-TIME / 60.0)),
-        reference_rate=rate, moving=None))])
-    first = refine_jointly(search, [effect_candidate('cubic_nonlinearity'),
-                                    effect_candidate('warm_up', 50.0)])
-    fit = fit_causes(search.problem, first)
-    for one in (effect_candidate('heading_sensitivity'), effect_candidate('dead_zone', 0.02),
-                effect_candidate('bandwidth', 0.1)):
-        assert likelihood_with(fit, one) == pytest.approx(
-            fit_causes(search.problem, [*first, one]).log_likelihood, abs=1e-4)
-    for place in range(2):
-        assert likelihood_without(fit, place) == pytest.approx(
-            fit_causes(search.problem, first[:place] + first[place + 1:]).log_likelihood, abs=1e-4)

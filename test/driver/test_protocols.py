@@ -289,10 +289,8 @@ def received(data, ratio, idle=0):
 @pytest.mark.parametrize('name', ALL)
 def test_every_format_is_recognized_from_five_samples_and_as_no_other(name):
     for motion, force in itertools.product(MOTIONS.values(), (None, 9.8)):
-        recognition = recognize_protocol(joined(name, 5, motion, force))
-        assert recognition.protocol is find_protocol(name), recognition.summary
-        assert (recognition.explained_share > 0.99
-                and recognition.summary.startswith(f'{name} explains 100% of'))
+        data = joined(name, 5, motion, force)
+        assert recognize_protocol(data, Settings()) is find_protocol(name)
 
 
 @pytest.mark.parametrize('name', ALL)
@@ -300,14 +298,11 @@ def test_bytes_are_recognized_wherever_they_begin_and_end_and_if_one_in_100_is_d
     generator, data = random.Random(2), bytearray(b''.join(frames(name, 100)))
     for place in generator.sample(range(len(data)), len(data) // 100):
         data[place] ^= 1 << generator.randrange(8)
-    few, length, shares = b''.join(frames(name, 8)), len(data) // 100, []
+    few, length = b''.join(frames(name, 8)), len(data) // 100
     cuts = [slice(generator.randrange(2 * length), -generator.randrange(1, length))
             for _ in range(50)]
     for part in (bytes(data), *(few[cut] for cut in cuts)):
-        recognition = recognize_protocol(part)
-        assert recognition.protocol is find_protocol(name), recognition.summary
-        shares.append(recognition.explained_share)
-    assert 0.5 < shares[0] < 1.0 and min(shares) > 0.5
+        assert recognize_protocol(part, Settings()) is find_protocol(name)
 
 
 @pytest.mark.parametrize('idle', [0, 30])
@@ -316,8 +311,8 @@ def test_a_wrong_baud_is_no_format(name, idle):
     data = b''.join(frames(name, 300))[:1500]
     assert received(data, 1.0, idle) == data, 'at the right one'
     for baud in set(BAUDS) - {find_protocol(name).baud}:
-        recognition = recognize_protocol(received(data, baud / find_protocol(name).baud, idle))
-        assert recognition.protocol is None, (baud, recognition)
+        other = received(data, baud / find_protocol(name).baud, idle)
+        assert recognize_protocol(other, Settings()) is None, baud
 
 
 def joined(*given):
@@ -327,38 +322,34 @@ def joined(*given):
 ZEROS = b'\x80' + bytes(7)  # which pass the check of the E-Core
 FOUR = b'0.1,2.0,3.0,4.0\r\n' * 5
 DSP3000 = b'       0.015733   1\r\n' * 8
-CASES = {  # bytes, columns if not the default ones, protocol, part of the summary
-    'nothing': (b'', None, None, 'nothing came: check the power and the wires of the gyro'),
-    'a single frame': (frames('kvh_1750', 1)[1], None, None, 'listen longer'),
-    'as many bytes of two formats': (joined('fizoptika', 11) + joined('witmotion', 8), None, None,
-                                     'may be '),
+CASES = {  # bytes, columns if not the default ones, protocol
+    'nothing': (b'', None, None),
+    'a single frame': (frames('kvh_1750', 1)[1], None, None),
+    'as many bytes of two formats': (joined('fizoptika', 11) + joined('witmotion', 8), None, None),
     'a tenth of another format': (joined('kvh_1750', 20) + joined('fizoptika', 9), None,
-                                  'kvh_1750', 'next is fizoptika with 9%'),
+                                  'kvh_1750'),
     'a few frames in much noise': (random.Random(8).randbytes(4000) + joined('fizoptika', 50),
-                                   None, None, 'of which too few are frames of fizoptika'),
+                                   None, None),
     'noise long ago': (random.Random(4).randbytes(1_000_000) + joined('minimu9', 300), None,
-                       'minimu9', ''),
-    'some frames of zeros': ((4 * ZEROS + b'\xff' * 8) * 10, None, None, ''),
-    'nearly all frames of zeros': ((39 * ZEROS + b'\xff' * 8) * 10, None, 'kvh_ecore', ''),
-    'more numbers than columns': (FOUR, None, None,
-                                  'name as many columns as a line has numbers'),
-    'as many numbers as columns': (FOUR, ('time_s', 'gyro_dps', 'a', 'b'), 'csv', ''),
-    'one number a line': (b'17\r\n' * 5, ('gyro_dps',), 'csv', ''),
-    'a DSP-3000, where one column is wanted': (DSP3000, ('gyro_dps',), 'kvh_dsp3000', ''),
-    'a DSP-3000, where two are wanted': (DSP3000, ('gyro_dps', 'valid'), 'kvh_dsp3000', ''),
+                       'minimu9'),
+    'some frames of zeros': ((4 * ZEROS + b'\xff' * 8) * 10, None, None),
+    'nearly all frames of zeros': ((39 * ZEROS + b'\xff' * 8) * 10, None, 'kvh_ecore'),
+    'more numbers than columns': (FOUR, None, None),
+    'as many numbers as columns': (FOUR, ('time_s', 'gyro_dps', 'a', 'b'), 'csv'),
+    'one number a line': (b'17\r\n' * 5, ('gyro_dps',), 'csv'),
+    'a DSP-3000, where one column is wanted': (DSP3000, ('gyro_dps',), 'kvh_dsp3000'),
+    'a DSP-3000, where two are wanted': (DSP3000, ('gyro_dps', 'valid'), 'kvh_dsp3000'),
     'a Razor that was not yet asked for rates': (b'#YPR=-142.28,-5.38,33.52\r\n' * 5, None,
-                                                 'razor', ''),
-    **{f'{byte:#x} again and again': (bytes([byte]) * 8192, None, None, '')
+                                                 'razor'),
+    **{f'{byte:#x} again and again': (bytes([byte]) * 8192, None, None)
        for byte in (0x00, 0x55, 0x80, 0xDD, 0xFE, 0xFF, 0x0A, 0x20, 0x30)},
 }
 
 
-@pytest.mark.parametrize('data, columns, name, words', CASES.values(), ids=CASES)
-def test_what_comes_is_recognized_or_explained(data, columns, name, words):
+@pytest.mark.parametrize('data, columns, name', CASES.values(), ids=CASES)
+def test_what_comes_is_recognized_or_not(data, columns, name):
     settings = Settings(columns=columns) if columns else Settings()
-    recognition = recognize_protocol(data, settings)
-    assert recognition.protocol is (name and find_protocol(name)), recognition.summary
-    assert words in recognition.summary
+    assert recognize_protocol(data, settings) is (name and find_protocol(name))
 
 
 # What single formats have: axes, temperatures, checksums, values over several frames

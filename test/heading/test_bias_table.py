@@ -308,5 +308,5 @@ def test_a_clock_that_is_set_moves_all_dates_since_the_table_began_and_no_others
     assert table.is_write_due(begin + step + 1e4), 'what is in the file has the old dates'
     table.add(20.0, 2.0 * DEGREE, WHITE, begin + step + 420.0)
     assert table.jumps[-1].time == begin + step + 300.0, 'that of what was held back'
-    table.mark_written(begin + step + 420.0)
+    table.mark_write(begin + step + 420.0)
     assert not table.is_write_due(begin + step + 1e4)

@@ -26,7 +26,6 @@ from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
-from gyro_calibration.ros.health_monitor import describe_change
 import numpy as np
 import pytest
 
@@ -237,24 +236,6 @@ def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(ter
     assert not gyro.live.tracker.is_resting
     gyro.go(40.0, 0.3, 35.0)
     assert abs(gyro.error - before) < 2.0 * DEGREE
-
-
-@pytest.mark.parametrize('known', [False, True], ids=['unknown coefficient', 'known coefficient'])
-def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
-    entries = [Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0)
-               for degc in range(15, 45)] if known else []
-    live = begun(table=BiasTable(MODEL, entries=entries))
-    live.add(0.1, 0.0, NOW)
-    live.use_calibration(MODEL, NOW)
-    assert live.current_calibration.bias == pytest.approx(CALIBRATED.bias)
-    for index in range(100):
-        live.add_temperature(INTERVAL * index, 35.0)
-        live.add(INTERVAL * index, 0.4 * DEGREE, NOW)
-    warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
-    assert (not describe_change(live.current_calibration, warm, NOISE, 300.0)
-            and describe_change(CALIBRATED, warm, NOISE, 300.0))
-    assert (bool(describe_change(live.current_calibration, replace(warm, bias=0.1 * DEGREE), NOISE,
-                                 300.0)) == known)
 
 
 def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():

@@ -13,7 +13,7 @@
 import math
 
 from gyro_calibration.heading.integration import (
-    BlockIntegrator, filter_rates, gap_variances, integrate, Intervals, Threshold,
+    BlockIntegrator, gap_variances, integrate, Intervals, Threshold,
     ThresholdFilter)
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE, Log
@@ -60,7 +60,7 @@ def test_a_log_in_blocks_or_samples_is_filtered_and_integrated_as_in_one_piece(s
     pieces = [integrator.add(time[i:j], rate[i:j], sensitivity[:, i:j])
               for i, j in zip(sorted(cuts), sorted(cuts)[1:])]
     filtered, heading, deviation = (np.concatenate(parts) for parts in zip(*pieces))
-    for other in (whole[0], filter_rates(settings, time, rate),
+    for other in (whole[0], ThresholdFilter(settings).apply_to_all(time, rate),
                   filtered_singly(settings, time, rate)):
         assert np.array_equal(filtered, other)
     assert np.array_equal(heading, whole[1]) and np.array_equal(heading, integrate(time, filtered))

@@ -14,7 +14,6 @@ import contextlib
 from dataclasses import replace
 import json
 import shutil
-import sqlite3
 import sys
 
 from gyro_calibration.logs.cdr import (
@@ -184,10 +183,6 @@ def test_an_imu_in_the_message_of_a_driver_serves_where_its_topic_is_named(
     assert log.specific_force[5] == 9.8
     with pytest.raises(LogError, match='select driver with --topic'):
         read_recording(path)
-    with sqlite3.connect(next(path.glob('*.db3'))) as file:  # as before ROS 2 Iron
-        file.execute('DROP TABLE message_definitions')
-    with pytest.raises(LogError, match='no definition; convert it by ros2 bag .* my_msgs is'):
-        read_recording(path, Topics('driver'))
 
 
 @pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
@@ -276,17 +271,6 @@ def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
     assert 1900 < len(log) < 2000 and (np.diff(log.output) > 0).all()
     assert any('1 damaged or oversized part of the recording was left out' in note
                for note in log.notes)
-
-
-def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
-    time = np.arange(2000) / RATE
-    path = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)}))
-    data = path.read_bytes()
-    path.write_bytes(data[:len(data) * 2 // 3])
-    log = read_recording(path)
-    assert 100 < len(log) < 2000
-    np.testing.assert_array_equal(log.output, time[:len(log)])
-    assert any('read up to there' in note for note in log.notes)
 
 
 def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):

@@ -30,7 +30,6 @@ import time
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.logs.cdr import quaternion_heading, UNMEASURED_VARIANCE
-from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
@@ -141,7 +140,7 @@ def test_names_types_and_qualities_are_those_of_the_documents(hold):
 
 
 def test_parameters_are_checked_described_and_taken_on_at_once(hold):
-    held = hold(stationary__threshold=0)
+    held = hold()
     names = held.node.get_parameters_by_prefix('')
     own = [name for name in names if not name.startswith('qos_overrides')
            and name not in ('use_sim_time', 'start_type_description_service')]
@@ -149,18 +148,14 @@ def test_parameters_are_checked_described_and_taken_on_at_once(hold):
     assert all(each.description.endswith('.') for each in described)
     assert any('Unit: rad/s.' in each.description and each.floating_point_range
                for each in described)
-    refused = held.put('stationary.method', 'off and on')
-    assert not refused.successful and 'rest, threshold or none' in refused.reason
-    assert not held.put('stationary.threshold', -1.0).successful
+    refused = held.put('calibration.reference', 'off and on')
+    assert not refused.successful and 'profile, odometry or turns' in refused.reason
+    assert not held.put('calibration.maximum_bias', -1.0).successful
     assert not held.put('model_file', '/tmp/other').successful, 'read-only'
-    assert held.put('stationary.threshold', 0.005).successful
-    for number in range(100):
-        held.send('/imu/data_raw', sample(number, 0.1 * DEGREE))
-    assert held.sent['/imu/data'][-1].angular_velocity.z == 0.0
-    assert held.put('stationary.threshold', 0).successful, 'a whole number for a float'
-    for number in range(100, 110):
-        held.send('/imu/data_raw', sample(number, 0.1 * DEGREE))
-    assert held.sent['/imu/data'][-1].angular_velocity.z > 0.0
+    assert held.put('calibration.maximum_bias', 0.5).successful
+    assert held.node._pipeline.values.calibration_maximum_bias == 0.5
+    assert held.put('calibration.maximum_bias', 1).successful, 'a whole number for a float'
+    assert held.node._pipeline.values.calibration_maximum_bias == 1.0
     assert held.node.get_parameter('heading_frame').value == 'odom'
 
 

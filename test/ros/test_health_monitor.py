@@ -16,10 +16,9 @@ import re
 from chance import fewest, mean_bound, most
 from gyro_calibration.heading.bias_table import REST_DURATION
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import describe_change, examine_stretch, HealthMonitor
+from gyro_calibration.ros.health_monitor import examine_stretch, HealthMonitor
 import numpy as np
 import pytest
 
@@ -127,23 +126,3 @@ def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
     check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:2])
     fed(check, np.zeros(2500), begin=100.0)
     assert 'check that the gyro responds to turns' in check.noise_alarm
-
-
-def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
-    generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
-    covariance, alarms, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
-    wander = math.sqrt(MEMS.mean_change_variance(age, REST_DURATION))
-    for _ in range(2000):
-        first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(),
-                                         covariance) for _ in range(2))
-        second = SelfCalibration(second.scale_factor_error,
-                                 second.bias + wander * generator.normal(), covariance)
-        alarms += bool(describe_change(first, second, MEMS, age, level))
-    assert fewest(2000, level) <= alarms <= most(2000, level)
-    moved = describe_change(first, SelfCalibration(first.scale_factor_error + 0.02,
-                                                   first.bias + 1.0 * DEGREE, covariance),
-                            MEMS, age, 1e-3)
-    assert 'the scale factor error changed by 2.000 % (' in moved
-    assert 'the bias changed by 1.0000 deg/s (' in moved
-    assert not describe_change(SelfCalibration(), second, MEMS, age,
-                               level), 'nothing was known before'

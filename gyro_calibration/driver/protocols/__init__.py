@@ -22,15 +22,14 @@ records. No port, no ROS and no clock is used here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import importlib
 import pkgutil
 
 from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
 from gyro_calibration.files import suggest_nearest
 
-__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Recognition', 'Sample',
-           'Settings', 'find_protocol', 'recognize_protocol']
+__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings',
+           'find_protocol', 'recognize_protocol']
 
 #: The formats by name.
 PROTOCOLS = {
@@ -56,25 +55,14 @@ def find_protocol(name: str) -> Protocol:
                      f'{suggest_nearest(name, PROTOCOLS)}')
 
 
-@dataclass(frozen=True)
-class Recognition:
-    """The recognized format of some bytes."""
-
-    protocol: Protocol | None  # None if ambiguous, or too few bytes
-    #: Of the bytes in frames of the best format, without an incomplete one at the beginning.
-    explained_share: float
-    summary: str  # the result as a sentence
-
-
-def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recognition:
+def recognize_protocol(data: bytes, settings: Settings) -> Protocol | None:
     """
-    Return the format that explains the last 8192 bytes.
+    Return the format that explains the last 8192 bytes; None if ambiguous, or too few bytes.
 
     The settings may be incomplete for the recognized format. `csv` is recognized by the number of
     their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
     """
-    settings, data = settings or Settings(), data[-_MAX_BYTES:]
-    scores = []
+    data, scores = data[-_MAX_BYTES:], []
     for protocol in PROTOCOLS.values():  # the share of the bytes in frames, and these frames
         splitter, parse = protocol.splitter(), protocol.parser(settings)
         found = splitter.feed(data)
@@ -85,21 +73,7 @@ def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recogni
             begun = min(found[0].skipped_bytes, max(map(len, good)))
             explained = sum(map(len, good)) / (received - begun)
         scores.append((explained, good, protocol))
-    (share, frames, best), (next_share, _, second) = sorted(scores, key=lambda each: -each[0])[:2]
-    if next_share and next_share >= _AMBIGUITY_RATIO * share:
-        return Recognition(None, share, f'the bytes may be {best.name} or {second.name}: set '
-                           'protocol')
+    (share, frames, best), (next_share, *_) = sorted(scores, key=lambda each: -each[0])[:2]
     least = _MIN_EXPLAINED_SHARE if len(set(frames)) >= _MIN_FRAMES else _MIN_IDENTICAL_SHARE
-    if len(frames) >= _MIN_FRAMES and share >= least:
-        following = f'; next is {second.name} with {next_share:.0%}' if next_share else ''
-        return Recognition(best, share, f'{best.name} explains {share:.0%} of {len(data)} bytes, '
-                           f'in {len(frames)} frames{following}')
-    if not data:
-        words = 'nothing came: check the power and the wires of the gyro'
-    elif frames:
-        words = (f'{len(data)} bytes came, of which too few are frames of {best.name}: listen '
-                 'longer, or set protocol')
-    else:
-        words = (f'{len(data)} bytes came, but in no known format: try another baud, set '
-                 'protocol, or for csv name as many columns as a line has numbers')
-    return Recognition(None, share, words)
+    return best if (len(frames) >= _MIN_FRAMES and share >= least
+                    and next_share < _AMBIGUITY_RATIO * share) else None
