@@ -264,14 +264,14 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
     logs : of one gyro
     effects : names of those to fit; None takes those that the data support
     technology : open_loop_fog, closed_loop_fog or mems; decides where effects look alike
-    method : dwells, likelihood, course or rate; None takes what the logs hold
+    method : dwells, likelihood or course; None takes what the logs hold
 
     """
     _require_logs(*logs)
     for name in effects or ():
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
-    _require_choice('method', method, ('dwells', 'likelihood', 'course', 'rate'))
+    _require_choice('method', method, ('dwells', 'likelihood', 'course'))
     for log in logs:
         refuse_mismatch(log)
     found = calibrate({str(number): log for number, log in enumerate(logs)},

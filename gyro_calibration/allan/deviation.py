@@ -39,16 +39,11 @@ from scipy.stats import pearsonr
 _MIN_ALLAN_SAMPLES = 100
 #: Largest share of lost samples in a window; it is also the largest change of the variance.
 _MAX_LOST_PER_WINDOW = 0.01
-#: Least number of spans in the test whether a reference turns with the output: chance shows such a
-#: correlation of fewer too often for spans of several lengths.
+#: Least number of spans in the test whether a reference turns with the output.
 _MIN_SPANS = 8
-#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
-#: product numpy computes in one thread, which is faster here.
+#: Samples in a block that fits into the cache, and whose dot product takes one thread.
 _BLOCK_SAMPLES = 8192
-#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
-_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
-#: Indices of quantization and ramp among the terms, and of terms whose second differences are
-#: independent over longer times.
+#: Indices of terms, the last ones those with independent second differences over longer times.
 _QUANTIZATION_INDEX, _RAMP_INDEX = map(NOISE_TERMS.index, (QUANTIZATION_NOISE, RATE_RAMP))
 _SHORT_MEMORY_INDICES = [
     place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
@@ -99,21 +94,7 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
         remarks.append(f'Far beyond the noise, and left out: {outliers.size} single '
                        f'sample{"s" * (outliers.size > 1)}, the first at '
                        f'{stamps.time_at(outliers[0]):.3f} s.')
-    if (motion := _find_motion(rate, stamps)) is not None:
-        # the first part that is not refused; next to a motion a smaller one is hidden
-        for begin, end in motion[1]:
-            rows = (time >= begin) & (time <= end)
-            try:
-                build_rest_record(time[rows], output[rows], *(
-                    None if each is None else each[rows] for each in (moving, heading)))
-            except _Moved as smaller:
-                if smaller.rest is None:
-                    continue
-                begin, end = smaller.rest
-            except DataRefused:
-                continue
-            raise _Moved(motion[0], (begin, end))
-        raise _Moved(motion[0], None)
+    _refuse_motion(rate, stamps)
     if heading is not None and moving is None:
         _refuse_turning(time, output, heading)
     # long gaps are cut, since no window crosses them
@@ -151,23 +132,8 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
                 'rest by --from and --to, or record one')
 
 
-class _Moved(DataRefused):
-    """A record with motion; begin and end of its longest part that is not refused, s, or None."""
-
-    def __init__(self, motion: str, rest: tuple[float, float] | None):
-        self.rest = rest
-        super().__init__(motion + (
-            'record again at rest' if rest is None else 'use the longest part at rest, '
-            f'from {rest[0]:.1f} to {rest[1]:.1f} s, or record again'))
-
-
-def _find_motion(rate: Array,
-                 stamps: StampGrid) -> tuple[str, list[tuple[float, float]]] | None:
-    """
-    Return a sentence on means that change by more than noise, and the parts between, s.
-
-    The longest is first, and each is within its limits as printed. None without motion.
-    """
+def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
+    """Refuse a record whose means change by more than noise, and name its longest part at rest."""
     angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
@@ -186,23 +152,25 @@ def _find_motion(rate: Array,
         if change.max() > worst * scale:
             worst, over = float(change.max() / scale), size
     if not moved.any():
-        return None
-    rests = sorted(find_runs(~moved), key=lambda rest: rest.start - rest.stop)
-    return ('the gyro was moved, or its output jumped: from '
-            f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
-            f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard deviations: ',
-            [(math.ceil(10.0 * stamps.time_at(rest.start)) / 10.0,
-              math.floor(10.0 * stamps.time_at(rest.stop - 1)) / 10.0) for rest in rests])
+        return
+    rest = max(find_runs(~moved), key=lambda run: run.stop - run.start, default=slice(0, 0))
+    remedy = 'record again at rest'
+    if rest.stop - rest.start >= _MIN_ALLAN_SAMPLES:  # to a tenth of a second within it
+        begin, end = math.ceil(10.0 * stamps.time_at(rest.start)) / 10.0, math.floor(
+            10.0 * stamps.time_at(rest.stop - 1)) / 10.0
+        remedy = f'use the longest part at rest, from {begin:.1f} to {end:.1f} s, or record again'
+    raise DataRefused('the gyro was moved, or its output jumped: from '
+                      f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
+                      f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
+                      f'deviations: {remedy}')
 
-
-# lost samples
 
 def _integrate_angle(rate: Array) -> Array:
     """
     Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
 
-    Gaps get the mean over 5 gap lengths on each side. A line between the samples at both ends
-    would integrate their noise over the whole gap, which passes for a random walk.
+    Gaps get the mean over 5 gap lengths on each side: the noise of the samples at both ends,
+    integrated over a gap, would pass for a random walk.
     """
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
@@ -268,9 +236,8 @@ def allan_deviation(rate: Array, interval: float,
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Averaging
-    times, s, from an interval to half the record, are taken to the nearest whole number of
-    intervals; by default they are ten a decade, up to a third of the record. Raise `DataRefused`
-    for too few samples.
+    times, s, are taken to whole intervals; by default they are ten a decade, up to a third of the
+    record. Raise `DataRefused` for too few samples.
     """
     _refuse_few(int(np.isfinite(rate).sum()))
     samples = len(rate)
@@ -299,16 +266,13 @@ def allan_deviation(rate: Array, interval: float,
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
     freedom = _degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
-    # A few overlapping windows between gaps may have less than one degree of freedom: their
-    # deviation has no upper bound.
+    # a few windows between gaps may have less than one degree of freedom, and no upper bound
     bounded = freedom >= 1.0 - 1e-9
     sizes, counts = sizes[bounded], counts[bounded]
     variance, freedom = variance[bounded], freedom[bounded]
     return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom,
                       *chi_squared_bounds(variance, freedom))
 
-
-# degrees of freedom
 
 def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, Any]:
     """Return the 95 % bounds of a root mean square (NIST SP 1065, eq. 45)."""
@@ -318,32 +282,24 @@ def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, 
 
 
 def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
-    """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
-    # They are those of the random term that fits the slope of each Allan variance best. The slope
-    # of the logarithm is that from half to twice each time, -1 for a single one. Quantization is
-    # assumed at the short end only; a steep slope elsewhere is chance.
+    """Return twice the squared variance over its own variance, shape (n,)."""
+    # Those of the random term that fits the slope of each Allan variance best, from half to twice
+    # each time. Quantization is assumed at the short end only; a steep slope elsewhere is chance.
     low = np.searchsorted(sizes, sizes / 2.0)
     high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
     rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
     slopes = np.where(
         high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
     steep, freedom = int(np.argmin(np.append(slopes < -1.5, False))), []
-    for place, (size, slope) in enumerate(zip(sizes.tolist(), slopes)):
-        part = QUANTIZATION_NOISE if place < steep else min(
+    for number, (size, slope) in enumerate(zip(sizes.tolist(), slopes)):
+        part = QUANTIZATION_NOISE if number < steep else min(
             (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK),
             key=lambda term: abs(2.0 * term.slope - slope))
-        count = samples + 1 - 2 * size
-        # the covariance of quantization is nonzero at single lags only
-        stride = 1 if part is QUANTIZATION_NOISE else max(1, size // _LAGS_PER_WINDOW)
-        lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
-        squares = (_lag_covariance(part.angle_covariance, size, size, lags) ** 2 * (count - lags)
-                   * stride)
-        freedom.append(
-            max(1.0, float(squares[0]) * count / stride / float(2.0 * squares.sum() - squares[0])))
+        place = NOISE_TERMS.index(part)
+        freedom.append(max(1.0, 2.0 * float(part.allan_variance(size)) ** 2
+                           / float(covariance_form(samples, size, size)[place, place])))
     return np.array(freedom)
 
-
-# covariance of second differences of the angle, and of Allan variances
 
 def _lag_covariance(angle_covariance: Callable[[Integers], Array], first: int, second: int,
                     lags: Integers) -> Array:
@@ -360,8 +316,7 @@ def covariance_form(samples: int, first: int, second: int,
 
     Angle quantization is white: only lags at which two of its samples coincide contribute. A ramp
     is no noise, but adds a mean m to values with the covariance c, and 4 m² c to the covariance of
-    their squares. With a process, its times in samples, the shape is (6, 6), with a coefficient of
-    1.
+    their squares. A process, its times in samples, adds a row and column.
     """
     counts = (samples + 1 - 2 * first, samples + 1 - 2 * second)
     area = float(first) ** 2 * float(second) ** 2
@@ -373,9 +328,9 @@ def covariance_form(samples: int, first: int, second: int,
         """Return how many pairs of second differences stand at each lag."""
         return np.maximum(np.minimum(counts[0], counts[1] - lags) - np.maximum(0, -lags), 0)
 
-    # lags that are dense enough for all but quantization
+    # lags that are dense enough for all but quantization: more change less than 1 %
     longer, shorter = max(first, second), min(first, second)
-    stride = max(1, shorter // _LAGS_PER_WINDOW, longer // _LAGS_PER_LONGER_WINDOW)
+    stride = max(1, shorter // 8, longer // 512)
     lags = np.arange(-(min(10 * longer, counts[0]) // stride),
                      min(10 * longer, counts[1]) // stride + 1) * stride
     values = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])

@@ -33,18 +33,12 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
 
-#: Least decrease of -2 ln likelihood for a further term. For white noise alone no further term is
-#: then found in 95 of 100 records.
-_TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALTERNATIVE_LIMIT = 6.0
 #: A combination that is likelier by this in -2 ln likelihood, but has too many terms, widens the
 #: bounds. At 0 those of the angle random walk are 6 to 35 % wider, and hold the truth as often.
 _WIDENING_LIMIT = 1.0
-#: Least p-value of the residuals of an accepted fit.
-_MIN_P_VALUE = 0.05
-#: Relative differences between the Allan deviations and the sum of the terms that are tried; the
-#: smallest sufficient one is used.
+#: Relative differences of the sum of the terms that are tried; the smallest sufficient is used.
 _MISFIT_SHARES = (0.0, *np.geomspace(0.01, 0.32, 11).tolist())
 _MIN_OCTAVES = 4  # least number of octaves that show a slope and its end
 #: Indices of the terms, of a Gauss-Markov process, and of the reduction of the variance by a
@@ -147,17 +141,17 @@ class _CombinationFit:
 
     def penalized_deviance(self) -> float:
         """Return -2 ln likelihood plus a penalty for each term."""
-        # The penalty of a ramp is larger, since in a single record a random walk looks like one. A
-        # Gauss-Markov process counts as two terms.
+        # By 10 a term, 95 % of white records have no further one. In a single record a random walk
+        # looks like a ramp. A process counts as two terms.
         return (self.deviance
-                + _TERM_PENALTY * (len(self.active_terms) + (_PROCESS in self.active_terms))
+                + 10.0 * (len(self.active_terms) + (_PROCESS in self.active_terms))
                 + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
 
     def is_likely(self) -> bool:
         """Return whether the residuals are within chance."""
         normal, _ = self._normal_scores()
         freedom = len(normal) - len(self.active_terms) - (_PROCESS in self.active_terms)
-        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _MIN_P_VALUE
+        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > 0.05
 
     def estimate_squares(self, indices: Sequence[int]) -> tuple[Array, Array]:
         """Return the squared coefficients by least squares, of any sign, and their deviations."""
@@ -269,9 +263,8 @@ def _fit_with_process(best: _CombinationFit, kept_terms: tuple[int, ...],
                       misfit: float) -> _CombinationFit | None:
     """Return the best fit of some terms and a Gauss-Markov process, or None without one."""
     # The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the
-    # chart: a process with a longer correlation time is a random walk. It must make less than half
-    # of the first Allan variance: white noise after a first-order lag is such a process too. The
-    # correlation time is found with the covariance of the best fit, scaled by the Allan
+    # chart, and it must make less than half of the first Allan variance, as white noise after a
+    # lag. The correlation time is found with the covariance of the best fit, scaled by the Allan
     # deviations.
     octaves, places = best.octaves, (*kept_terms, _PROCESS)
     longest, known = octaves.size[-1] / 1.9, octaves.model_variance(best.squares)
@@ -301,8 +294,7 @@ class NoiseFigure:
     term: NoiseTerm
     value: float  # 0 where it is not detected
     standard_deviation: float  # if only the detected terms are present; nan where not detected
-    #: Bounds with 95 % confidence, which allow for undetected terms; where it is not detected, 0
-    #: and the largest undetectable coefficient.
+    #: with 95 % confidence, and undetected terms; the largest undetectable one where not detected
     lower: float
     upper: float
 
@@ -320,8 +312,7 @@ class NoiseFit:
     max_time: float  # s
     misfit: float  # relative difference of Allan deviations and sum of terms, beyond chance
     alternatives: tuple[str, ...] = ()  # symbols of combinations that fit nearly as well
-    #: In place of flicker and rate random walk, where it fits better; these two then approximate
-    #: it at the averaging times of the chart.
+    #: in place of flicker and rate random walk, where it fits better
     process: GaussMarkov | None = None
 
     @property
@@ -354,9 +345,8 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
     The squared coefficients are found by generalized least squares (as in the generalized method
     of wavelet moments of Guerrier, Skaloud, Stebler and Victoria-Feser, JASA 2013), none of them
-    negative, with the covariance of the fitted noise itself. The combination with the largest
-    penalized likelihood is used. The shortest averaging times, which the filters of a gyro bend,
-    are left out until the sum of the terms fits the rest.
+    negative, with the covariance of the fitted noise itself. The shortest averaging times, which
+    the filters of a gyro bend, are left out until the sum of the terms fits the rest.
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Raise
     `DataRefused` for too few samples, or where no sum of terms fits them.
@@ -369,8 +359,8 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
                           f'lowest Allan deviation {chart.deviation.min(initial=math.inf):g} '
                           f'rad/s; wanted {_MIN_OCTAVES} octaves, all above 0: record longer and '
                           'without losses')
-    # The first octave is the earliest one from which the residuals are within chance; if there is
-    # none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
+    # If residuals are within chance from no octave on, a misfit is added. Filters bend the short
+    # end gradually: one more octave is left out.
     octaves, last = _OctaveVariances.from_chart(chart), max(len(chart.size) // 2 - 1, 0)
     for misfit, start in itertools.product(_MISFIT_SHARES, range(last + 1)):
         ranking = _rank_from_octave(octaves, start, misfit)
@@ -415,8 +405,7 @@ def _build_figure(ranking: _Ranking, index: int, interval: float) -> NoiseFigure
             each.coefficient_bounds(index) for each in possible if index in each.active_terms)]
         lower, upper = min(low for low, _ in ends), max(high for _, high in ends)
         if index == _B:
-            # a process may be in the record too, as other combinations with more terms; it has
-            # two figures
+            # a process may be in the record too; it has two figures
             joint = _fit_with_process(best, tuple(best.active_terms), ranking.misfit)
             if (joint is not None and index in joint.active_terms
                     and joint.deviance < best.deviance - 2.0 * _WIDENING_LIMIT):
@@ -436,8 +425,8 @@ def _build_figure(ranking: _Ranking, index: int, interval: float) -> NoiseFigure
 def _likelihood_bounds(ranking: _Ranking, best: _CombinationFit,
                        index: int) -> tuple[float, float]:
     """Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum."""
-    # At each coefficient the other terms are fitted anew (profile likelihood): those of the best
-    # fits, N, B and K, detected or not, and a process where it is fitted with the term.
+    # The other terms are fitted anew (profile likelihood): those of the best fits, N, B and K,
+    # detected or not, and a process where it is fitted with the term.
     held = {_N, _B, _K, *(each for one in (best, *ranking.plausible_fits, *ranking.alternatives)
                           for each in one.active_terms)}
     others = tuple(sorted(held - {index}))

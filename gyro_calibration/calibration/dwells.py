@@ -16,8 +16,6 @@ heading, or the integral of the reference rate, is a straight line but for the s
 Ramps, the settling of the gyro after them, outliers and repeated samples are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -31,7 +29,6 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     find_runs, mark_rows, mask_outliers, mask_repeated_samples, noise_before_rounding,
     quantization_step, rounding_product)
-from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
@@ -39,16 +36,13 @@ from scipy.special import digamma, polygamma
 
 #: Minimum number of samples of a dwell, and minimum duration after all cuts, s.
 _MIN_SAMPLES, _MIN_DURATION = 8, 1.5
-#: Minimum cut at both ends of a dwell, s, which excludes a time offset between gyro and reference.
-_MARGIN = 0.25
 #: Largest deviation of the heading from a straight line beyond its steps, rad.
 _MAX_DEVIATION = 0.5 * DEGREE
 #: A dwell or a sample beyond this many robust standard deviations is outlying.
 OUTLIER_THRESHOLD = 6.0
 #: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
 MIN_TEMPERATURE_SPREAD = 1.0
-#: Minimum share of a log in dwells, as a swing is steady for short times only; and share up to
-#: which another method is the default, since few short dwells hide their scatter.
+#: Minimum share of a log in dwells, and share up to which another method is the default.
 MIN_DWELL_SHARE, FEW_DWELLS_SHARE = 0.05, 0.25
 #: Duration of the blocks in which the heading is averaged, s, and how many of them show a ramp.
 _BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
@@ -61,17 +55,12 @@ class Dwells:
     rate: Array  # of the reference, rad/s
     output: Array  # of the gyro, rad/s
     temperature: Array | None  # degC; None where the log holds none
-    # standard deviation of the mean output against the mean reference, rad/s; nan where it is not
-    # known
-    deviation: Array
-    # number of the sweep, or block of time, of each dwell; cross-validation leaves a sweep out as
-    # a whole
-    sweep: Numbers
+    deviation: Array  # of output against reference, rad/s; nan if unknown
+    sweep: Numbers  # number of the sweep, or block of time, which cross-validation leaves out
     location: tuple[str, ...]  # of each dwell in its file, for messages
     remarks: tuple[str, ...] = ()  # on what was found and left out, one sentence each
     rows: tuple[Numbers, ...] = ()  # of the log, whose mean each dwell is
-    # step of a coarse output, and standard deviation of the noise of its samples before they are
-    # rounded, both rad/s, shape (n, 2); empty where the steps do not matter
+    # step of a coarse output and deviation of its noise, rad/s, (n, 2); empty where it is fine
     rounding: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def __len__(self) -> int:
@@ -82,9 +71,8 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     """
     Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
-    The log has an output, and a reference rate or heading. The name of a file is put before places
-    and remarks. `DataRefused` is raised where something is missing, in another unit, or where the
-    share of a log in time that is in dwells is smaller than `min_share`.
+    The name of a file is put before places and remarks. `DataRefused` is raised where something is
+    missing, in another unit, or where less than `min_share` of a log in time is in dwells.
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log, min_share)
     if log.time is not None and not name:  # several logs may have a rate each
@@ -132,15 +120,14 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
     if temperatures and not has_temperature:
         remarks += (f'{len(parts) - len(temperatures)} of {len(parts)} logs hold no temperature, '
                     'so that of the others is not used',)
-    return Dwells(np.concatenate([part.rate for part in parts]),
-                  np.concatenate([part.output for part in parts]),
-                  np.concatenate(temperatures) if has_temperature else None,
-                  np.concatenate([part.deviation for part in parts]), np.concatenate(
-                      [part.sweep + number for part, number in zip(parts, first_sweep)]),
-                  sum((part.location for part in parts), ()), remarks,
+    rate, output, deviation, rounding = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ('rate', 'output', 'deviation', 'rounding'))
+    sweep = np.concatenate([part.sweep + number for part, number in zip(parts, first_sweep)])
+    return Dwells(rate, output, np.concatenate(temperatures) if has_temperature else None,
+                  deviation, sweep, sum((part.location for part in parts), ()), remarks,
                   sum((part.rows for part in parts), ()),
-                  np.concatenate([part.rounding for part in parts])
-                  if all(len(part.rounding) for part in parts) else np.empty((0, 2)))
+                  rounding if len(rounding) == len(rate) else np.empty((0, 2)))
 
 
 def require_output(log: Log) -> Array:
@@ -159,11 +146,7 @@ def format_list(items: Sequence[str]) -> str:
 # rate tables
 
 def dwells_from_table(log: Log) -> Dwells:
-    """
-    Return the rows of a rate table, or raise `DataRefused` if none has output and reference rate.
-
-    The columns `sweep` (any text) and `deviation_dps` (of each mean) are used if present.
-    """
+    """Return the rows of a rate table, by its columns `sweep` and `deviation_dps` if present."""
     output = require_output(log)
     if log.reference_rate is None:
         raise DataRefused('the rows have no time and no reference rate; a rate table needs the '
@@ -187,8 +170,7 @@ def dwells_from_table(log: Log) -> Dwells:
     output = output[rows]
     rounding: Array = np.empty((0, 2))
     if not (deviation > 0.0).any():  # that of the steps is the only one that is known
-        # The step is the largest one that all differences are multiples of: that of the gyro
-        # where its samples are all alike, or of the digits that were written. Where the rates
+        # The step is the largest one that all differences are multiples of. Where the rates
         # explain it, as those of a gyro without errors, it is at most 1 deg/s.
         step = _largest_divisor(output - output[0])
         if step > 0.5 * _largest_divisor(rate - rate[0]):
@@ -215,11 +197,10 @@ def _largest_divisor(values: Array) -> float:
 
 def _number_sweeps(rate: Array) -> Numbers:
     """
-    Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
+    Return the number of the sweep of each dwell, shape (n,).
 
     The rates of a sweep increase or decrease, or their absolute values do with changing sign, with
-    or without a rest between them. Where the order shows no sweeps, that is where the median of
-    them has less than four dwells, nine blocks of consecutive dwells are taken as sweeps.
+    or without a rest between them; else nine blocks of consecutive dwells are taken as sweeps.
     """
     turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
     for used in (np.full(len(rate), True), turning) if turning.any() else ():
@@ -235,11 +216,7 @@ def _number_sweeps(rate: Array) -> Numbers:
 
 
 def _number_passes(value: Array) -> Numbers:
-    """
-    Assign numbers to passes through values; a pass begins where the direction reverses.
-
-    Values that are repeated where passes turn belong to both in equal parts.
-    """
+    """Assign numbers to passes, from where the direction reverses; repeats there are shared."""
     change = np.diff(value)
     # Mean rates of opposite sign differ slightly in absolute value.
     steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
@@ -276,34 +253,20 @@ def few_values_remedy(time: Array, known: Mask, wanted: int) -> str:
     return f'record longer, {math.ceil(duration)} s at the interval of the reference'
 
 
-def interpolate_reference(time: Array, values: Array) -> Array:
-    """Return a slow reference at each sample, linear between its values; nan where it is lost."""
-    known = np.isfinite(values)
-    if known.all() or not known.any():
-        return values
-    return np.where(find_lost_reference(known), np.nan,
-                    np.interp(time, time[known], values[known], np.nan, np.nan))
-
-
 class NothingSteady(DataRefused):
     """The reference of a log in time is hardly ever steady, so that it shows no dwells."""
 
 
 class _Samples(NamedTuple):
-    """
-    Samples with output and reference, arrays of shape (n,).
-
-    `heading` is that of the reference, or the integral of its `rate`; `step` is that of an
-    encoder, rad, and `scale` the approximate ratio of output to reference.
-    """
+    """Samples with output and reference, arrays of shape (n,)."""
 
     time: Array
     output: Array
     rate: Array | None
-    heading: Array
-    step: float
+    heading: Array  # of the reference, or the integral of its rate
+    step: float  # of an encoder, rad
     temperature: Array | None
-    scale: float = 1.0
+    scale: float = 1.0  # approximate ratio of output to reference
 
     @property
     def error(self) -> Array:
@@ -319,7 +282,7 @@ class _Samples(NamedTuple):
         Return the mean rate of an angle over some samples, rad/s.
 
         It is the slope of a straight line through a heading, whose errors are those of single
-        samples, and the difference of both ends over the duration where a rate was integrated.
+        samples, and the difference of both ends over the duration of an integrated rate.
         """
         time = self.time[rows]
         return (fit_scale(angle, time)[1] if self.rate is None
@@ -338,8 +301,7 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
                           'and one of reference_rate_dps and reference_heading_deg')
     known = np.isfinite(reference)
     lost = find_lost_reference(known)
-    # A reference has errors up to 0.05 s before and after a loss: motion capture loses its markers
-    # one by one. Stamps may come in bursts, so the mean interval counts.
+    # Motion capture loses its markers one by one. Stamps may come in bursts: the mean counts.
     steps = np.diff(time)
     steps = steps[steps < 1.0]
     reach = round(0.05 / float(steps.mean())) if len(steps) else 0
@@ -360,11 +322,7 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
 # dwells of a log in time
 
 def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
-    """
-    Find the dwells of a log in time by its reference heading, or else by its reference rate.
-
-    `NothingSteady` is raised where the reference is never steady for long enough.
-    """
+    """Find the dwells of a log in time by its reference heading, or else by its reference rate."""
     samples, remarks = _select_samples(log)
     time, temperature = samples.time, samples.temperature
     parts = [np.arange(part.start, part.stop) for part in _find_straight(samples)
@@ -380,11 +338,10 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         fresh = part[~is_repeated[part]]
         is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
         kept.append(fresh[~is_outlier[fresh]])
-    # margin or settling time, if longer, are cut off both ends; a time offset shows before a ramp,
-    # in the mirrored log
+    # 0.25 s at least, for a time offset; it shows before a ramp, in the mirrored log
     error, rate_change = samples.error, np.diff([np.median(samples.output[rows]) for rows in kept])
     mirrored = [(len(time) - 1 - rows)[::-1] for rows in kept[:-1]]
-    after, before = (max(_MARGIN, _settling_time(*each))
+    after, before = (max(0.25, _settling_time(*each))
                      for each in ((time, error, kept[1:], rate_change),
                                   (-time[::-1], error[::-1], mirrored, -rate_change)))
     ends = [(time[rows[0]] + after, time[rows[-1]] - before) for rows in kept]
@@ -409,7 +366,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
         remarks.append('dwells that warmed or cooled by more than '
                        f'{MIN_TEMPERATURE_SPREAD:g} K are divided, which makes {more} more')
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells], len(time))
-    remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
+    remarks += _describe_left_out(samples, is_outlier & within, is_repeated & within)
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
     if share < min_share:
         raise NothingSteady(
@@ -436,8 +393,7 @@ def _find_straight(samples: _Samples) -> list[slice]:
     edges = np.append(first, len(time))
     times, headings = (np.add.reduceat(values, first) / np.diff(edges)
                        for values in (time, samples.heading))
-    # A vibration of the table cancels over a whole number of its periods, so several lengths are
-    # used.
+    # A vibration of the table cancels over whole periods: several lengths.
     deviation = max((float(np.median(np.abs(
         headings[reach:-reach] - 0.5 * (headings[2 * reach:] + headings[:-2 * reach]))))
         for reach in (2, 3, 5) if len(headings) > 2 * reach), default=math.inf)
@@ -446,8 +402,7 @@ def _find_straight(samples: _Samples) -> list[slice]:
     for cone in _split_into_lines(times, headings, 2.0 * tolerance):
         if times[cone.stop - 1] - times[cone.start] < 0.5 * _MIN_DURATION:
             continue
-        # a line through the middle is extended within the tolerance, without the ramps, by at most
-        # its own length at both ends, so that the time is linear in the length of the log
+        # a line through the middle is extended within the tolerance, by at most its own length
         length = cone.stop - cone.start
         middle = slice(cone.start + length // 5, cone.stop - length // 5)
         begin, end = max(0, cone.start - length), min(len(times), cone.stop + length)
@@ -490,19 +445,11 @@ def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator
 
 
 def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
-    """
-    Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
-
-    On a ramp the deviation of the heading is proportional to the square of time, so the ratio of
-    two deviations gives its beginning; a short ramp began later.
-    """
+    """Return how many blocks of a ramp, of a deviation by time squared, are within tolerance."""
     if len(deviation) <= _RAMP_BLOCKS:
         return 0
     ratio = math.sqrt(max(1.0, deviation[_RAMP_BLOCKS] / tolerance))
     return math.ceil(min(6.0, 1.0 / max(ratio - 1.0, 1e-3)) * _RAMP_BLOCKS)
-
-
-# settling and temperature
 
 
 def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
@@ -511,9 +458,9 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     Return the settling time of the output after a ramp, s.
 
     A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
-    over the dwells, which determines a response below the noise of one dwell: over all but the
-    shortest ones, and over the longest ones, which show a slower response. It is settled where it
-    is within four standard deviations of its last half; below 20 ppm it always is.
+    over all but the shortest dwells, and over the longest ones, which show a slower response. It
+    is settled where it is within four standard deviations of its last half; below 20 ppm it always
+    is.
     """
     durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
     interval, width, found = max(0.05, float(np.median(np.diff(time)))), 4, 0.0
@@ -538,9 +485,8 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     return found
 
 
-def _describe_left_out(log: Log, samples: _Samples, is_outlier: Mask, is_repeated: Mask,
-                       within: Mask) -> Iterator[str]:
-    """Yield remarks on outliers, repeated and lost samples within the dwells."""
+def _describe_left_out(samples: _Samples, is_outlier: Mask, is_repeated: Mask) -> Iterator[str]:
+    """Yield remarks on outliers and repeated samples within the dwells."""
     places = [f'{time:.2f} s' for time in samples.time[is_outlier]]
     if places:
         yield f'outliers, left out: {len(places)}, at {format_list(places)}'
@@ -549,24 +495,11 @@ def _describe_left_out(log: Log, samples: _Samples, is_outlier: Mask, is_repeate
     if places:
         yield (f'the output was repeated {_format_occurrences(len(places))}, at '
                f'{format_list(places)}; the repeats are left out')
-    assert log.time is not None and log.output is not None
-    time = log.time[np.isfinite(log.output)]
-    lost = count_lost_samples(time)
-    if lost is None:
-        yield 'the stamps are too irregular to count lost samples'
-        return
-    gaps = np.flatnonzero((lost > 0) & (np.interp(time[1:], samples.time, within) > 0.5))
-    if len(gaps):
-        yield (f'samples missing within the dwells: {lost[gaps].sum()}, '
-               f'after {format_list([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
-               'constant rate the means are not affected')
 
 
 def _format_occurrences(number: int) -> str:
     return 'once' if number == 1 else f'{number} times'
 
-
-# means
 
 def _average(samples: _Samples,
              dwells: Sequence[Numbers]) -> tuple[Array, Array, Array, Array]:
@@ -575,9 +508,8 @@ def _average(samples: _Samples,
 
     Heading and integral of the output are averaged with the same weights, so that deviations of
     the table from its steady rate are the same in both. The deviation is that of four to twelve
-    batches of at least 0.75 s, in which a vibration of the table and the response of the gyro's
-    filter average out; nan where it is not known. The rounding of the output adds its own, and is
-    returned, too.
+    batches of at least 0.75 s, in which vibration and the response of a filter average out, and of
+    the rounding of the output, which is returned too; nan where it is not known.
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
     batches = np.clip(durations / 0.75, 4, 12).astype(int)
@@ -587,10 +519,9 @@ def _average(samples: _Samples,
         reference = samples.heading[rows]
         angle = integrate(samples.time[rows], samples.output[rows])
         rate[place], output[place] = (samples.slope(rows, each) for each in (reference, angle))
-        # Over M steps of an encoder the deviation of the slope is about 0.35 step / (M duration),
-        # and below one step 0.6 step / duration (by simulation). Each step is observed late by up
-        # to a sample, which adds the square root of M over the number of samples. A heading that
-        # stays on one step for the whole dwell is taken as a rest.
+        # By simulation, the deviation of the slope over M steps of an encoder is about 0.35 step /
+        # (M duration), below one step 0.6 step / duration. Each step is seen late by up to a
+        # sample. A heading that stays on one step for the whole dwell is taken as a rest.
         blur[place] = 0.0
         if np.ptp(reference) > 0.5 * samples.step > 0.0:
             steps = abs(reference[-1] - reference[0]) / samples.step
@@ -602,13 +533,11 @@ def _average(samples: _Samples,
             slopes = [samples.slope(rows[part], each[part]) for part in parts]
             variance[place] = np.var(slopes, ddof=1) / len(parts)
     # Against a heading, the scatter of the output includes the motion of the table, that of the
-    # error the steps of the encoder; the smaller one is used. Its product with the duration is the
-    # same in all dwells under white noise.
+    # error the steps of the encoder. Under white noise its product with the duration is constant.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
-    # Step and noise of the samples. Up to a quarter of a squared step, the variance depends on the
-    # place in the step, so such dwells have one noise. Where most dwells are on one step each,
-    # their steps may be those of their rates; then the whole output shows it.
+    # Up to a quarter of a squared step, the variance depends on the place in the step, so such
+    # dwells have one noise. Where most are on one step each, the whole output shows the step.
     values = [samples.output[rows] for rows in dwells]
     step = (quantization_step(np.concatenate(values))
             if np.median([np.ptp(each) for each in values]) > 0.0
@@ -629,11 +558,10 @@ def dwell_rounding_covariance(rate: Array, output: Array, rounding: Array) -> Ar
     """
     Return the covariance of the means of dwells due to the steps of the output, shape (n, n).
 
-    The mean of a value x with normal noise of variance v, rounded to a step q, is a periodic
-    function of x. Where in a step x lies is not known, but how far two values lie apart is; the
-    mean product of their errors is `rounding_product`. Of two dwells, v is the mean, with half of
-    the variance of the distance: of the bias between dwells of nearly one rate, beyond the steps,
-    and of the scale, by the rounding of the fastest rate.
+    Where in a step a value lies is not known, but how far two values lie apart is; the mean
+    product of their errors is `rounding_product`. The variance of their noise is the mean, with
+    half of the variance of the distance: of the bias between dwells of nearly one rate, beyond the
+    steps, and of the scale, by the rounding of the fastest rate.
     """
     place, wander = _place_in_steps(rate, output, rounding)
     noise, apart = (rounding[:, 1] / rounding[:, 0]) ** 2, place[:, None] - place
@@ -673,10 +601,8 @@ def _shrink_variances(variance: Array, dof: Array) -> Array:
     """
     Shrink variances, shape (n,), toward their common value, by more if they agree.
 
-    A variance of twelve batches has a standard error of 40 %; weights computed from it would be
-    random, and the smallest variances would dominate the fit. Empirical Bayes: the logarithms are
-    shrunk by the part of their scatter that the degrees of freedom explain (Smyth 2004, section
-    6.2).
+    A variance of twelve batches has a standard error of 40 %. Empirical Bayes: the logarithms are
+    shrunk by the scatter that the degrees of freedom explain (Smyth 2004, section 6.2).
     """
     known = variance > 0.0  # 0 where it is not known
     if known.sum() < 3:

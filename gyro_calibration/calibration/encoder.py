@@ -11,19 +11,14 @@
 """
 Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
 
-The input is a log in time with a reference heading. There are three methods: the likelihood of the
-headings, the regression of a course over ground, and the regression of the encoder's rate on the
-gyro, sample by sample.
-
-The error of an encoder is constant while its reading is, and known where the reading changes by a
-step; so readings are used at their steps. An error of step / sqrt(12) at each sample would give
-rests too much weight: with 0.088 deg and a gyro of low noise the variance of the scale was 58
-times the Cramer-Rao bound. The interval of the scale is the scatter between pieces of the log,
-since the error that repeats in each period of a swing is no noise of the fit, and at least that
-between places of the shaft; that of the bias is its wander between pieces.
+The input is a log in time with a reference heading, and the method the likelihood of headings, or
+the regression of a course over ground. The error of an encoder is constant while its reading is,
+and known where the reading changes by a step; so readings are used at their steps (an error of
+step / √12 at each sample would give rests too much weight). The interval of
+the scale is the scatter between pieces of the log, since the error that repeats in each period of
+a swing is no noise of the fit, and at least that between places of the shaft; that of the bias is
+its wander between pieces.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,10 +28,10 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
-    interpolate_reference, join_dwells, MIN_DWELL_SHARE, NothingSteady)
+    join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
-    TECHNOLOGY_PRIORS, WANDER_COSINES)
+    COURSE_TREATMENT, fit_course, is_noisy, lag_deviation, MAX_ENCODER_OFFSET,
+    MAX_FOLLOWED_RESIDUAL, TECHNOLOGY_PRIORS, WANDER_COSINES)
 from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
     ScaleBiasFit)
@@ -52,7 +47,7 @@ from gyro_calibration.calibration.run_faults import (
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects)
 from gyro_calibration.calibration.self_calibration import (
-    DRIVE_DURATION, fit_rate, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
+    DRIVE_DURATION, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -70,69 +65,23 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-#: The gyro's white noise that is possible, rad/√s.
-_WHITE_NOISE_RANGE = (1e-5, 1e-2)
 #: Prior standard deviation of the lag of a gyro, half the square of its time constant, s².
 _GYRO_LAG_DEVIATION = 2e-4
-#: Prior standard deviation of the smoothing of a heading without steps, half the variance of the
-#: times over which it is a mean, s²: that of a mean over 0.2 s, which may cause no delay.
-_SMOOTHING_DEVIATION = 0.2 ** 2 / 24.0
-#: Places of a shaft in a revolution whose errors are independent.
-_PLACE_COUNT = 24
-#: References on each side of a hole that the residual is continued by.
-_HOLE_EDGE = 15
-#: Largest difference of the scales of a reference rate and heading that is not reported, 0.4 deg
-#: in a revolution, as by integration over samples.
-_SAME_SCALE = 1e-3
-#: Share of the largest differences that show their tail.
-_TAIL_SHARE = 0.005
-#: Largest difference from a reference that is computed from the output, relative to its noise:
-#: that of rounding. A second gyro that shares vibration or fast motion differs by 1e-3 or more.
-_OWN_DIFFERENCE_SHARE = 1e-6
-
-
-@dataclass(frozen=True)
-class HeadingResidual:
-    """Heading of the gyro less that of the reference, over a whole log."""
-
-    heading: Array  # rad, shape (n,); its mean is 0, as the gyro's first heading is not known
-
-    @property
-    def rms(self) -> float:
-        """Return the root of the mean square, rad."""
-        return math.sqrt(float(np.mean(self.heading ** 2)))
-
-    @property
-    def largest(self) -> float:
-        """Return the largest error either way, rad."""
-        return float(np.abs(self.heading).max())
 
 
 @dataclass(frozen=True)
 class EncoderCalibration:
-    """
-    The calibration of a gyro by a log with a reference heading.
+    """The calibration of a gyro by a log with a reference heading."""
 
-    Attributes
-    ----------
-    model : scale factor error and bias with their covariance, valid ranges and temperature
-    method : 'likelihood', 'course' or 'rate'
-    fit : the same with noise and time offset, as found
-    reference : its headings over time, s since it began
-    residual_before, residual_after : the residual heading without calibration and with it
-    lost_samples : number missing between the stamps, where these are regular enough to count them
-    remarks : on the result, one sentence each
-
-    """
-
-    model: GyroModel
-    method: str
-    fit: ScaleBiasFit
-    reference: Motion
-    residual_before: HeadingResidual
-    residual_after: HeadingResidual
-    lost_samples: int
-    remarks: tuple[str, ...]
+    model: GyroModel  # scale factor error and bias with covariance and valid ranges
+    method: str  # 'likelihood' or 'course'
+    fit: ScaleBiasFit  # the same with noise and time offset, as found
+    reference: Motion  # its headings over time, s since it began
+    # heading of the gyro less that of the reference, without calibration and with it, rad, (n,)
+    residual_before: Array
+    residual_after: Array
+    lost_samples: int  # where the stamps are regular enough to count them
+    remarks: tuple[str, ...]  # one sentence each
 
 
 def calibrate_encoder(log: Log, method: str | None = None,
@@ -144,8 +93,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
     ----------
     log : with time, output and reference heading, or a reference rate, which is integrated;
         samples without a number count as lost
-    method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
-        encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
+    method : 'likelihood', or 'course' for a course over ground; None for 'course' where the
+        reference is one, else 'likelihood'
     technology : of the gyro, one of `heading_regression.TECHNOLOGY_PRIORS`; with 'course' its
         prior decides what a drive leaves open
 
@@ -160,10 +109,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
     time, output, motion, crossing = _extract_motion(log)
     if method is None:
         method = 'likelihood'
-        if log.reference_heading is not None and log.time is not None:
-            sampled = replace(log, reference_heading=interpolate_reference(
-                log.time, log.reference_heading))
-            method = 'course' if is_course(sampled) or is_noisy(sampled) else 'likelihood'
+        if log.reference_heading is not None:
+            method = 'course' if is_course(log) or is_noisy(log) else 'likelihood'
             longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
             if longest < 0.5 * motion.duration and (
                     hole := _find_turn_in_hole(time, output, motion)):
@@ -179,7 +126,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         refuse_dead(output)
         fit = fit_course(log, technology)
     else:
-        fit, bounds = _fit_encoder(time, output, motion, crossing, method, technology)
+        fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
         (Term(BIAS, (fit.bias,)), Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
         fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())),
@@ -188,7 +135,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         degc = log.temperature
         model = replace(model, temperature_range=(float(degc.min()), float(degc.max())),
                         reference_temperature=float(degc.mean()))
-    on_reference = time - np.nan_to_num(fit.time_offset)
+    on_reference = time - fit.time_offset
     lost = count_lost_samples(time)
     return EncoderCalibration(
         model, method, fit, motion, _heading_residual(on_reference, output, motion),
@@ -198,27 +145,25 @@ def calibrate_encoder(log: Log, method: str | None = None,
         (*chosen, *repeated, *jumps, *_list_remarks(fit, motion, method, technology)))
 
 
-def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, method: str,
+def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
-    """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
+    """Return the fit by the likelihood, or refuse it, and the bounds of its noise."""
     limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET, max_heading_error=15.0 * DEGREE)
     if hole := _find_turn_in_hole(time, output, motion):
         raise DataRefused(f'{hole}: use --method course, or fit the log before or after it (--to, '
                           '--from), or correct the stamps')
     refuse_one_speed(motion, limits)
     refuse_dead(output)
-    # the gyro's lag is assumed to be about that of a filter of 20 ms
+    # the gyro's lag is about that of a filter of 20 ms; a heading without steps may be a mean over
+    # 0.2 s
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
-    fit = (_fit_by_rate(time, output, motion) if method == 'rate' else
-           fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
-                          lag_deviation=(_GYRO_LAG_DEVIATION if has_steps
-                                         else _SMOOTHING_DEVIATION),
-                          cross_rotation=crossing, bias_wanders=True))
-    if motion.rate is not None and method == 'likelihood':
-        # the variance of the times by which a motion is late is seldom above their mean squared
+    fit = fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
+                         lag_deviation=_GYRO_LAG_DEVIATION if has_steps else 0.2 ** 2 / 24.0,
+                         cross_rotation=crossing, bias_wanders=True)
+    if motion.rate is not None:
         exact = fit.scale_factor_error
         fit = fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=max(
-            0.5 * fit.time_offset ** 2, _GYRO_LAG_DEVIATION), bias_wanders=True)
+            lag_deviation(fit.time_offset), _GYRO_LAG_DEVIATION), bias_wanders=True)
         # the shape of the response is not known: what it changes is uncertain
         fit = replace(fit, response_deviation=abs(fit.scale_factor_error - exact))
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
@@ -231,7 +176,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
     elif fit.shaft_error.size:
         motion = replace(motion, heading=correct_shaft(motion.heading, fit.shaft_error))
     drift = _estimate_drift(motion, _heading_residual(
-        time - np.nan_to_num(fit.time_offset), corrected, motion).heading, fit.bias, technology)
+        time - fit.time_offset, corrected, motion), fit.bias, technology)
     # a bias within chance that could make a heading worse
     if (drift.deviation * DRIVE_DURATION > limits.max_heading_error
             and abs(drift.bias) < stats.norm.ppf(0.975) * drift.deviation):
@@ -249,8 +194,6 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array, me
                           f'wanted {100 * limits.max_scale_deviation:g} %: '
                           'turn further, faster, or more often')
     fit = replace(fit, covariance=fit.covariance + np.diag([response_variance, 0.0]))
-    if method == 'rate':
-        return replace(fit, angle_random_walk=drift.angle_random_walk), {}
     # the steps of an encoder hide white noise
     if has_steps:
         return replace(fit, angle_random_walk=min(fit.angle_random_walk, drift.walk_bounds[1])), {}
@@ -273,9 +216,7 @@ class HeadingJumps(NamedTuple):
 
 def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
     """
-    Return a log whose reference heading continues over its jumps as the gyro does, and a remark.
-
-    Also the jumps, if there are any.
+    Return a log whose reference heading continues over its jumps as the gyro does, remarks, jumps.
 
     A jump is a change from one value to the next beyond all rates of the gyro around it, and
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
@@ -307,9 +248,9 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
                         alone * np.sign(difference)) - quantization_step(heading[known])
     usual = (apart < 1.5 * np.median(apart)) & (np.abs(
         since[known[1:]] + delay - 0.5 * since[-1]) < 0.5 * since[-1])
-    low, high = np.quantile(np.abs(difference[usual]), 1.0 - _TAIL_SHARE * np.array([2.0, 1.0]))
-    noise = high + (high - low) * math.log2(
-        max(_TAIL_SHARE * len(known) / FALSE_ALARM_RATE, 1.0))
+    tail = 0.005  # share of the largest differences
+    low, high = np.quantile(np.abs(difference[usual]), 1.0 - tail * np.array([2.0, 1.0]))
+    noise = high + (high - low) * math.log2(max(tail * len(known) / FALSE_ALARM_RATE, 1.0))
     above = usual & (beyond > noise)
     once = above & (np.convolve(above, np.ones(3), 'same') == 1.0)
     jumps = known[1:][once]
@@ -328,7 +269,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
         sizes[jumps] = change[once]
         halvings = (beyond[once].max() - high) / max(high - low, 1e-300)
         found = HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
-                             _TAIL_SHARE * len(known) * 2.0 ** -min(halvings, 1000.0))
+                             tail * len(known) * 2.0 ** -min(halvings, 1000.0))
         remarks.append(
             f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
             f'to the next, at {format_list([f"{time[row]:.2f} s" for row in jumps])}, where the '
@@ -341,10 +282,9 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
     """
     Return a log with a single reference over time, and remarks on what was left out.
 
-    Of a heading and a rate it is the heading, unless this is known for less than half as long: a
-    rate may be filtered, or a command, where a heading is what was turned. If a rate is preferred,
-    it is that where both turn alike. Where they contradict each other, and one is further from the
-    gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
+    Of a heading and a rate it is the heading, unless this is known for less than half as long, or
+    the rate is preferred and both turn alike. Where they contradict each other, and one is further
+    from the gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -366,7 +306,7 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         if not alike and late < 0.5 * unexplained:
             contradiction = f'is {abs(delay):.1f} s {"behind" if delay > 0.0 else "ahead of"}'
         # what noise or another delay may do to the scale is less than the root of what they leave
-        elif abs(scale - 1.0) >= max(_SAME_SCALE, math.sqrt(max(unexplained, 0.0))):
+        elif abs(scale - 1.0) >= max(1e-3, math.sqrt(max(unexplained, 0.0))):
             contradiction = f'turns {scale:.3f} times as far as'
         if contradiction and log.output is not None:
             rows = np.isfinite(log.output[known])
@@ -442,31 +382,6 @@ def _find_turn_in_hole(time: Array, output: Array, motion: Motion) -> str:
     return ''
 
 
-def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:
-    """Fit by the rate of the encoder; the stamps are taken as exact."""
-    noise, interval = white_noise_deviation(output), float(np.median(np.diff(time)))
-    at = motion.time[(motion.time >= time[0]) & (motion.time <= time[-1])]
-    heading = motion.heading_at(at)
-    if motion.rate is None:
-        # differences of headings are means of rates, which the output is averaged to as well: by
-        # the trapezoid rule with the next term of Euler and Maclaurin
-        angle = integrate(time, output) - interval ** 2 / 12.0 * np.gradient(output, time)
-        output, rate = (np.gradient(each, at) for each in (np.interp(at, time, angle), heading))
-        noise *= math.sqrt(interval / (2.0 * float(np.median(np.diff(at)))))
-    else:
-        output, rate = np.interp(at, time, output), motion.rate_at(at)
-    fit = fit_rate(at, output, Motion(at, heading, rate))
-    scale = 1.0 / (1.0 + fit.scale_factor_error)
-    offset = -fit.bias / (1.0 + fit.scale_factor_error)
-    columns = np.column_stack([output, np.ones(len(output))])
-    scores = columns * (columns @ (scale, offset) - rate)[:, None]
-    jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
-    influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
-    # the noise of the output, the regressor, biases the scale factor error by its share
-    return replace(fit, influence=np.column_stack([influence, at]), time_offset=math.nan,
-                   response_deviation=noise ** 2 / float(np.var(output)))
-
-
 def _number_pieces(time: Array) -> NDArray[np.intp]:
     """Return the piece of the log of each time: 8 to 64 pieces, of 5 s or more if above 8."""
     since = (time - time[0]) / (time[-1] - time[0])
@@ -482,9 +397,7 @@ class _Drift:
     bias: float
     deviation: float
     wander_deviation: float  # of the mean bias less the bias at the beginning, rad/s
-    # rad/√s, over times longer than a piece of the log, and its 95 % bounds if nothing else moves
-    # the heading from piece to piece
-    angle_random_walk: float
+    # 95 % bounds of the angle random walk if nothing else moves the heading, rad/√s
     walk_bounds: tuple[float, float]
 
 
@@ -492,19 +405,11 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     """
     Find the mean bias over a log, and how it wanders, by the drifts between pieces of the log.
 
-    What repeats itself with a motion within a piece is noise of the mean heading of that piece. It
-    is at least what the step of the reference leaves, and at most all that the headings are apart.
+    What repeats itself with a motion within a piece is noise of the mean heading of that piece.
     The bias has a normal prior about zero, of a tenth of the size that the technology has up to
     all of it: a bias of many standard deviations stays; one that the log hardly shows would only
-    harm a heading.
-
-    Parameters
-    ----------
-    motion : by the reference
-    error : of the heading after a fit, rad, shape (n,)
-    bias : of that fit, rad/s
-    technology : of the gyro, one of `TECHNOLOGY_PRIORS`
-
+    harm a heading. Given are, of the fit, the error of the heading, rad, shape (n,), and the bias,
+    rad/s.
     """
     piece = _number_pieces(motion.time)
     counts = np.bincount(piece)
@@ -520,7 +425,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     between = (durations[1:] + durations[:-1]) / 6.0
     # means over pieces of a random walk
     walk = BandedNoise('angle_random_walk', np.maximum(spacing - between, between),
-                       durations[:-1] / 6.0, _WHITE_NOISE_RANGE)
+                       durations[:-1] / 6.0, (1e-5, 1e-2))
     # a file has headings to 1e-6 rad
     rounding = max(quantization_step(motion.heading), 1e-6) / math.sqrt(
         12.0 * len(piece) / len(known))
@@ -536,36 +441,31 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
     return _Drift(bias + float(found.values[0]), float(found.deviations[0]),
-                  math.sqrt(found.unobservable_variance), found.size('angle_random_walk'),
+                  math.sqrt(found.unobservable_variance),
                   (math.sqrt(squares / stats.chi2.ppf(0.975, len(white) - 1)),
                    math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))
 
 
 def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasFit:
-    """
-    Return the fit with the mean bias of the drift, and covariances by the scatter between pieces.
-
-    What repeats itself with the motion is not noise of the fit, and what is slower than a piece
-    shows in part only. What repeats itself at a place of the shaft shows between the places.
-    """
+    """Return the fit with the mean bias of a drift, and covariances by scatter between pieces."""
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence, turned)
     slope = scatter[0, 1] / scatter[1, 1]
     # the drift is that of a heading with the scale of the fit, whose error is one of the bias too
-    own_variance = max(float(np.nan_to_num(fit.covariance[0, 0]))
-                       - fit.response_deviation ** 2, 0.0)
+    own_variance = max(float(fit.covariance[0, 0]) - fit.response_deviation ** 2, 0.0)
     of_scale = fit.covariance[0, 1] / math.sqrt(own_variance) if own_variance else 0.0
     widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation, of_scale)
                          / math.sqrt(scatter[1, 1])])
     covariance = scatter * np.outer(widening, widening)
-    place = np.floor(np.mod(turned, 1.0) * _PLACE_COUNT).astype(np.intp) % _PLACE_COUNT
+    # 24 places in a revolution, whose errors are independent
+    place = np.floor(np.mod(turned, 1.0) * 24.0).astype(np.intp) % 24
     # what the prior of the lag leaves open
     covariance[0, 0] = max(covariance[0, 0], own_variance)
     if len(np.unique(place)) > 7:  # fewer do not determine a variance
         covariance[0, 0] = max(covariance[0, 0],
                                _scatter_between(place, fit.influence, turned)[0, 0])
     # the components of a misalignment scatter as the scale factor error does
-    widening = covariance[0, 0] / np.nan_to_num(fit.covariance[0, 0], nan=math.inf)
+    widening = covariance[0, 0] / fit.covariance[0, 0]
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
                    + float(slope) * (drift.bias - fit.bias), covariance=covariance,
                    misalignment_covariance=max(widening, 1.0) * fit.misalignment_covariance)
@@ -575,8 +475,8 @@ def _scatter_between(group: NDArray[np.intp], influence: Array, turned: Array) -
     """
     Return the covariance of (s, b) by sums over groups of blocks, with Student's factor.
 
-    A few turns may determine s: what a group leaves is less by its share in the fit than what it
-    is in error (MacKinnon and White 1985), and the effective number of groups has the freedom.
+    What a group leaves is less by its share in the fit than what it is in error (MacKinnon and
+    White 1985), and the effective number of groups has the freedom.
     """
     leverage = np.array([np.gradient(turned) ** 2 + 1e-300, np.ones(len(turned))])
     shares = np.array([np.bincount(group, each) / each.sum() for each in leverage])
@@ -587,16 +487,16 @@ def _scatter_between(group: NDArray[np.intp], influence: Array, turned: Array) -
     return np.asarray(sums @ sums.T)
 
 
-def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidual:
+def _heading_residual(time: Array, rate: Array, motion: Motion) -> Array:
+    """Return heading of the gyro less that of the reference, rad, (n,); its mean is 0."""
     error = np.interp(motion.time, time, integrate(time, rate)) - motion.heading
     covered = (motion.time >= time[0]) & (motion.time <= time[-1])
     error = np.interp(motion.time, motion.time[covered], error[covered])
     for begin, end in _find_holes(time):  # the gyro's heading begins anew after it
         after = motion.time >= 0.5 * (begin + end)
         if after.any() and not after.all():  # by medians, as single references may be wrong
-            error[after] -= np.median(error[after][:_HOLE_EDGE]) - np.median(
-                error[~after][-_HOLE_EDGE:])
-    return HeadingResidual(error - error.mean())
+            error[after] -= np.median(error[after][:15]) - np.median(error[~after][-15:])
+    return np.asarray(error - error.mean())
 
 
 def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
@@ -607,7 +507,7 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
         yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
-    if method != 'rate' and fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
+    if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
         yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag of '
                'the reference or the gyro, as where it has one frequency, or a period that is not '
                f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
@@ -655,11 +555,6 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                'in which an error once in a revolution, as of an eccentric encoder, may have the '
                'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
                'not include what the likelihood does not show: turn further')
-    if method == 'rate':
-        yield ('the regression of rates fits no time offset, and noise of the gyro biases its '
-               'scale factor error by up to '
-               f'{100.0 * fit.response_deviation:.2g} %, which the interval includes; compare it '
-               'with the method likelihood')
 
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
@@ -670,12 +565,7 @@ HEADING_ALONE = ('a reference heading determines bias and scale_factor_error onl
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
               technology: str | None = None) -> SelectedEffects | EncoderCalibration:
-    """
-    Calibrate by the dwells of logs, by their paths, or by the heading of a single log.
-
-    The options are those of `api.fit`. A log in time whose only reference is a heading is
-    calibrated by it, and so is one with a reference rate that is seldom steady.
-    """
+    """Calibrate by the dwells of logs, by their paths, or by the heading of one (`api.fit`)."""
     for log in logs.values():
         _refuse_own_reference(log)
     chosen = {path: choose_reference(log) for path, log in logs.items()}
@@ -736,7 +626,8 @@ def _refuse_own_reference(log: Log) -> None:
         known = np.isfinite(rate) & np.isfinite(columns).all(axis=1)
         shares = np.linalg.lstsq(columns[known], rate[known], rcond=1e-12)[0]
         left = np.abs(rate[known] - columns[known] @ shares)
+        # by rounding; a second gyro that shares vibration differs by 1e-3 of the noise or more
         if np.count_nonzero(known) > 100 and np.quantile(left, 0.9) < (
-                _OWN_DIFFERENCE_SHARE * white_noise_deviation(columns @ shares, 6)):
+                1e-6 * white_noise_deviation(columns @ shares, 6)):
             raise DataRefused('the reference is computed from this gyro, since it follows its '
                               'noise from sample to sample: give a reference without it')

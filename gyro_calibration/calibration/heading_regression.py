@@ -21,13 +21,10 @@ integrals of the most likely rate ``w`` given both (with a course, that of the g
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
 with the integrals ``J``. A point is the mean over some samples; the observations are the
-differences between points, so that a gap of the reference is a long span. A rest is one more
-observation: a turn by 0; the spans do not contain it. It is in a gap, as of a vehicle whose course
-is lost then, or the reference stands, as odometry does, which may drift in motion; then the drift
-is one more value, and the rests determine the bias. An attitude shows the rotation about the two
-axes across that of the gyro too; as the axes of gyro and reference are never exactly parallel,
-parts of it, two more values, are in the output. What differs between the kinds of references
-is in `ReferenceTreatment`. The computing time is proportional to the number of spans.
+differences between points, so that a gap of the reference is a long span. A rest, in a gap or
+where the reference stands, is one more observation: a turn by 0. Odometry, which stands at rest,
+may drift in motion: one more value. An attitude shows the rotation about the two axes across that
+of the gyro; as axes are never exactly parallel, parts of it are in the output: two more values.
 
 A course over ground, the direction of travel by satellites, differs from the heading by the side
 slip. It is smoothed, late or early against the gyro, lost below some speed, and in bursts of some
@@ -45,10 +42,11 @@ import math
 from typing import Any, NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
+from gyro_calibration.calibration.likelihood import (
+    MIN_FIT_PROBABILITY, robust_residual, ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
-    bias_wander_columns, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior,
-    SharedNoise)
+    average_hypotheses, bias_wander_columns, carried_shares, fit_noise_grid, GridFit,
+    heading_noise, HierarchicalPrior, SharedNoise)
 from gyro_calibration.calibration.own_instants import (
     is_slow, keep_own_instants, MAX_ROUNDING_STEP, OwnInstants)
 from gyro_calibration.calibration.reference_noise import (
@@ -68,7 +66,6 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import expit
 from scipy.stats import t as student
-from scipy.stats import ttest_1samp
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
 TECHNOLOGY_PRIORS = {
@@ -78,38 +75,19 @@ TECHNOLOGY_PRIORS = {
 }
 #: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
 MAX_ENCODER_OFFSET = 0.25
-#: Typical duration of a burst of errors of a course, s. The few errors within it hardly determine
-#: its variance: the errors of a course have Student's distribution with so many degrees of
-#: freedom, plus one for each observed error.
-_BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
-#: The random walk of the bias that is possible beside a course, rad/s/√s; and the cosines of a
-#: wander that one part of noise describes.
-_COURSE_RANDOM_WALK_RANGE, WANDER_COSINES = (1e-7, 1e-4), 8
-#: Largest number of corrections of the rate, and error of the scale by a last one.
-_MAX_CORRECTIONS, _SCALE_TOLERANCE = 20, 1e-4
-#: Prior standard deviations of scale factor error and bias, rad/s, where gyro and reference
-#: disagree by more than a gyro errs; and prior odds of that beside a course that is lost at times,
-#: which has no wheels. A scale of odometry is wrong as probably as it is right.
-_WIDE_PRIOR, _WIDE_ODDS_OF_COURSE = (0.3, 10.0 * DEGREE), 1e-3
+#: Cosines of a wander that one part of noise describes.
+WANDER_COSINES = 8
+#: Prior deviations of s and b, rad/s, where gyro and reference disagree by more than a gyro errs.
+_WIDE_PRIOR = (0.3, 10.0 * DEGREE)
 #: Prior standard deviation of the smoothing of a course, s².
 _SMOOTHING_DEVIATION = 0.1
-#: Correlations of the errors of a course over a span that are possible.
-_COURSE_CORRELATIONS = (0.0, 0.2, 0.4, 0.6, 0.8)
 #: Names of the values that are always fitted.
 BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 #: Least effective number of stretches of an established value.
 MIN_STRETCHES = 3.0
 #: Distance of trial delays, s, and the largest in standard deviations of the prior.
 _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
-#: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
-_FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
-#: Cosines over which the power spectrum of a rate is averaged: that of white noise to 14 %.
-_SPECTRUM_BINS = 101
-#: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
-#: vibration.
-_MAX_VEHICLE_WALK = 5e-4
-#: Least number of spans to determine the noise of a course, and largest deviation of its turn in
-#: a span from that of a gyro that follows it, rad.
+#: Least number of spans, and largest deviation in a span from a gyro that follows, rad.
 _MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
 
 
@@ -117,8 +95,8 @@ def lag_deviation(delay: float) -> float:
     """
     Return the prior standard deviation of the lag that a delay, s, may be, s².
 
-    The variance of the times by which gyro or reference is late, twice this, is from 0 to the
-    square of their mean, of a filter of first order, and at most that of a smoothed course.
+    The variance of the times by which gyro or reference is late, twice this, is up to the square
+    of their mean, of a filter of first order, and at most that of a smoothed course.
     """
     return min(0.5 * delay ** 2, _SMOOTHING_DEVIATION)
 
@@ -179,7 +157,8 @@ class CauseTerm(NamedTuple):
         return max(len(effect.coefficients), 1) if effect is not None else 1
 
 
-_CLOCK_TERM, MISALIGNMENT_TERM = CauseTerm('clock_rate'), CauseTerm('axis_misalignment')
+_CLOCK_TERM, _DRIFT_TERM, MISALIGNMENT_TERM = map(
+    CauseTerm, ('clock_rate', 'reference_drift', 'axis_misalignment'))
 
 
 @dataclass(frozen=True)
@@ -190,25 +169,33 @@ class Spans:
     channels: Channels  # inputs of the effects; the rate is that of the gyro, as corrected so far
     value_times: Array  # times of the known values of the reference, s
     point_index: NDArray[np.intp]  # point of each of them
-    # time, heading: of the points, s and rad, shape (n + 1,)
-    time: Array
-    heading: Array
+    time: Array  # of the points, s, shape (n + 1,)
+    heading: Array  # of the points, rad
     # first and last row of each rest, shape (r, 2), and whether the reference is known there
     rests: NDArray[np.intp]
     stands: Mask
     treatment: ReferenceTreatment  # of the kind of the reference
-    # the angle random walk by the white noise of the samples, with that of a reference rate, and
-    # by the difference of gyro and reference over a second, the smaller first, rad/√s
+    # smaller and larger angle random walk, by the white noise of samples and reference rate, and
+    # by the difference of gyro and reference over a second, rad/√s
     walk_bounds: tuple[float, float]
     reference_noise_ratio: float  # ratio of the noise of a reference rate to that of the gyro
     uses_code_changes: bool  # whether the points are changes of the code of an encoder
-    # begin and end of each hole in the output that is as long as a span, s, shape (k, 2); over a
-    # span that meets one, nothing is compared, and its observation is 0
+    # begin and end of each hole in the output that is as long as a span, s, shape (k, 2)
     holes: Array
     output_step: float  # quantization step of the output, rad/s; 0 without one
     adds_up: bool  # whether the reference is never lost, as odometry, which adds up its errors
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
+
+    @property
+    def stamps(self) -> Array:
+        """Return the stamps of the gyro, s, shape (m,)."""
+        return np.asarray(self.log.time)
+
+    @property
+    def output(self) -> Array:
+        """Return its output, rad/s, shape (m,)."""
+        return np.asarray(self.log.output)
 
     @cached_property
     def cross_rotation(self) -> Array:
@@ -218,10 +205,9 @@ class Spans:
     @cached_property
     def is_measured(self) -> Mask:
         """Tell which spans and rests the output covers, shape (n + r,)."""
-        assert self.log.time is not None
         at, margin = self.gyro_stamps(self.time), 0.5 * float(np.median(np.diff(self.time)))
         first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
-                                      self.log.time[self.rests]]).T
+                                      self.stamps[self.rests]]).T
         begin, end = self.holes[:, :, None].transpose(1, 0, 2)
         covered = (self.time_outside[:-1] >= 0.0) & (self.time_outside[1:] <= 0.0)
         return np.asarray(~((begin < last) & (end > first)).any(axis=0)
@@ -230,9 +216,8 @@ class Spans:
     @property
     def time_outside(self) -> Array:
         """Return the mean time of each point before the log, or after it, s, shape (n + 1,)."""
-        assert self.log.time is not None
         at = self.gyro_stamps(self.value_times)
-        outside = at - np.clip(at, self.log.time[0], self.log.time[-1])
+        outside = at - np.clip(at, self.stamps[0], self.stamps[-1])
         return np.bincount(self.point_index, outside) / np.bincount(self.point_index)
 
     @property
@@ -245,12 +230,7 @@ class Spans:
 
     @property
     def shaft_sectors(self) -> NDArray[np.intp]:
-        """
-        Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,).
-
-        If a motion repeats synchronously with the samples, the errors of an encoder repeat too.
-        Stretches in time would count them as independent.
-        """
+        """Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,)."""
         middle = self.point_means(np.asarray(self.channels.heading))
         sector = np.floor(0.5 * (middle[1:] + middle[:-1]) / (10.0 * DEGREE))
         keys = np.append(2.0 * sector + (np.diff(middle) > 0.0), np.zeros(len(self.rests)))
@@ -259,7 +239,7 @@ class Spans:
     def all_causes(self, causes: Sequence[CauseTerm]) -> list[CauseTerm]:
         """Return causes, after those that are always fitted, misalignment and drift."""
         own = [MISALIGNMENT_TERM] * bool(self.cross_rotation.size)
-        own += [CauseTerm('reference_drift')] * bool(self.stands.any())
+        own += [_DRIFT_TERM] * bool(self.stands.any())
         return [*dict.fromkeys([*own, *causes])]
 
     def prior_deviations(self, causes: Sequence[CauseTerm]) -> Array:
@@ -290,17 +270,11 @@ class Spans:
     @cached_property
     def time_in_motion(self) -> Array:
         """Return the time without the rests, s, shape (m,)."""
-        assert self.log.time is not None
-        return integrate(self.log.time, self.is_in_motion.astype(float))
+        return integrate(self.stamps, self.is_in_motion.astype(float))
 
     @property
     def angles(self) -> Array:
-        """
-        Return the angle that is turned in each span, rad, shape (n,).
-
-        It is 0 where a course is nearer to no turn than to that of the gyro, which is noise then.
-        As that is in the observations too, it would pass for a scale factor error of 1.
-        """
+        """Return the angle turned in each span, rad, (n,); 0 where a course shows noise."""
         by_gyro = np.diff(self.point_means(np.asarray(self.channels.heading)))
         turns = np.diff(self.heading) * by_gyro > 0.5 * by_gyro ** 2
         return np.asarray(np.where(turns | self.treatment.is_fine, by_gyro, 0.0))
@@ -308,20 +282,15 @@ class Spans:
     @property
     def rest_durations(self) -> Array:
         """Return the length of each rest, s, shape (r,)."""
-        assert self.log.time is not None
-        return np.diff(self.log.time[self.rests])[:, 0]
+        return np.diff(self.stamps[self.rests])[:, 0]
 
     @cached_property
     def rest_rounding(self) -> float:
-        """
-        Return the standard deviation of the mean output of all rests by its steps, rad/s.
-
-        Where the noise is small compared with a step, they have one code and one error.
-        """
+        """Return the standard deviation of the mean output of all rests by its steps, rad/s."""
         rows = mark_rows(self.rests, len(self.log))
         if not (self.output_step and rows.any()):
             return 0.0
-        output = np.asarray(self.log.output)
+        output = self.output
         variance = np.average([np.var(output[first:last + 1]) for first, last in self.rests],
                               weights=np.diff(self.rests)[:, 0]) / self.output_step ** 2
         if variance > 0.25:  # as with a noise of half a step, which averages it out
@@ -334,13 +303,8 @@ class Spans:
         return (time + self.delay) / (1.0 + self.clock_rate)
 
     def point_means(self, values: Array, slopes: Array | None = None) -> Array:
-        """
-        Return the means of a signal at the points, corrected for the delay, shape (n + 1,).
-
-        Between samples it is a line, or a cubic with its slopes, if these are given.
-        """
-        assert self.log.time is not None
-        time = self.log.time
+        """Return the means of a signal at the delayed points, linear or with slopes, (n + 1,)."""
+        time = self.stamps
         # a change of code is the mean of two samples, between which the signal may be curved
         half = 0.5 * self.uses_code_changes * float(np.median(np.diff(time)))
         total: Array = np.zeros(len(self.time))
@@ -352,10 +316,9 @@ class Spans:
 
     def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
-        assert self.log.time is not None
-        rate = np.broadcast_to(rate, self.log.time.shape)
+        rate = np.broadcast_to(rate, self.stamps.shape)
         moving: Array = rate * self.is_in_motion
-        whole, in_motion = (integrate_with_curvature(self.log.time, each)
+        whole, in_motion = (integrate_with_curvature(self.stamps, each)
                             for each in (rate, moving))
         return self.is_measured * np.append(np.diff(self.point_means(in_motion, moving)),
                                             np.diff(whole[self.rests])[:, 0])
@@ -368,16 +331,15 @@ class Spans:
     @property
     def observed(self) -> Array:
         """Return the change of the reference less that of the integral of the output, (n + r,)."""
-        assert self.log.output is not None
         turned = np.append(np.diff(self.heading), np.zeros(len(self.rests)))
         return self.is_measured * turned - (1.0 + self.clock_rate) * self.span_integrals(
-            self.log.output)
+            self.output)
 
     @cached_property
     def _motion_share(self) -> Array:
         """Return the share of the motion in the power of each cosine of the rate, shape (m,)."""
         rate = np.asarray(self.channels.rate)
-        power = uniform_filter1d(dct(rate, norm='ortho') ** 2, _SPECTRUM_BINS)
+        power = uniform_filter1d(dct(rate, norm='ortho') ** 2, 101)  # of white noise to 14 %
         return np.maximum(1.0 - white_noise_deviation(rate) ** 2 / np.maximum(power, 1e-300), 0.0)
 
     def _smooth(self, rate: Array) -> Array:
@@ -386,12 +348,7 @@ class Spans:
 
     @cached_property
     def smooth_rate(self) -> Array:
-        """
-        Return the rate by a Wiener filter of its cosines, rad/s, shape (m,).
-
-        The changes of the rate from point to point, in which a delay shows, are mostly white noise
-        in a slow motion; as a column it would pass for information.
-        """
+        """Return the rate by a Wiener filter: its noise would pass for information on a delay."""
         return self._smooth(np.asarray(self.channels.rate))
 
     def rate_columns(self) -> Array:
@@ -408,7 +365,7 @@ class Spans:
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
-        time, heading = np.asarray(self.log.time), np.asarray(self.channels.heading)
+        time, heading = self.stamps, np.asarray(self.channels.heading)
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
@@ -417,7 +374,7 @@ class Spans:
                      / np.bincount(self.point_index) for each in self.cross_rotation.T]
             return np.pad(np.diff(means), ((0, 0), (0, len(self.rests)))).T * np.where(
                 self.is_measured, -1.0, 0.0)[:, None]
-        if cause.cause == 'reference_drift':
+        if cause == _DRIFT_TERM:
             return self.span_changes(self.time_in_motion)[:, None]
         if cause.cause == 'reference_slip':
             return self.span_changes((time >= cause.shapes[0]).astype(float))[:, None]
@@ -433,7 +390,7 @@ class Spans:
 
     def step_columns(self, times: Array) -> Array:
         """Return the columns of steps of the bias, each between two samples, shape (n + r, k)."""
-        time = np.asarray(self.log.time)
+        time = self.stamps
         between = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), [math.inf]])
         begin, at = between[np.searchsorted(time, times)], self.gyro_stamps(self.value_times)
         # the time in motion since the step, as a mean over the values of each point
@@ -451,10 +408,9 @@ class Spans:
         """
         Return the spans with the rate corrected for scale factor error, bias, delay and causes.
 
-        The causes are those that depend on the rate. The delay and the clock rate are added to
-        those of the spans.
+        These are the causes that depend on the rate. Delay and clock rate are added to those of
+        spans.
         """
-        assert self.log.output is not None and self.log.time is not None
         errors, clock_rate = values[1], self.clock_rate
         for cause in causes:
             own = values[self.value_slice(causes, cause)]
@@ -464,18 +420,18 @@ class Spans:
                     and 'rate' in CATALOGUE[cause.cause].inputs):
                 errors = errors + sum(size * column for size, column in zip(
                     own, CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)))
-        rate: Array = self.is_in_motion * (self.log.output - errors) / (1.0 + values[0])
+        rate: Array = self.is_in_motion * (self.output - errors) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]), clock_rate=clock_rate)
-        turned = integrate_with_curvature(self.log.time, rate)
+        turned = integrate_with_curvature(self.stamps, rate)
         # the heading of the reference, between its points that of the gyro
-        at = (1.0 + moved.clock_rate) * self.log.time - moved.delay
+        at = (1.0 + moved.clock_rate) * self.stamps - moved.delay
         heading_change: Array = self.heading - moved.point_means(turned, rate)
         if self.treatment.is_fine:
             heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
             rate = rate + (np.diff(heading_change) / np.diff(self.time))[steps]
         return replace(
-            moved, channels=replace(self.channels.with_rate(rate, self.log.output),
+            moved, channels=replace(self.channels.with_rate(rate, self.output),
                                     heading=turned + np.interp(at, self.time, heading_change)))
 
     def _difference_of_gyro(self, heading_change: Array) -> Array:
@@ -483,9 +439,8 @@ class Spans:
         Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
 
         The errors of the most likely heading given both are independent of the difference of both.
-        Columns computed from it are not correlated with the noise of the observations; those of
-        the reference alone are, which matters where it errs by degrees, and those of the gyro
-        alone, which matters if two columns are nearly the same.
+        Columns computed from the reference alone, or the gyro alone, would be correlated with the
+        noise of the observations.
         """
         if not self.treatment.errs_as_heading:
             return heading_change / (1.0 + self.reference_noise_ratio ** 2)
@@ -503,15 +458,13 @@ class Spans:
     def bias_wander(self) -> tuple[Array, list[SharedNoise]]:
         """Return the columns of a wandering bias, and the parts of its noise."""
         least, most = self.walk_bounds
-        flicker, walk = ((low * least, high * most)
-                         for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
+        # rad/s and rad/s/√s; beside a fine reference relative to the angle random walk
         waves, parts = bias_wander_columns(self.time, *(
-            (flicker, walk) if self.treatment.is_fine
-            else (None, _COURSE_RANDOM_WALK_RANGE, WANDER_COSINES)))
-        assert self.log.time is not None
+            ((3e-3 * least, 0.5 * most), (1e-4 * least, 0.1 * most)) if self.treatment.is_fine
+            else (None, (1e-7, 1e-4), WANDER_COSINES)))
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
-        rest_times = np.clip(self.log.time[self.rests], begin, end)[:, :, None] - begin
+        rest_times = np.clip(self.stamps[self.rests], begin, end)[:, :, None] - begin
         rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
         around = np.searchsorted(self.time - begin, rest_times.mean(axis=(1, 2))) - 1
         np.subtract.at(waves, np.clip(around, 0, len(waves) - 1), rows)
@@ -541,17 +494,15 @@ class Spans:
         """
         Return the column of a lag without its noise, what others explain of it, both (n + r,).
 
-        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro,
-        which would make the lag too small. It is reduced to the share that the reference shows
-        too (regression calibration, Carroll and others 2006), if that is beyond chance. The error
-        of that share, and what noise in both columns and observations may do, is an error of the
-        lag, s², of this deviation, which the others take up.
+        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro.
+        It is reduced to the share that the reference shows too (regression calibration, Carroll
+        and others 2006), if that is beyond chance. What is left of noise is an error of the lag,
+        s².
         """
-        assert self.log.time is not None and self.log.output is not None
-        time, columns = self.log.time, self.base_columns()
+        time, columns = self.stamps, self.base_columns()
         column = self.cause_columns(CauseTerm('bandwidth'))[:, 0]
         turned = np.column_stack([self.point_means(integrate_with_curvature(
-            time, self.log.output), self.log.output), self.heading])
+            time, self.output), self.output), self.heading])
         rates = CubicSpline(self.time, turned)((1.0 + self.clock_rate) * time - self.delay, 1).T
         seen = np.column_stack([column, *(
             -self.span_changes(np.gradient(self._smooth(each), time)) for each in rates),
@@ -572,9 +523,8 @@ class Spans:
 
     def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
-        assert self.log.time is not None and self.log.output is not None
-        turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
-        after, now, before = (np.interp(self.log.time + shift, self.log.time, turned)
+        turned, half = integrate_with_curvature(self.stamps, self.output), 0.5
+        after, now, before = (np.interp(self.stamps + shift, self.stamps, turned)
                               for shift in (half, 0.0, -half))
         return self.span_changes((after - 2.0 * now + before) / half ** 2)
 
@@ -584,9 +534,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     """
     Divide a log with a reference of some kind into spans.
 
-    The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
-    gyro was measured; beside a course, that of its technology is used as well. The instants are
-    those of the known values of a slow reference, by `keep_own_instants`.
+    The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, the instants those
+    of a slow reference.
     """
     treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
     if not treatment.is_fine:
@@ -623,11 +572,10 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         if difference.is_significant:  # or a heading that was differentiated
             treatment = replace(treatment, errs_as_heading=True)
     else:
-        walks = [min(walks[0], _MAX_VEHICLE_WALK)]
+        walks = [min(walks[0], 5e-4)]  # more is vibration of the vehicle
     by_code = kind == 'encoder' and encoder_step(reference) > 0.0 and (at == time).all()
     if by_code:
-        # between two samples with different codes the shaft was in the middle of both; a single
-        # code gives only a range, and its error at rest or at a reversal is systematic
+        # between two samples with different codes the shaft was in the middle of both
         at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
         reference = np.append(np.where(np.diff(reference) != 0.0,
                                        0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
@@ -686,9 +634,8 @@ class SpanFit:
     spans: Spans  # the log
     causes: tuple[CauseTerm, ...]  # in addition to scale factor error, bias and delay
     fit: GridFit  # of the restricted likelihood
-    # values, covariance: estimates and their cluster-robust covariance
     values: Array
-    covariance: Array
+    covariance: Array  # cluster-robust
     effective_stretches: Array  # effective number of stretches that determine each value
     freedom: Array  # degrees of freedom of the deviation of each value
 
@@ -696,6 +643,20 @@ class SpanFit:
         """Return half the length of the interval of 95 % of a value."""
         deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
         return float(student.ppf(0.975, self.freedom[value_index])) * deviation
+
+    def p_value(self, value_index: int) -> float:
+        """Return the probability by chance of a value as far from 0, two-sided."""
+        deviation = math.sqrt(max(self.covariance[value_index, value_index], 1e-300))
+        return 2.0 * float(student.sf(abs(self.values[value_index]) / deviation,
+                                      self.freedom[value_index]))
+
+    @property
+    def reference_drift(self) -> tuple[float, float] | None:
+        """Return the drift in motion and its half width, rad/s; None if it stands in no rest."""
+        if _DRIFT_TERM not in self.causes:
+            return None
+        place = self.value_slice(_DRIFT_TERM).start
+        return float(self.values[place]), self.half_width(place)
 
     @property
     def normal_covariance(self) -> Array:
@@ -722,12 +683,9 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    Rests that the motion contradicts are left out where no causes are given.
-
-    Wheels of another size, or a wrong unit, may exceed what a gyro errs by. Beside a course, whose
-    errors otherwise take that up, the values are means under the prior of the technology and a
-    wide one, weighted by their probability given the drive, and the intervals contain both answers
-    where it does not decide. An error that a drive does not need lowers its evidence.
+    Rests that the motion contradicts are left out where no causes are given. Wheels of another
+    size may exceed what a gyro errs by: beside a course the values are means under the prior of
+    the technology and a wide one, weighted by their probability given the drive.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
     corrected, point_variances = _correct_rate(spans, every)
@@ -747,16 +705,15 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     least = abs(wide.values[0]) - wide.half_width(0)
     probability = 0.0 if is_lost and least < NORMAL_QUANTILE_975 * prior[0] else float(expit(
         wide.fit.log_evidence - usual.fit.log_evidence
-        + math.log(_WIDE_ODDS_OF_COURSE if is_lost else 1.0)))
+        + math.log(1e-3 if is_lost else 1.0)))  # what is lost at times has no wheels
     likelier = wide if probability > 0.5 else usual
     if min(probability, 1.0 - probability) < 0.025:  # an interval of 95 % does not contain it
         return likelier
-    change = wide.values - usual.values
-    covariance = (probability * wide.normal_covariance
-                  + (1.0 - probability) * usual.normal_covariance
-                  + probability * (1.0 - probability) * np.outer(change, change))
+    values, covariance = average_hypotheses(
+        np.array([1.0 - probability, probability]), np.array([usual.values, wide.values]),
+        np.array([usual.normal_covariance, wide.normal_covariance]))
     widening = np.sqrt(np.diag(likelier.normal_covariance) / np.diag(likelier.covariance))
-    return replace(likelier, values=usual.values + probability * change,
+    return replace(likelier, values=values,
                    covariance=covariance / np.outer(widening, widening))
 
 
@@ -767,7 +724,7 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Arr
     delayed = replace(spans, delay=spans.delay or _find_delay(spans))
     point_variances: Array = np.ones(count + 1)
     scale = 0.0
-    for number in range(_MAX_CORRECTIONS):
+    for number in range(20):
         design = design_matrix(delayed, causes)
         if spans.treatment.is_fine:
             values = _robust_least_squares(design, delayed.observed, free)[0]
@@ -782,7 +739,7 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Arr
             point_variances = _point_variances(left[:count])
         delayed, change, scale = corrected, values[0] - scale, values[0]
         # the columns are of the rate by the scale before
-        if number and abs(scale * change) < _SCALE_TOLERANCE:
+        if number and abs(scale * change) < 1e-4:
             break
     return delayed, point_variances
 
@@ -825,11 +782,10 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
 def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
                              point_variances: Array) -> Spans:
     """Return the spans without rests whose rate is not the bias that the course shows."""
-    assert spans.log.output is not None
     by_course = _fit_with_noise(replace(spans, rests=spans.rests[spans.stands],
                                         stands=spans.stands[spans.stands]), causes,
                                 point_variances)
-    rates = np.array([spans.log.output[first:last].mean() for first, last in spans.rests])
+    rates = np.array([spans.output[first:last].mean() for first, last in spans.rests])
     agree = spans.stands | (np.abs(rates - by_course.values[1]) < by_course.half_width(1))
     return replace(spans, rests=spans.rests[agree], stands=spans.stands[agree])
 
@@ -856,10 +812,11 @@ def _fit_headings(spans: Spans, design: Array, point_variances: Array,
 
 def _burst_variance(time: Array, error: Array) -> Array:
     """Return the variance of each point of a course relative to the usual one."""
-    around = np.abs(time[:, None] - time) <= 0.5 * _BURST_DURATION
+    around = np.abs(time[:, None] - time) <= 2.5  # bursts of errors last for about 5 s
     squares, count = around @ error ** 2, around.sum(axis=1)
     usual = max(float(np.median(squares / count)), 1e-12)
-    return np.asarray((_STUDENT_DOF + squares / usual) / (_STUDENT_DOF + count))
+    # Student's distribution with 4 degrees of freedom, and one for each observed error
+    return np.asarray((4.0 + squares / usual) / (4.0 + count))
 
 
 def _point_variances(left: Array) -> Array:
@@ -904,14 +861,13 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     else:
         walk, size = _reference_walk(spans, fit_with) if spans.adds_up else (None, None)
         greatest, likeliest = -math.inf, None
-        for over_span in _COURSE_CORRELATIONS:
+        for over_span in (0.0, 0.2, 0.4, 0.6, 0.8):
             correlation = over_span ** (np.diff(spans.time) / spans.treatment.min_span)
             evidence = fit_with(correlation, walk, size).log_evidence
             if evidence < greatest:
                 break
             greatest, likeliest = evidence, correlation
-        # what a drive of minutes does not determine is drawn to 0, and the mean bias of the drive
-        # is not that of the gyro
+        # what a drive of minutes does not determine is drawn to 0
         fit = fit_with(likeliest, walk, size, wandering_value=1, hierarchical_priors=[
             HierarchicalPrior(name, place, (1e-2 * size, size))
             for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))])
@@ -928,9 +884,8 @@ def _reference_walk(spans: Spans,
     """
     Return how errors of odometry grow over each span, shape (n,), and their size.
 
-    They do not add up, grow in proportion to the time in motion, or to the angle turned by many
-    small slips, or a slip is a share of a whole turn, from a reversal to the next: whichever is
-    the likeliest. The spans of a turn may slip alike, so that the errors of whole turns count too.
+    They do not add up, grow with the time in motion, or with the angle turned by many small slips,
+    or a slip is a share of a whole turn, from a reversal to the next: whichever is the likeliest.
     """
     angles, independent = np.abs(spans.angles), np.zeros(len(spans.time) - 1)
     number = np.cumsum(np.diff(spans.angles > 0.0, prepend=spans.angles[0] > 0.0))
@@ -953,16 +908,12 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
 
-    Nor less than their mean square error under the widest prior, as a value that is drawn to 0 by
-    a narrower one may be as large as the technology allows.
-
-    Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958):
-    the few turning points of a swing at an even rate may determine a value and take up their
-    errors. The intervals of the first values are not wider than those of their priors; that of a
-    scale factor error that fewer than `MIN_STRETCHES` stretches determine is as wide, as it cannot
-    be separated from errors of the reference, unless the prior includes these.
-
-    Also the effective number of stretches that determine each value, and the degrees of freedom.
+    Nor less than their mean square error under the widest prior; nor than what they change by
+    without each place of a shaft (jackknife, Tukey 1958), as the few turning points of an even
+    swing may determine a value. The intervals of the first values are not wider than those of
+    their priors; that of a scale factor error that fewer than `MIN_STRETCHES` stretches determine
+    is as wide, as it cannot be separated from errors of the reference. Also the effective number
+    of stretches that determine each value, and the degrees of freedom.
     """
     count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
@@ -1015,8 +966,7 @@ class WhitenedRegression:
     """
     A whitened regression, for which ordinary least squares is generalized least squares.
 
-    The m priors of the values and of the wandering bias are rows after those of the observations.
-    Each of them is a separate cluster.
+    The m priors of values and wandering bias are rows after the observations, each a cluster.
     """
 
     observed: Array  # shape (n + r + m,)
@@ -1039,8 +989,8 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     """
     Return the regression of a log on causes, under the noise of a fit of the same log.
 
-    The noise may be of another fit, and its random walk the upper 95 % limit, as slow bias wander
-    may pass for a cause otherwise.
+    The random walk may be its upper 95 % limit, as slow bias wander may pass for a cause
+    otherwise.
     """
     spans, noise = fit.spans, (noise_fit or fit).fit
     waves, shared = spans.bias_wander()
@@ -1063,21 +1013,12 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
                               int(stretches.max()) + 1, cosines, noise)
 
 
-# a course over ground
-
 def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset to a drive.
 
-    Parameters
-    ----------
-    log : with output, time and a course
-    technology : of the gyro, one of `TECHNOLOGY_PRIORS`
-
-    Raises
-    ------
-    DataRefused : the course is known for too short a time, or the gyro does not follow it
-
+    The log has output, time and a course. `DataRefused` is raised where the course is known for
+    too short a time, or the gyro does not follow it.
     """
     spans = lay_out_spans(log, technology=technology)
     length = spans.treatment.min_span
@@ -1103,13 +1044,10 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     axes = (fit.value_slice(MISALIGNMENT_TERM) if MISALIGNMENT_TERM in fit.causes
             else slice(0))
     scale, bias, delay = fit.values[:len(BASE_VALUES)].tolist()
-    drift = None
-    if spans.stands.any():
-        place = fit.value_slice(CauseTerm('reference_drift')).start
-        drift = float(fit.values[place]), fit.half_width(place)
     return ScaleBiasFit(scale, bias, covariance[:2, :2], delay,
                         fit.noise_size('angle_random_walk'), fit.noise_size('reference'),
-                        time_offset_deviation=math.sqrt(covariance[2, 2]), reference_drift=drift,
+                        time_offset_deviation=math.sqrt(covariance[2, 2]),
+                        reference_drift=fit.reference_drift,
                         # a course may be lost in the rests before and after the drive alone
                         reference_adds_up=spans.adds_up and bool(spans.stands.all()),
                         misalignment=fit.values[axes],
@@ -1120,69 +1058,20 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     """
     Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
 
-    The bias that the motion shows is compared with that of the rests in which the reference
-    stands. Either may change steadily with time, and what depends on the rate is not of the
-    reference. None without such rests, or where both agree (Welch's test, at 1 %), as a whole or
-    in the ways from rest to rest, each compared with the rests around it: the bias may wander.
+    It is that of a regression with the rests in which the reference stands, a ramp of the bias,
+    and an asymmetry, which are of the gyro. None without two such rests, or within chance.
     """
     spans = lay_out_spans(log)
-    rests = spans.rests[spans.stands]
-    if len(rests) < 2:
+    if np.count_nonzero(spans.stands) < 2 or len(spans.time) < _MIN_SPANS:
         return None
-    time, output = np.asarray(spans.log.time), np.asarray(spans.log.output)
-    halves = [half for first, last in rests
-              for half in np.array_split(np.arange(first, last + 1), 2)]
-    middle, means = 0.5 * time[-1], np.array([output[half].mean() for half in halves])
-    spans = spans.with_corrected_rate(np.array([0.0, means.mean(), 0.0]))
-    rows = np.column_stack([spans.observed, design_matrix(
-        spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])])
-    rows = -rows[:len(spans.time) - 1]
-    rows = rows[rows[:, 2] > 0.0]
-    in_motion = np.insert(rows[:, [2, 1, 3, 6]], 1, rows[:, 5] - middle * rows[:, 2], axis=1)
-    at_rest = np.array([(1.0, time[half].mean() - middle) for half in halves])
-    if any(len(each) <= each.shape[1] for each in (in_motion, at_rest)):
-        return None
-    of_motion, one, freedom_of_one, left = _weighted_fit(in_motion, rows[:, 0], 1.0 / rows[:, 2])
-    of_rests, other, freedom_of_other, _ = _weighted_fit(
-        at_rest, means, np.array([len(half) for half in halves], dtype=float))
-    freedom = (one + other) ** 2 / (one ** 2 / freedom_of_one + other ** 2 / freedom_of_other
-                                    + 1e-300)
-    drift = of_rests[0] - of_motion[0]
-    deviation = math.hypot(math.sqrt(one + other), spans.rest_rounding)
-    if abs(drift) <= student.ppf(0.995, freedom) * deviation:
-        return None
-    # the bias on each way from rest to rest, and that of the rests around it
-    way = np.searchsorted(time[rests[:, 0]], in_motion[:, 1] / in_motion[:, 0] + middle) - 1
-    ways = len(rests) - 1
-    inside = (way >= 0) & (way < ways)
-    turned, duration = (np.bincount(way[inside], each[inside], ways) for each in (
-        in_motion[:, :2] @ of_motion[:2] + left, in_motion[:, 0]))
-    of_each = means.reshape(-1, 2).mean(axis=1)
-    known = duration > 0.0
-    differences = (turned[known] / duration[known]
-                   - 0.5 * (of_each[1:] + of_each[:-1])[known])
-    if len(differences) < 3 or ttest_1samp(differences, 0.0).pvalue > 0.01:
-        return None
-    return drift, float(student.ppf(0.975, freedom)) * deviation
-
-
-def _weighted_fit(columns: Array, observed: Array,
-                  weights: Array) -> tuple[Array, float, int, Array]:
-    """Return values, variance of the first, its degrees of freedom, and residual."""
-    root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
-    inverse = np.linalg.pinv(root[:, None] * columns)
-    values = inverse @ (root * observed)
-    left = observed - columns @ values
-    variance = float(weights @ left ** 2 / freedom * inverse[0] @ inverse[0])
-    return values, variance, freedom, left
+    fit = fit_spans(spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])
+    drift = fit.reference_drift
+    return drift if drift and fit.p_value(fit.value_slice(_DRIFT_TERM).start) < (
+        MIN_FIT_PROBABILITY) else None
 
 
 def is_noisy(log: Log) -> bool:
-    """
-    Tell whether a heading errs like a course.
-
-    It has no steps, is no attitude, and is as noisy from span to span; or it drifts in motion.
-    """
+    """Tell whether a heading drifts in motion, or has no steps and is as noisy as a course."""
     assert log.reference_heading is not None
     if find_drift(log) is not None:
         return True

@@ -11,29 +11,27 @@
 """
 The likelihood of a gyro's output, given its heading: scale factor error, bias, delay and lag.
 
-Everything is computed on increments between blocks of up to half a second: rates integrated by the
-trapezoid rule against the reference.
-
-Errors within a block (vibration, backlash, an eccentric encoder) are no random walk. The
-covariance of the increments is a banded matrix with one unknown ratio, which is solved exactly for
-each ratio of a grid. A bias may wander by a random walk, of sizes of a grid too. Blocks are
-shorter where the heading swings so fast that means over 0.5 s would attenuate it.
+Everything is computed on increments between blocks of up to half a second, shorter where the
+heading swings so fast that means would attenuate it: rates integrated by the trapezoid rule
+against the reference. Errors within a block (vibration, backlash, an eccentric encoder) are no
+random walk. The covariance of the increments is a banded matrix with one unknown ratio, and is
+solved exactly for each ratio of a grid. A bias may wander by a random walk, of sizes of a grid.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import math
 
-from gyro_calibration.calibration.noise_grid import bias_wander_columns, TridiagonalMatrix
+from gyro_calibration.calibration.noise_grid import (
+    average_hypotheses, bias_wander_columns, TridiagonalMatrix)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, robust_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import helmert
+from scipy.linalg import helmert, orth
+from scipy.special import softmax
 
 
 @dataclass(frozen=True)
@@ -43,9 +41,7 @@ class GoodnessOfFit:
     chi_square: float  # sum of squares of the residual over the variance that is known
     dof: float  # degrees of freedom
     probability: float  # of as much, or more, by chance
-    # noise that accumulates in the heading, over the known one; noise that repeats or averages out
-    # is not included
-    noise_ratio: float
+    noise_ratio: float  # that accumulates in the heading, over the known one
 
     def __str__(self) -> str:
         """Return a sentence for people."""
@@ -57,8 +53,7 @@ class GoodnessOfFit:
                 f'noise {self.noise_ratio:.2f} times that of the model)')
 
 
-#: Probability of a misfit by chance below which it is stated: of a residual, of a frequency band
-#: of it, or of sizes of a cause that differ from log to log.
+#: Probability of a misfit by chance below which it is stated.
 MIN_FIT_PROBABILITY = 1e-3
 
 
@@ -66,48 +61,35 @@ MIN_FIT_PROBABILITY = 1e-3
 class ScaleBiasFit:
     """The result of a fit."""
 
-    # s, 1, and b, rad/s
-    scale_factor_error: float
-    bias: float
+    scale_factor_error: float  # s, 1
+    bias: float  # b, rad/s
     covariance: Array  # of (s, b), shape (2, 2); nan where the method gives none
     time_offset: float = 0.0  # how late the gyro is against the profile, s
-    # as the run shows them, rad/√s and rad in one reading
-    angle_random_walk: float = math.nan
-    reference_noise: float = math.nan
-    # largest deviation of a stretch of the run from the profile, rad, and its significance in
-    # standard deviations
+    angle_random_walk: float = math.nan  # as the run shows it, rad/√s
+    reference_noise: float = math.nan  # in one reading, as the run shows it, rad
+    # largest deviation of a stretch of the run from the profile, rad, and in standard deviations
     stretch_residual: tuple[float, float] = (0.0, 0.0)
-    time_offset_deviation: float = math.nan  # standard deviation of the time offset, s
-    # the effect of the noise of each block on (s, b), shape (n, 2), and the times of the blocks,
-    # s, shape (n,), as one array (n, 3)
+    time_offset_deviation: float = math.nan  # s
+    # effect of the noise of each block on (s, b), and the times of the blocks, s, shape (n, 2 + 1)
     influence: Array = field(default_factory=lambda: np.empty((0, 3)))
     stretch_interval: tuple[float, float] = (0.0, 0.0)  # beginning and end of that stretch, s
-    # true heading where gyro and reference begin, from the reference's first heading, and its
-    # standard deviation, rad; nan against a profile, which defines its own start
+    # true heading where the run begins, from the first one of a measured reference, and its
+    # deviation, rad; nan against a profile
     start_heading: float = math.nan
     start_heading_deviation: float = math.nan
-    # sum of squares of the residual, in units of white noise of 1 rad/√s, and its degrees of
-    # freedom
-    residual_squares: float = math.nan
-    dof: float = 0.0
-    # comparison of that with the noise; None where the noise is not known
-    goodness: GoodnessOfFit | None = None
-    # standard deviation between the turns of a profile of the fraction that each lost, 1
-    slip_deviation: float = 0.0
-    # by how much both headings differ that the fit leaves unexplained: that of the random walk
-    # over the run, from and to 0, with their root mean square, which is 1 / √6 of it, rad
+    residual_squares: float = math.nan  # their sum, in units of white noise of 1 rad/√s
+    dof: float = 0.0  # degrees of freedom of these
+    goodness: GoodnessOfFit | None = None  # None where the noise is not known
+    slip_deviation: float = 0.0  # of the fraction that each turn of a profile lost, 1
+    # √6 times the rms of the difference of the headings that the fit leaves, rad
     heading_difference: float = math.nan
-    # variance of a mean at a constant rate by the steps of the output, (rad/s)²
-    rounding_variance: float = 0.0
-    # drift of a reference in motion against the rests in which it stands, and half its interval of
-    # 95 %, rad/s; None without such rests
+    rounding_variance: float = 0.0  # of a mean at a constant rate by output steps, (rad/s)²
+    # drift in motion against rests, and half its interval of 95 %, rad/s; None without such rests
     reference_drift: tuple[float, float] | None = None
     reference_adds_up: bool = False  # whether the reference adds up its errors, as odometry
-    # standard deviation of s by a lag or a smoothing that the motion does not determine; part of
-    # the covariance
+    # of s by a lag or smoothing that the motion does not determine; part of the covariance
     response_deviation: float = 0.0
-    # components of the axis of the gyro along the cross axes of the reference, rad, shape (k,),
-    # and their covariance, shape (k, k); k is 2 where it shows the rotation about these, else 0
+    # of the axis of the gyro along the cross axes of an attitude, rad, (2,) or (0,); covariance
     misalignment: Array = field(default_factory=lambda: np.empty(0))
     misalignment_covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
     # sizes of the error of a measured heading once in a revolution, rad, shape (2,), or none (0,)
@@ -120,14 +102,7 @@ MISALIGNMENT_REMEDY = ('turn the axes of the attitude into those of the gyro, or
 
 
 def oblique_angle(misalignment: Array, covariance: Array) -> tuple[float, float, float]:
-    """
-    Return the angle of a misalignment, rad, half its interval of 95 %, and its p-value.
-
-    Parameters
-    ----------
-    misalignment, covariance : of the two components, shapes (2,) and (2, 2), rad and rad²
-
-    """
+    """Return the angle of a misalignment, rad, half its interval of 95 %, and its p-value."""
     angle = float(np.hypot(*misalignment))
     along = misalignment / max(angle, 1e-300)
     square = float(misalignment @ np.linalg.pinv(covariance) @ misalignment)
@@ -135,8 +110,7 @@ def oblique_angle(misalignment: Array, covariance: Array) -> tuple[float, float,
             math.exp(-0.5 * square))  # the chi-squared distribution of two degrees of freedom
 
 
-#: Limit of significance, standard deviations: noise does not exceed it in 10 000 stretches a run,
-#: in all runs of a robot.
+#: Limit of significance: noise does not exceed it in 10 000 stretches a run.
 MAX_NOISE_SIGMAS = 7.0
 
 
@@ -145,9 +119,8 @@ class _ReferencePoints:
     """
     Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
 
-    The variances are known up to one factor. Errors that several points share have columns, shape
-    (n, k), and prior standard deviations, shape (k,), times one row of the factors
-    `prior_factors`, shape (m, k).
+    The variances are known up to one factor. Errors that several points share have columns, (n,
+    k), and prior standard deviations, (k,), times one row of the factors `prior_factors`, (m, k).
     """
 
     time: Array
@@ -169,15 +142,13 @@ class _Increments:
     prior_factors: Array  # possible factors of the prior standard deviations, shape (l, m)
     prior_mean: Array  # prior means of the values, shape (m,)
     gyro_increments: Array  # increments of the gyro's integral, rad, shape (n,)
-    # variance of the increments of a random walk, and covariance of each with the one before, s,
-    # shape (n,)
+    # variance of increments of a random walk, and covariance with the one before, s, shape (n,)
     walk_variance: Array
     walk_covariance: Array
     # variance of the reference in each block, up to one factor, shape (n + 1,)
     reference_variance: Array
     time: Array  # of the blocks, s, shape (n + 1,)
-    # from the first point to the first block: its heading, the time, the shared errors in that
-    # block, then the turn of the gyro
+    # of the first block against the first point: heading, time, shared errors, turn of the gyro
     start_offsets: Array
     # the change by a lag with accelerations by gyro and reference over `acceleration_time`, s,
     # rad/s², and by a term of the fourth order, rad/s⁴, shape (n, 3); empty for a profile
@@ -186,35 +157,26 @@ class _Increments:
     wander_count: int = 0  # number of the last columns, of a wandering bias
 
 
-#: Sizes of a rate random walk of the bias that are possible, rad/s/√s.
-_RATE_RANDOM_WALKS = np.geomspace(1e-7, 1e-2, 6)
-#: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
-#: random walk, and are not modelled as one.
-MAX_BLOCK_DURATION = 0.5
+MAX_BLOCK_DURATION = 0.5  # s
 #: Prior standard deviations: of the error of the present delay, s, and of the lag, s².
 DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
-#: Two offsets fit equally well if the ratio of their misfits is below this.
-_MAX_MISFIT_RATIO = 1.5
-#: Rate and acceleration are differences over this time, s, or an interval if longer, to either
-#: side: over less, noise dominates them.
-_MIN_SMOOTHING_TIME = 0.01
 
 
 class _RunAlignment:
     """A run and a motion, aligned at any time offset and lag."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
-                 slip_deviation: float, excess_turn: tuple[float, float] | None,
-                 cross_rotation: Array, bias_wanders: bool):
+                 slip_deviation: float, cross_rotation: Array, bias_wanders: bool):
         self._time, self._rate = time, rate
         self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
-        self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
+        # rate and acceleration are differences over this time to either side, s
+        self._smoothing_time = max(float(np.median(np.diff(time))), 0.01)
         self._acceleration_time = self._smoothing_time
         self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
-                                                excess_turn, cross_rotation)
+                                                cross_rotation)
         self.shaft_error: Array = np.zeros(2)  # in the columns of the shaft, rad
         self.has_shaft = self.is_measured and not cross_rotation.size
 
@@ -222,8 +184,8 @@ class _RunAlignment:
         """
         Return the increments if the gyro is `offset` s late, part of it by a first-order lag.
 
-        The time constant of the lag has the square 2 `lag`. The output of such a lag plus its rate
-        times the constant is the input, but for a delay.
+        The output of a lag with the time constant √(2 `lag`), plus its rate times that, is the
+        input.
         """
         points, constant = self._points, math.sqrt(2.0 * lag)
         gyro_time = points.time + offset - constant
@@ -251,8 +213,9 @@ class _RunAlignment:
             wander, (part,) = bias_wander_columns(means[:, 1], bias_instability=None)
             columns, count = np.column_stack([columns, wander]), wander.shape[1]
             prior = np.append(prior, np.sqrt(part.variance))
-            prior_factors = np.array([np.append(factors, np.full(count, size))
-                                      for factors in prior_factors for size in _RATE_RANDOM_WALKS])
+            prior_factors = np.array([
+                np.append(factors, np.full(count, size))  # of the walk, rad/s/√s
+                for factors in prior_factors for size in np.geomspace(1e-7, 1e-2, 6)])
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
@@ -291,11 +254,7 @@ class _RunAlignment:
         return data
 
     def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
-        """
-        Return rate, acceleration and integral of the rate, linear between the samples.
-
-        The lag is taken off the rate and the integral.
-        """
+        """Return rate, acceleration and integral of the rate at times, corrected for a lag."""
         base = self._smoothing_time
         integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
         rate = 0.5 * (later - earlier) / base
@@ -311,12 +270,7 @@ class _RunAlignment:
         return within + (at - inside) * rate
 
     def find_coarse_offset(self, largest: float) -> float:
-        """
-        Return the offset, s, at which most increments fit.
-
-        A slip affects only the blocks that contain it. A periodic motion fits about equally well
-        at several offsets: the smallest of these is returned.
-        """
+        """Return the smallest of the offsets, s, at which most increments fit about as well."""
         # a profile is smoother than measured headings
         step = 0.02 if self.is_measured else 0.04
         offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
@@ -329,8 +283,7 @@ class _RunAlignment:
         fine = np.arange(-5, 6) * 0.002
         deepest = [min((self._misfit(offset), offset) for offset in bottom + fine)
                    for bottom in bottoms]
-        alike = [offset
-                 for misfit, offset in deepest if misfit <= _MAX_MISFIT_RATIO * min(deepest)[0]]
+        alike = [offset for misfit, offset in deepest if misfit <= 1.5 * min(deepest)[0]]
         return float(min(alike, key=abs))
 
     def _misfit(self, offset: float) -> float:
@@ -358,13 +311,12 @@ def block_duration(motion: Motion) -> float:
 
 
 def _select_reference_points(motion: Motion, block: float, slip_deviation: float,
-                             excess_turn: tuple[float, float] | None,
                              cross_rotation: Array) -> _ReferencePoints:
     """Return where a motion is known: at its samples, or for an encoder where it steps."""
     if motion.rate is not None:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
-                                *tracking_error_columns(motion, time, slip_deviation, excess_turn))
+                                *tracking_error_columns(motion, time, slip_deviation))
     step = encoder_step(motion.heading)
     if cross_rotation.size:  # an attitude, which has no shaft
         ones = np.ones(cross_rotation.shape[1])
@@ -382,7 +334,7 @@ def _select_reference_points(motion: Motion, block: float, slip_deviation: float
     rests = np.ones(shared.shape[1])
     return _ReferencePoints(
         time, heading, variance, np.column_stack([_shaft_columns(heading), shared]),
-        np.append(np.full(2, _SHAFT_ERROR_DEVIATION), step / math.sqrt(12.0) * rests),
+        np.append(np.full(2, math.radians(1.0)), step / math.sqrt(12.0) * rests),
         np.array([[factor, factor, *rests] for factor in _PRIOR_FACTORS]))
 
 
@@ -401,60 +353,42 @@ def correct_shaft(heading: Array, sizes: Array) -> Array:
 
 #: Standard deviation of the scale factor error by which the two senses of turning may differ.
 ASYMMETRY_DEVIATION = 1e-4
-#: Prior standard deviation of the differences between turns in the lag of a robot, s².
-_TURN_LAG_DEVIATION = 0.02
-#: Largest number of groups of neighbouring turns with a delay and a lag of their own.
-_MAX_TURN_GROUPS = 12
-#: A response of higher order, as of a robot that overshoots, as a sum of second differences of the
-#: heading: their times, s, and prior standard deviation, 1.
-_RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.2 * np.arange(1, 5), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
 _PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
-#: Largest prior standard deviation of an error of a shaft once in a revolution, as of an eccentric
-#: encoder, rad.
-_SHAFT_ERROR_DEVIATION = math.radians(1.0)
 
 
-def tracking_error_columns(
-        motion: Motion, time: Array, slip_deviation: float,
-        excess_turn: tuple[float, float] | None = None) -> tuple[Array, Array, Array]:
+def tracking_error_columns(motion: Motion, time: Array,
+                           slip_deviation: float) -> tuple[Array, Array, Array]:
     """
     Return the deviations from a profile that scale, bias, delay and lag do not describe.
 
     The gyro's scale may differ between the two senses of turning. The response of the robot may be
     of higher order than a lag, and have a delay and a lag of its own in each turn, as where the
-    acceleration is limited. The robot may slip in each turn, and while it decelerates.
-
-    Parameters
-    ----------
-    time : s, shape (n,)
-    slip_deviation : largest standard deviation of the slip of a turn, as a fraction of it
-    excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides the
-        profile; None without one
+    acceleration is limited. The robot may slip in each turn, by a fraction of it with a standard
+    deviation of at most `slip_deviation`, and while it decelerates.
 
     Returns
     -------
     columns of headings, rad, shape (n, k), their prior standard deviations, shape (k,), and
     possible factors of these, shape (m, k)
-
     """
     rate, heading = motion.rate_at(time), motion.heading_at(time)
     sense, acceleration = np.sign(rate), np.gradient(rate, time)
     heading_change = np.diff(heading, prepend=heading[:1])[:, None]
     turn = np.where(sense, np.cumsum((sense != 0.0) & (np.diff(sense, prepend=0.0) != 0.0)), 0)
-    count = min(int(turn.max()), _MAX_TURN_GROUPS)
+    count = min(int(turn.max()), 12)  # groups of turns with a delay and a lag of their own
     if count < 2:
         return np.empty((len(time), 0)), np.empty(0), np.ones((1, 0))
     inside = (-(-turn * count // turn.max()))[:, None] == np.arange(1, count + 1)
     # the mean over the turns is delay, lag and scale
     contrasts = helmert(count).T
     columns = [rate[:, None] * (inside @ contrasts), acceleration[:, None] * (inside @ contrasts)]
-    columns.append(
-        np.column_stack([heading - 2.0 * motion.heading_at(time - late)
-                         + motion.heading_at(time - 2.0 * late) for late in _RESPONSE_DELAYS]))
+    delays = 0.2 * np.arange(1, 5)  # of a response of higher order, as of overshooting, s
+    columns.append(np.column_stack([heading - 2.0 * motion.heading_at(time - late)
+                                    + motion.heading_at(time - 2.0 * late) for late in delays]))
     deviations = [np.full(count - 1, DELAY_DEVIATION),
-                  np.full(count - 1, _TURN_LAG_DEVIATION),
-                  np.full(len(_RESPONSE_DELAYS), _RESPONSE_DEVIATION)]
+                  np.full(count - 1, 0.02),  # of the lag, s²
+                  np.full(len(delays), 0.3)]
     slips = np.ones(1)
     if slip_deviation:
         ending = inside & (rate * acceleration < 0.0)[:, None]
@@ -464,15 +398,11 @@ def tracking_error_columns(
         slips = _PRIOR_FACTORS
     of_response, of_slips = (each.reshape(-1, 1) for each in np.meshgrid(_PRIOR_FACTORS, slips))
     prior_factors = np.hstack([
-        np.repeat(of_response, 2 * count - 2 + len(_RESPONSE_DELAYS), axis=1),
+        np.repeat(of_response, 2 * count - 2 + len(delays), axis=1),
         np.repeat(of_slips, (2 * count - 1) * bool(slip_deviation), axis=1)])
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(heading_change), axis=0))
         deviations.append(np.array([ASYMMETRY_DEVIATION]))
-        prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
-    if excess_turn is not None:
-        columns.append(np.minimum(time, excess_turn[0])[:, None])
-        deviations.append(np.array([excess_turn[1]]))
         prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
     return np.hstack(columns), np.concatenate(deviations), prior_factors
 
@@ -481,8 +411,8 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     """
     Return the middles between lasting readings one step apart, with variances in units of theirs.
 
-    A constant reading has a constant error of up to half a step; where it changes by one step, the
-    heading is the edge between the two, but for the turn between the samples.
+    The error of a reading is constant; where it changes by one step, the heading is the edge
+    between the two, but for the turn between the samples.
     """
     change = np.abs(np.diff(motion.heading))
     index = np.flatnonzero(change > 0.5 * step)
@@ -493,9 +423,8 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
                           if len(time) else time)
     relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
                                   np.clip(relative_deviation * np.diff(motion.time)[index] / step,
-                                          _MIN_CROSSING_DEVIATION, 1.0))
-    # none has more weight than the median one: the accuracy of a reference is seldom that of its
-    # slowest steps
+                                          0.05, 1.0))
+    # the accuracy of a reference is seldom that of its slowest steps
     relative_deviation = (np.maximum(relative_deviation, np.median(relative_deviation))
                           if len(time) else relative_deviation)
     alone = np.diff(index, prepend=-1, append=len(change)) == 1
@@ -504,17 +433,13 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
                             np.zeros((int(edges.sum()), 2)))
 
 
-#: Least standard deviation of a heading where an encoder steps, in units of that of a reading.
-_MIN_CROSSING_DEVIATION = 0.05
-
-
 def _find_constant_readings(motion: Motion, step: float, block: float) -> _ReferencePoints:
     """
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
-    Of a value that was held, as it changes by several steps at once, it is the first sample. All
-    samples of a constant reading count as one. At the first and the last the gyro rests if
-    they last much longer than the readings next to them; then their samples share one error.
+    All samples of a constant reading count as one, but for the first and the last if they last
+    much longer than the readings next to them: then the gyro rests, and their samples share one
+    error.
     """
     change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
     run = np.cumsum(change > 0.5 * step)
@@ -539,9 +464,9 @@ def _random_walk_covariance(time: Array, weight: Array,
     """
     Return the variance of increments by a random walk, and the covariance of neighbours, s, (n,).
 
-    The random walk has unit variance a second, the increments are between weighted means of
-    blocks. With A the weights summed up to each point, the mean of a block is its last value less
-    the sum of A times the steps, and its first value plus the sum of (1 - A) times the steps.
+    The increments are between weighted means of blocks. With A the weights summed up to each
+    point, a mean is the last value less the sum of A times the steps of the walk, or the first one
+    plus that of 1 - A.
     """
     interval = np.diff(time, append=time[-1])
     until = np.cumsum(weight)
@@ -601,18 +526,10 @@ class _Estimate:
         return self.covariance * ((self.dof - 2.0) / (self.dof * self.rate_variance))
 
     def influence(self, data: _Increments) -> Array:
-        """
-        Return the effect of the noise of each block on (s, b), shape (n, 2).
-
-        A bias that wanders is part of the noise.
-        """
+        """Return the effect of each block's noise and bias on (s, b), shape (n, 2)."""
         wander = data.columns.shape[1] - data.wander_count
         noise = self.residual + data.columns[:, wander:] @ self.values[wander:]
         return noise[:, None] * (self.weighted @ self.inverse[:2].T)
-
-
-#: Variance of a block's reference noise over what the rate noise adds from block to block.
-_NOISE_RATIOS = np.geomspace(1e-3, 1e5, 25)
 
 
 def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Array,
@@ -651,18 +568,14 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
 def _average_over_noise(data: _Increments, prior_factors: Array,
                         has_shaft: bool) -> tuple[Array, Array, _Estimate]:
     """
-    Return the average over all ratios of the noises and factors of the priors, (m, k).
+    Return means over all ratios of noises and factors of priors, covariance, likeliest estimate.
 
     An error of the shaft is included only where the likelihoods show it: over less than a
     revolution it has nearly the effect of a scale factor error. Errors that repeat count once.
-
-    Returns
-    -------
-    means of the values, shape (k,), their covariance, shape (k, k), and the likeliest estimate
-
     """
+    # variance of a block's reference noise over what the rate noise adds from block to block
     typical = float(np.median(data.walk_variance) / np.median(data.reference_variance))
-    noises = [_IncrementCovariance(data, ratio) for ratio in _NOISE_RATIOS * typical]
+    noises = [_IncrementCovariance(data, ratio) for ratio in np.geomspace(1e-3, 1e5, 25) * typical]
     estimates = [_solve_weighted(data, noise, weighted, data.prior_deviation * factors)
                  for noise in noises for weighted in [noise.solve(_instrument(data, noise))]
                  for factors in prior_factors]
@@ -676,20 +589,16 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
         if math.exp((logarithms[~has_error].max() - logarithms.max()) / repeated) > (
                 MIN_FIT_PROBABILITY):
             logarithms[has_error] = -math.inf
-    weights = np.exp(logarithms - logarithms.max())
-    weights /= weights.sum()
-    return (weights @ values, np.tensordot(weights, covariances, 1)
-            + np.cov(values.T, aweights=weights, ddof=0), estimates[int(weights.argmax())])
+    weights = softmax(logarithms)
+    return (*average_hypotheses(weights, values, covariances), estimates[int(weights.argmax())])
 
 
 def _repetition(data: _Increments, estimate: _Estimate) -> float:
     """
-    Return how many times the same errors occur: 1 if all are independent.
+    Return how many times the same errors occur, as in an even swing: 1 if all are independent.
 
-    They may be the same in all passes through a place of the shaft in one sense, as the steps of
-    an encoder in an even swing. There are as many groups, by place and sense, as a pass has
-    blocks. It is the mean square of a group's mean, times its number of blocks, over that of all
-    (analysis of variance).
+    There are as many groups, by place and sense, as a pass through the motion has blocks. It is
+    the mean square of a group's mean, times its number of blocks, over that of all.
     """
     turned, white = data.columns[:, 0], estimate.noise.whiten(estimate.residual)
     heading = np.cumsum(turned) - 0.5 * turned
@@ -710,8 +619,7 @@ def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
 
     White noise of the variance N² of the gyro has the covariance -N² / base with an acceleration
     by the gyro over a base, and reference headings of the variance r the covariance 2 r / base²
-    with one by the reference. In a mean with weights inverse to them both cancel. Otherwise the
-    noise passes for a lag, and with that, in a swing of one frequency, for a scale factor error.
+    with one by the reference. In a mean with weights inverse to them both cancel.
     """
     columns = data.columns.copy()
     if len(data.accelerations):
@@ -726,13 +634,12 @@ def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
     """
     Return the prior standard deviation of a lag, and that of the scale by what is not known of it.
 
-    The motion determines a lag by the part of the acceleration that the other columns do not
-    explain, as gyro and reference both show it, since their noise is no information; less two
-    standard deviations. If it does so more narrowly than what is `possible`, s², or than the lag
-    that is found, there is no prior; what a lag adds to the fourth order is that of a Gaussian
-    window, or by a fifth of its square less, of a mean over a time, or by its square more, of a
-    filter of first order, which has the lag `offset` ** 2 / 2. Else the lag is 0, as in a swing of
-    one frequency, and what it may do to the scale is uncertain.
+    The motion determines a lag by the part of the acceleration that gyro and reference both show
+    and the other columns do not explain, less two standard deviations. If it does so more narrowly
+    than what is `possible`, s², or than the lag that is found, only the shape of the response is
+    not known: from a mean over a time, with a fifth of the square of a lag less in the fourth
+    order than a Gaussian window, to a filter of first order with the lag `offset` ** 2 / 2. Else
+    the lag is 0, as in a swing of one frequency, and what it may do to the scale is uncertain.
     """
     of_first_order = 0.5 * offset ** 2
     possible = max(possible, of_first_order)
@@ -759,49 +666,36 @@ def _nonzero_scale(scale: float) -> float:
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
                    lag_deviation: float = LAG_DEVIATION, slip_deviation: float = 0.0,
-                   excess_turn: tuple[float, float] | None = None,
                    cross_rotation: Array | None = None,
                    bias_wanders: bool = False) -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
-    Rates are integrated by the trapezoid rule and compared with the reference heading increment by
-    increment. The increments have noise of the rate (a random walk of the heading) and of the
-    reference heading (an encoder's step), so that neighbours are correlated; the ratio of the two
-    is found by restricted likelihood. A measured heading is smoothed by the gyro's output before
-    it serves as the regressor, which makes this the errors-in-variables likelihood.
+    The increments have noise of the rate (a random walk of the heading) and of the reference
+    heading (an encoder's step), so that neighbours are correlated; the ratio of the two is found
+    by restricted likelihood. A measured heading is smoothed by the gyro's output before it serves
+    as the regressor (errors in variables).
 
-    A robot follows its profile late and smoothly, so delay and lag are fitted too: without them, a
-    first-order lag of 0.2 s causes 0.9 % of scale factor error. The lag is of first order against
-    a profile of rates, which a robot only follows; against headings, which were measured on the
-    robot itself, it is small and taken to second order. Other deviations from a profile
-    (`tracking_error_columns`) are fitted within their priors, and so is a stretch with a turn of
-    its own, weighted by its probability.
+    A robot follows its profile late and smoothly: without delay and lag, a first-order lag of 0.2
+    s causes 0.9 % of scale factor error. Against headings, which were measured on the robot
+    itself, the lag is small and taken to second order. `tracking_error_columns` are fitted within
+    their priors, and so is a stretch with a turn of its own. `DataRefused` is raised where gyro
+    and motion hardly overlap.
 
     Parameters
     ----------
-    time : s since the start of the motion, shape (n,)
-    rate : output of the gyro, rad/s, shape (n,)
-    motion : of the gyro
+    time, rate : s since the start of the motion, and output of the gyro, rad/s, shape (n,)
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
     lag_deviation : prior standard deviation of the lag, s²; with a measured motion only where it
         does not determine the lag, as a sine does not
-    slip_deviation : largest standard deviation of the slip of each turn of a profile, as a
-        fraction of it
-    excess_turn : end, s, and prior standard deviation, rad/s, of a steady turn besides a profile;
-        the bias is then that of the rest after it. None without one
+    slip_deviation : largest one of the slip of each turn of a profile, as a fraction of it
     cross_rotation : of the motion about the two axes across that of the reference, at the times of
         a measured motion, rad, shape (n, 2) or (n, 0); None where it is not known
     bias_wanders : whether it may do so by a random walk; it is then the mean over the motion
-
-    Raises
-    ------
-    DataRefused : gyro and motion hardly overlap
-
     """
     if cross_rotation is None:
         cross_rotation = np.empty((len(motion.time), 0))
-    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation, excess_turn,
+    alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation,
                               cross_rotation, bias_wanders)
     offset, data, averages, averaged_covariance, estimate, response_deviation = _fit_offset(
         alignment, largest_time_offset)
@@ -857,11 +751,9 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     Return the time offset, s, the increments there, and their fits.
 
     First values and covariance averaged over the noise, then the estimate at the likeliest one,
-    and the standard deviation of the scale by a lag that the motion does not determine.
-
-    A measured heading, or the gyro, may be late since it was smoothed. Half the variance of the
-    times by which it is late is from 0, of a delay, to half the square of their mean, of a
-    first-order lag, which is a standard deviation of the prior.
+    and the standard deviation of the scale by a lag that the motion does not determine. Half the
+    variance of the times by which a smoothed heading, or a gyro, is late is from 0, of a delay, to
+    half the square of their mean, of a first-order lag, a standard deviation of the prior.
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
@@ -899,15 +791,13 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
         if alignment.has_shaft:
             alignment.set_shaft_error(estimate.values[4:6] / _nonzero_scale(estimate.values[0]))
         if (len(prior_factors) == len(data.prior_factors)
-                and abs(offset - before) < _OFFSET_TOLERANCE
+                and abs(offset - before) < 1e-3
                 and np.abs(alignment.shaft_error ** 2 - shaft_error ** 2).max() < 1e-6):
             break
     assert estimate is not None
     return offset, data, values, covariance, estimate, response_deviation
 
 
-#: The noise is estimated again where the offset changed by more than this, s.
-_OFFSET_TOLERANCE = 1e-3
 #: Largest additional delay of a robot that follows its profile with a lag, s.
 MAX_TRACKING_LAG = 0.25
 
@@ -916,8 +806,8 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     """
     Return the true heading where gyro and reference begin, and its standard deviation, rad.
 
-    It is relative to the reference's first heading. The expected noise of the first block's
-    heading, given all that follows, is subtracted, and then the gyro's turn before that block.
+    It counts from the reference's first heading: that of the first block less its expected noise,
+    given all that follows, and less the gyro's turn before it.
     """
     heading, elapsed, shared, gyro_angle = (data.start_offsets[0], data.start_offsets[1],
                                             data.start_offsets[2:-1], data.start_offsets[-1])
@@ -947,17 +837,13 @@ class DeviatingStretch:
     # sum of squares that it explains, and that remains
     explained_squares: float
     remaining_squares: float
-    # sums of squares that each stretch explains, and of its column without the part that the fit
-    # explains, for all stretches that are distinguishable from the fit, shape (m,)
+    # what each stretch explains, and its column beside those of the fit, squares, shape (m,)
     all_explained_squares: Array
     column_squares: Array
 
 
-#: A turn that the profile does not contain, by hand or by a single slip: standard deviation of its
-#: rate, rad/s, and its prior odds.
-EXCESS_RATE_DEVIATION, _EXCESS_TURN_ODDS = 0.0175, 0.1
-#: Largest number of places of a run at which a stretch begins or ends.
-_MAX_EDGES = 150
+#: Standard deviation of a turn beside the profile, by hand or a slip, rad/s.
+EXCESS_RATE_DEVIATION = 0.0175
 
 
 def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
@@ -965,8 +851,8 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     """
     Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and the noise.
 
-    The values are fitted together with the excess turn of each stretch, so that they do not absorb
-    a slip. The standard deviation of the noise is that of a robust fit.
+    The values are fitted with the excess turn of each stretch, so that they do not absorb a slip.
+    The standard deviation of the noise is that of a robust fit.
     """
     noise, interval = estimate.noise, data.columns[:, 1]
     shared = data.columns[:, 4:] @ estimate.values[4:]
@@ -974,7 +860,7 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     noise_deviation = max(
         robust_deviation(robust) * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
     edges = np.unique(
-        np.linspace(0, len(robust), min(len(robust), _MAX_EDGES) + 1).astype(np.intp))
+        np.linspace(0, len(robust), min(len(robust), 150) + 1).astype(np.intp))
     steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)
     prior = noise_deviation / estimate.prior_deviation
     found = find_deviating_stretch(
@@ -994,41 +880,33 @@ def _average_over_stretch(
         (estimate.dof - 1.0) * np.log1p(-np.minimum(
             found.all_explained_squares / total_squares, 1.0 - 1e-15))
         + np.log1p(found.column_squares * (EXCESS_RATE_DEVIATION / noise_deviation) ** 2))
-    odds = (_EXCESS_TURN_ODDS * float(np.exp(np.minimum(logarithms, 100.0)).sum())
-            / max(len(logarithms), 1))  # the mean over all stretches, each against none
+    # prior odds of 0.1, times the mean over all stretches, each against none
+    odds = 0.1 * float(np.exp(np.minimum(logarithms, 100.0)).sum()) / max(len(logarithms), 1)
     widened = replace(data, columns=np.insert(data.columns, 4, stretch_column, axis=1),
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
     other = _solve_weighted(widened, estimate.noise, estimate.noise.solve(widened.columns),
                             np.insert(estimate.prior_deviation, 4, EXCESS_RATE_DEVIATION))
-    probability, change = odds / (1.0 + odds), other.values[:2] - values
-    return values + probability * change, (
-        (1.0 - probability) * covariance + probability * other.covariance[:2, :2]
-        + probability * (1.0 - probability) * np.outer(change, change))
+    return average_hypotheses(
+        np.array([1.0, odds]) / (1.0 + odds), np.array([values, other.values[:2]]),
+        np.array([covariance, other.covariance[:2, :2]]))
 
 
 def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> DeviatingStretch:
     """
     Return the stretch that improves a fit most.
 
-    Parameters
-    ----------
-    columns : of the fit, white, shape (n, k)
-    steps : the addition of a turn of 1 rad/s from each edge on, white, shape (n, m); the last edge
-        is the end
-    observed : what is fitted, white, shape (n,)
-
+    Given are white columns of the fit, (n, k), the addition of a turn of 1 rad/s from each edge
+    on, (n, m), of which the last is the end, and what is fitted, (n,).
     """
-    basis, singular, _ = np.linalg.svd(
-        columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    basis = basis[:, singular > 1e-7]
+    basis = orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), 1e-7)
     step_residuals = steps - basis @ (basis.T @ steps)
     sums, products, whole = (step_residuals.T @ observed, step_residuals.T @ step_residuals,
                              steps.T @ steps)
     differences = sums[:, None] - sums
     norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
                      for matrix in (products, whole))
-    # neither stretches that scale and bias explain nearly as well, nor empty ones
-    distinct = np.triu(norms > _MIN_DISTINCT_SHARE * wholes, 1)
+    # no empty stretches, nor those of which the fit explains 80 %: noise gives them large turns
+    distinct = np.triu(norms > 0.2 * wholes, 1)
     gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
     first, last = np.unravel_index(int(gains.argmax()), gains.shape)
     gain = float(gains[first, last])
@@ -1036,8 +914,3 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
         int(first), int(last), float(differences[first, last] / max(norms[first, last], 1e-300)),
         gain, float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
         gains[distinct], norms[distinct])
-
-
-#: Fraction of a stretch that the columns of a fit must not explain, so that the two are
-#: distinguishable; with less, noise gives a stretch a large turn.
-_MIN_DISTINCT_SHARE = 0.2

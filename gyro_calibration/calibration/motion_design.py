@@ -11,19 +11,17 @@
 """
 The motion within the limits of a robot that minimizes the heading error of a later drive.
 
-The accuracy of a run is computed before it is driven. `fit_likelihood` weighs increments of
-headings; the same columns, the same priors on delay and lag and the noise figures of the gyro give
-the covariance of scale factor error s and bias b. The rest after the run is combined with them as
-in `check_rest`. From these follows the covariance of the heading of a later drive. Flicker and
-random walk of the bias, which the fit does not weigh, are propagated through its weights.
+The accuracy of a run is computed before it is driven: the columns and priors of `fit_likelihood`
+and the noise figures of the gyro give the covariance of scale factor error s and bias b, with the
+rest after the run as in `check_rest`, and that of the heading of a later drive. Flicker and random
+walk of the bias, which the fit does not weigh, are propagated through its weights.
 
 A motion that returns has no net turn, so that the estimates of s and b are independent. The
 deviation of the bias depends on the white noise N, the time T, N / √T, and the rest, but not on
 the motion; that of s depends on the motion.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 import math
@@ -41,8 +39,6 @@ from scipy.special import ndtri
 
 #: Cells in which the noise is counted, in one block of the fit, and points of the motion in each.
 _CELLS_PER_BLOCK = 5
-#: Largest number of cells of the drive, of 1 s or longer.
-_MAX_DRIVE_CELLS = 600
 #: Median of the absolute value of a normal variable, standard deviations.
 _MEDIAN_SIGMA = float(ndtri(0.75))
 
@@ -93,13 +89,9 @@ class Prediction:
     """The expected accuracy of a calibration by a motion."""
 
     scale_deviation: float  # standard deviation of s, 1
-    # standard deviation of b against the mean bias of the drive that follows, rad/s; without
-    # flicker and random walk it is what the calibration states
-    bias_deviation: float
+    bias_deviation: float  # of b against the mean bias of the drive, rad/s
     heading_error: float  # mean absolute error of the heading over that drive, rad
-    # the part of it that white noise causes, which remains if s and the bias are known at all
-    # times
-    floor: float
+    floor: float  # the part that white noise causes
 
 
 class CalibrationForecast:
@@ -107,15 +99,10 @@ class CalibrationForecast:
 
     def __init__(self, noise: Noise, duration: float, drive: Motion, drive_duration: float,
                  rest_duration: float = RunLimits.rest_duration):
-        """
-        Prepare for a gyro, whose angle random walk is above 0; all durations are in s.
-
-        The rest begins `SETTLING_TIME` s after the motion; a duration of 0 is none. The motion of
-        the robot after the rest, the drive, is repeated where it ends.
-        """
+        """Prepare for a gyro with noise; durations are in s, a rest of 0 is none."""
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
-        cells = min(max(round(drive_duration), 1), _MAX_DRIVE_CELLS)
+        cells = min(max(round(drive_duration), 1), 600)
         time = np.linspace(0.0, drive_duration, cells + 1)[1:]
         rounds = np.floor(time / drive.duration)  # the drive begins again where it ended
         heading = rounds * drive.heading[-1] + drive.heading_at(time - rounds * drive.duration)
@@ -131,10 +118,9 @@ class CalibrationForecast:
         """
         Return the heading error, rad, by blocks of one length for all motions.
 
-        A fit takes shorter blocks where the motion is fast, and loses less at both ends, which
-        improves the bias by 0.3 %. A search with these blocks would prefer fast motions for it, at
-        the cost of the scale; with the allowance for a difference between the senses of turning it
-        would prefer slow ones.
+        A fit takes shorter blocks where the motion is fast, which improves the bias by 0.3 %: a
+        search with these would prefer fast motions, at the cost of the scale; one with the
+        allowance for a difference between the senses of turning would prefer slow ones.
         """
         blocks = math.ceil(self._duration / min(MAX_BLOCK_DURATION, self._duration / 40.0))
         return self._predict(motion, blocks, False).heading_error
@@ -143,8 +129,8 @@ class CalibrationForecast:
         white_precision, of_run, of_both, of_drive = _noise_covariances(
             self._noise, self._duration, blocks, self._rest_duration, self._drive_duration,
             self._drive_columns.shape[1])
-        # the fit: its weights of (s, b) on increments of the gyro's integral, shape (2, n), and
-        # the covariance by errors of the robot that it does not determine, (2, 2)
+        # the weights of (s, b) on increments of the gyro's integral, (2, n), and the covariance by
+        # errors of the robot that the fit does not determine, (2, 2)
         count = blocks * _CELLS_PER_BLOCK ** 2
         point = (np.arange(count) + 0.5) * self._duration / count
         rate = motion.rate_at(point)
@@ -160,8 +146,8 @@ class CalibrationForecast:
         of_tracking = weights @ columns[:, 4:] * prior[4:]
         unweighed = of_tracking @ of_tracking.T
         if self._rest_duration:
-            # combined with the median rest: its halves differ by twice the deviation of the mean,
-            # times `_MEDIAN_SIGMA`
+            # the median rest: its halves differ by `_MEDIAN_SIGMA` deviations, twice that of the
+            # mean
             white = self._noise.angle_random_walk / math.sqrt(self._rest_duration)
             stated = covariance[:2, :2] + np.diag([0.0, self._noise.allan_floor ** 2])
             expected, variance = (rest_variance(self._noise, self._rest_duration, white, change)
@@ -170,8 +156,7 @@ class CalibrationForecast:
                 stated, _MEDIAN_SIGMA * math.sqrt(stated[1, 1] + expected), variance)
             share = np.eye(2) - np.outer(gain, (0.0, 1.0))
             weights = np.column_stack([share @ weights, gain])
-            # the probability of another turn of the robot is no noise, but part of the stated
-            # variance
+            # another turn of the robot is no noise, but part of the stated variance
             unweighed = share @ (unweighed - stated) @ share.T + combined - variance * np.outer(
                 gain, gain)
 
@@ -225,21 +210,12 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
             ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
 
 
-@dataclass(frozen=True)
-class _Turn:
-    """One turn through an angle, rad, signed, at a rate above 0, rad/s, and its rest after, s."""
-
-    angle: float
-    rate: float
-    rest: float
-
-
-def _build_motion(robot: RobotLimits, turns: list[_Turn]) -> Motion:
-    """Return the motion of a rest and then turns; angles are large enough for their rates."""
+def _build_motion(robot: RobotLimits, turns: Iterable[tuple[float, float, float]]) -> Motion:
+    """Return a rest, then turns of angle, rad, signed, rate above 0, rad/s, and rest after, s."""
     time, rate = [0.0, robot.rest], [0.0, 0.0]
-    for turn in turns:
+    for angle, speed, rest in turns:
         # a ramp: times, s, and fractions of the rate from 0 to 1; rounded where jerk is limited
-        rising, rounding = robot.ramp_times(turn.rate)
+        rising, rounding = robot.ramp_times(speed)
         since, share = np.array([0.0, rising]), np.array([0.0, 1.0])
         if rounding:
             since = np.linspace(0.0, rising + rounding, 17)
@@ -247,14 +223,14 @@ def _build_motion(robot: RobotLimits, turns: list[_Turn]) -> Motion:
                        for begin in (0.0, rising, rounding, rising + rounding)]
             share = (squares[0] - squares[1] - squares[2] + squares[3]) / (
                 2.0 * rising * rounding)
-        steady = abs(turn.angle) / turn.rate - robot.ramp_duration(turn.rate)
+        steady = abs(angle) / speed - robot.ramp_duration(speed)
         up = time[-1] + since[1:]
         down = time[-1] + since[1:] + since[-1] + max(steady, 0.0)
-        rates = math.copysign(turn.rate, turn.angle) * share
+        rates = math.copysign(speed, angle) * share
         time += [*up, *([down[0] - since[1]] if steady > 1e-9 else []), *down]
         rate += [*rates[1:], *([rates[-1]] if steady > 1e-9 else []), *rates[-2::-1]]
-        if turn.rest > 1e-9:
-            time.append(time[-1] + turn.rest)
+        if rest > 1e-9:
+            time.append(time[-1] + rest)
             rate.append(0.0)
     return motion_from_rates(np.array(time), np.array(rate))
 
@@ -265,7 +241,7 @@ class _MotionFamily:
 
     The axes: number of turns, sense of the first one, fractions of the headings above and below 0
     that are used, rates of one pair of turns and of the next, and fraction of the time that is
-    rest between turns. Angles are stretched up to the duration or the limits of the heading.
+    rest between turns.
     """
 
     def __init__(self, robot: RobotLimits, duration: float):
@@ -303,8 +279,7 @@ class _MotionFamily:
                 or (np.abs(angles) < rates * ramps).any()):
             return None
         rests = np.append(np.full(count - 1, max(left, 0.0) / (count - 1)), robot.rest)
-        return _build_motion(robot, [_Turn(*values) for values in zip(
-            angles.tolist(), rates.tolist(), rests.tolist())])
+        return _build_motion(robot, zip(angles.tolist(), rates.tolist(), rests.tolist()))
 
 
 @dataclass(frozen=True)
@@ -320,8 +295,8 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     """
     Return the motion of that length, s, with the least heading error in the forecast's drive.
 
-    The forecast is for motions of this length. Each generation of the search tries 70 motions.
-    `DataRefused` is raised where the robot cannot make one, or none would calibrate well enough.
+    Each generation of the search tries 70 motions. `DataRefused` is raised where the robot cannot
+    make one, or none would calibrate well enough.
     """
     _refuse_impossible(robot, duration)
     family = _MotionFamily(robot, duration)
@@ -364,20 +339,15 @@ def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
 
 
 def plain_motion(robot: RobotLimits, duration: float) -> Motion:
-    """
-    Return the plain motion of that length, s: rest, one turn there, rest, one turn back, rest.
-
-    It turns at half of the robot's fastest rate, as far as time and place allow, to the wider
-    side.
-    """
+    """Return a motion, s, of one turn there and back with rests, at half the fastest rate."""
     _refuse_impossible(robot, duration)
     place, half = max(robot.highest, -robot.lowest), 0.5 * duration - robot.rest
     rate = max(0.5 * robot.max_turn_rate(min(place, robot.max_turn_angle(half))), robot.slowest)
     angle = min(place, rate * (half - robot.ramp_duration(rate)))
     between = 2.0 * (half - angle / rate - robot.ramp_duration(rate))
     side = 1.0 if robot.highest == place else -1.0
-    return _build_motion(robot, [_Turn(side * angle, rate, between),
-                                 _Turn(-side * angle, rate, robot.rest)])
+    return _build_motion(
+        robot, [(side * angle, rate, between), (-side * angle, rate, robot.rest)])
 
 
 def can_follow(robot: RobotLimits, motion: Motion) -> bool:

@@ -11,31 +11,25 @@
 """
 One likelihood for linear regressions whose noise has several parts of unknown size.
 
-The model of ``n`` observations is::
+The model of ``n`` observations is ``observed = columns @ values + shared_columns @ u + e``:
 
-    observed = columns @ values + shared_columns @ u + e
-
-* ``values``, shape (m,), are estimated. Each has a flat prior, or a normal prior with a stated
-  mean and standard deviation.
-* ``e`` has the covariance ``sum(size_k**2 * banded_k)``; each ``banded_k`` is tridiagonal
-  (`BandedNoise`).
+* ``values``, shape (m,), are estimated, with a flat prior, or a normal one.
+* ``e`` has the covariance ``sum(size_k**2 * banded_k)`` of tridiagonal parts (`BandedNoise`).
 * ``u``, shape (q,), has independent elements with variances ``sum(size_j**2 * variance_j)``
-  (`SharedNoise`). It describes errors that many observations have in common: a bias that wanders
-  (`bias_wander_columns`), or the bias of one sweep of a rate table.
+  (`SharedNoise`): errors that many observations have in common, as of a wandering bias.
 
-The sizes are not known. For each point of a grid over them the restricted likelihood (REML:
-``values`` with a flat prior and ``u`` are integrated out) is computed, with ``V`` the covariance
-of ``e`` and ``P`` the prior precision of ``(values, u)``::
+For each point of a grid over the sizes the restricted likelihood (REML: ``values`` with a flat
+prior and ``u`` are integrated out) is computed, with ``V`` the covariance of ``e`` and ``P`` the
+prior precision of ``(values, u)``, of which ``|P|+`` is the product of those that are not zero::
 
     log L = -1/2 [log|V| + log|A| - log|P|+ + y'V⁻¹y - c'A⁻¹c],    A = X'V⁻¹X + P,    c = X'V⁻¹y
 
-where ``|P|+`` is the product of the precisions that are not zero. Estimates and their covariance
-are averaged over the grid, so that the intervals of the values include the uncertainty of the
-noise (law of total variance). The prior of each size is flat in its logarithm within the range
-given. The grid is refined three times around its likely points.
+Estimates and their covariance are averaged over the grid, so that intervals include the
+uncertainty of the noise. The prior of each size is flat in its logarithm within its range. The
+grid is refined three times around its likely points.
 
 Headings at points ``t_0 ... t_n`` become increments over the spans between them (`heading_noise`).
-A gap of the reference is a long span. The parts of the noise of such increments:
+The parts of the noise of such increments:
 
 =================  =========  ==================================================================
 name               unit       noise
@@ -60,8 +54,8 @@ determinant 1, likelihoods of different correlations can be compared (`carried_s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 import math
 
@@ -69,13 +63,7 @@ from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
-
-#: Points of the grid for each size, and passes: the first is over the whole range, each further
-#: one around the likely points.
-_GRID_POINTS, _GRID_PASSES = 5, 4
-#: Cosines that describe a wandering bias; faster changes are hardly distinguishable from white
-#: noise.
-_COSINE_COUNT = 24
+from scipy.special import logsumexp, softmax
 
 
 @dataclass(frozen=True)
@@ -84,9 +72,7 @@ class BandedNoise:
 
     name: str  # of the size
     diagonal: Array  # shape (n,)
-    # of each observation with the one before it, shape (n,); the first is not looked at. None
-    # where they are independent
-    off_diagonal: Array | None
+    off_diagonal: Array | None  # with the one before, (n,); None where independent
     # smallest and largest size that is possible; equal where the size is known
     size_range: tuple[float, float]  # noqa: A003
 
@@ -99,19 +85,12 @@ class SharedNoise:
     variance: Array  # shape (q,)
     # smallest and largest size that is possible; equal where the size is known
     size_range: tuple[float, float]  # noqa: A003
-    # variance that the observations have in common, so that it looks like one of the values, in
-    # units of size²
-    unobservable_variance: float = 0.0
+    unobservable_variance: float = 0.0  # that looks like one of the values, in size²
 
 
 @dataclass(frozen=True)
 class HierarchicalPrior:
-    """
-    A value whose normal prior has a standard deviation of unknown size.
-
-    A value that the data determine weakly is drawn towards the mean of its prior, a value that
-    they determine well is not.
-    """
+    """A value whose normal prior has a standard deviation of unknown size."""
 
     name: str  # of the size
     value_index: int  # number of the value
@@ -129,23 +108,12 @@ class GridFit:
     sizes: Mapping[str, tuple[float, float, float]]
     # the size of each part at the point of the grid with the largest likelihood, by name
     likeliest_sizes: Mapping[str, float]
-    # there, with the values of flat prior integrated out; for models with the same columns of flat
-    # prior
-    log_likelihood: float
-    # logarithm of the mean likelihood over the grid, to compare models with the same columns of
-    # flat prior
-    log_evidence: float
+    log_evidence: float  # of the mean likelihood over the grid
     # observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
     residual: Array
-    shared: Array  # estimates of u at the likeliest point, shape (q,)
-    # what the error of each observation adds to the values at the likeliest point, shape (n, m);
-    # sums over stretches of a log give a covariance that does not rely on the noise model
-    influence: Array
-    # variance that the shared noise has in common with one of the values, as it is
-    # `unobservable_variance`
-    unobservable_variance: float
+    unobservable_variance: float  # of the shared noise, that looks like one of the values
     _noise: TridiagonalMatrix
-    _carried: Array | None = None
+    _carried: Array | None
 
     @property
     def deviations(self) -> Array:
@@ -159,10 +127,6 @@ class GridFit:
     def whiten(self, columns: Array) -> Array:
         """Return columns, shape (n,) or (n, k), with independent banded noise of variance 1."""
         return self._noise.whiten(_quasi_differences(columns, self._carried))
-
-    def solve(self, columns: Array) -> Array:
-        """Return the inverse of the covariance of the likeliest banded noise, times columns."""
-        return self._noise.solve(columns)
 
 
 class TridiagonalMatrix:
@@ -256,28 +220,24 @@ def _quasi_differences(columns: Array, carried: Array | None) -> Array:
 
 def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
                         rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
-                        cosine_count: int = _COSINE_COUNT) -> tuple[Array, list[SharedNoise]]:
+                        cosine_count: int = 24) -> tuple[Array, list[SharedNoise]]:
     """
     Return the columns of a wandering bias in increments between points, and its noise parts.
 
     About its mean over the log a bias is the sum of ``u_j cos(ω_j (t - t_0))`` with ``ω_j = π j /
     T``. The variance of ``u_j`` is ``2 / T`` times the two-sided spectrum at ``ω_j``, ``B²/ω`` and
-    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. A bias among the
-    values of the regression is the mean over the log. How far that is from the bias where the log
-    began has the variance ``2/π B²`` and ``K² T / 3``, which is not observable in the log:
-    `fit_noise_grid` adds it to the variance of the value `wandering_value`.
+    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. How far that mean
+    is from the bias where the log began has the variance ``2/π B²`` and ``K² T / 3``, which the
+    log does not show: `fit_noise_grid` adds it to the variance of the value `wandering_value`.
 
     Parameters
     ----------
     time : of the points, s, shape (n + 1,)
-    bias_instability : range of B, rad/s, or None without flicker
-    rate_random_walk : range of K, rad/s/√s, or None without rate random walk
-    cosine_count : their number
+    bias_instability, rate_random_walk : ranges of B, rad/s, and K, rad/s/√s; None without it
 
     Returns
     -------
     columns, s, shape (n, q); and the parts of the noise
-
     """
     duration = float(time[-1] - time[0])
     omega = math.pi * np.arange(1, cosine_count + 1) / duration
@@ -331,11 +291,8 @@ class _Regression:
         """
         Solve for one banded noise, and k variances of the shared values.
 
-        Returns
-        -------
-        log likelihoods, shape (k,); values, shape (k, m + q); the first m columns of the inverse
-        normal matrices, shape (k, m + q, m)
-
+        Return log likelihoods, (k,), values, (k, m + q), and the first m columns of the inverse
+        normal matrices, (k, m + q, m).
         """
         weighted = covariance.solve(np.column_stack([self.columns, self.observed]))
         gram = self.columns.T @ weighted
@@ -362,34 +319,24 @@ class _Regression:
 def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise],
                    shared_columns: Array | None = None, shared: Sequence[SharedNoise] = (),
                    prior_mean: Array | None = None, prior_deviation: Array | None = None,
-                   noisy_column: int | None = None, wandering_value: int | None = None,
+                   wandering_value: int | None = None,
                    hierarchical_priors: Sequence[HierarchicalPrior] = (),
                    carried: Array | None = None) -> GridFit:
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
 
+    There must be more observations than values, or `ValueError` is raised.
+
     Parameters
     ----------
-    observed : shape (n,)
-    columns : of the values, shape (n, m)
+    observed, columns : shape (n,), and those of the values, shape (n, m)
     banded : parts of the noise; their sum must be positive definite
-    shared_columns : of the shared values, shape (n, q)
-    shared : parts of their variances
+    shared_columns, shared : of the shared values, shape (n, q), and parts of their variances
     prior_mean, prior_deviation : of the values, shape (m,); infinite deviation for a flat prior
-    noisy_column : number of a column that holds the increments of the reference, whose noise are
-        the parts 'reference' and 'motion'. Its estimate would be too small by the share of the
-        noise in it; it is estimated with the column smoothed by what is observed as the instrument
-        (errors in variables). None where no column is noisy
+    wandering_value : number of the value whose variance includes `unobservable_variance`
     hierarchical_priors : values with a prior of unknown size
-    wandering_value : number of the value whose variance holds what the shared noise has
-        `unobservable_variance`; None where there is none
     carried : share of the observation before that is subtracted from each, shape (n,); None where
         the errors of the observations are not autoregressive
-
-    Raises
-    ------
-    ValueError : there are not more observations than values
-
     """
     count = columns.shape[1]
     if len(observed) <= count:
@@ -401,39 +348,38 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     regression = _Regression(_quasi_differences(observed - columns @ mean, carried),
                              _quasi_differences(together, carried), count, precision, banded,
                              shared, hierarchical_priors)
-    axes = [np.array([low]) if low == high else np.geomspace(low, high, _GRID_POINTS)
+    axes = [np.array([low]) if low == high else np.geomspace(low, high, 5)
             for low, high in (part.size_range for part in regression.parts)]
-    for remaining in reversed(range(_GRID_PASSES)):
-        grid = _evaluate_grid(regression, axes)
-        weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
-        weights /= weights.sum()
+    for remaining in reversed(range(4)):
+        sizes, log_likelihoods, all_values, covariances = _evaluate_grid(regression, axes)
+        weights = softmax(log_likelihoods)
         if remaining:
-            axes = [_refine_axis(axis, grid.sizes[:, place], weights, part.size_range)
+            axes = [_refine_axis(axis, sizes[:, place], weights, part.size_range)
                     for place, (axis, part) in enumerate(zip(axes, regression.parts))]
-    unobservable_variance = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
+    unobservable = sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
         [part.unobservable_variance for part in shared])
     if wandering_value is not None:
-        grid.covariance[:, wandering_value, wandering_value] += unobservable_variance
-    return replace(_average_grid(regression, grid, weights, mean, noisy_column,
-                                 float(weights @ unobservable_variance)), _carried=carried)
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Sizes, shape (k, parts), log likelihoods, values, shape (k, m), and their covariances."""
-
-    sizes: Array
-    log_likelihood: Array
-    values: Array
-    covariance: Array
+        covariances[:, wandering_value, wandering_value] += unobservable
+    values, covariance = average_hypotheses(weights, all_values, covariances)
+    best = int(log_likelihoods.argmax())
+    noise = regression.banded_covariance(sizes[best, :len(banded)])
+    _, (likeliest,), _ = regression.solve(
+        noise, regression.prior_precisions(sizes[best: best + 1, len(banded):]))
+    names = [part.name for part in regression.parts]
+    return GridFit(values + mean, covariance,
+                   {name: _interval_95(each, weights) for name, each in zip(names, sizes.T)},
+                   dict(zip(names, sizes[best].tolist())),
+                   float(logsumexp(log_likelihoods)) - math.log(len(weights)),
+                   regression.observed - regression.columns @ likeliest,
+                   float(weights @ unobservable), noise, carried)
 
 
 def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
     """
     Return an axis where the sizes are likely, at least to the middle between old points.
 
-    Where they are likely at an end of the old axis, it goes on beyond that: the likeliest point of
-    a coarse grid is not always next to the likeliest size.
+    It may go on beyond an end of the old axis: the likeliest point of a coarse grid is not always
+    next to the likeliest size.
     """
     if len(axis) == 1:
         return axis
@@ -446,7 +392,8 @@ def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float,
     return np.exp(np.linspace(low, high, len(axis)))
 
 
-def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
+def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> Iterator[Array]:
+    """Give sizes, (k, parts), log likelihoods, (k,), values, (k, m), and their covariances."""
     banded, count = len(regression.banded), regression.value_count
     inner = np.array(list(product(*axes[banded:])))  # one empty row where nothing is shared
     precisions = regression.prior_precisions(inner)
@@ -456,36 +403,18 @@ def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
             regression.banded_covariance(sizes), precisions)
         found.append((np.column_stack([np.tile(sizes, (len(inner), 1)), inner]), log_likelihood,
                       values[:, :count], inverse[:, :count]))
-    return _Grid(*(np.concatenate(each) for each in zip(*found)))
+    return (np.concatenate(each) for each in zip(*found))
 
 
-def _average_grid(regression: _Regression, grid: _Grid, weights: Array, mean: Array,
-                  noisy_column: int | None, unobservable_variance: float) -> GridFit:
-    values = weights @ grid.values
-    deviations = grid.values - values
-    covariance = (np.tensordot(weights, grid.covariance, 1)
-                  + (deviations * weights[:, None]).T @ deviations)
-    best = int(grid.log_likelihood.argmax())
-    banded, count = len(regression.banded), regression.value_count
-    noise = regression.banded_covariance(grid.sizes[best, :banded])
-    precisions = regression.prior_precisions(grid.sizes[best: best + 1, banded:])
-    _, (all_values,), (inverse,) = regression.solve(noise, precisions)
-    names = [part.name for part in regression.parts]
-    likeliest_sizes = dict(zip(names, grid.sizes[best].tolist()))
-    if noisy_column is not None:
-        corrected = _errors_in_variables(regression, noise, precisions[0], likeliest_sizes,
-                                         all_values, mean, noisy_column)
-        values = values + (corrected - all_values)[:count]
-        all_values = corrected
-    residual = regression.observed - regression.columns @ all_values
-    of_values = regression.observed - regression.columns[:, :count] @ all_values[:count]
-    influence = noise.solve(regression.columns) @ inverse * of_values[:, None]
-    return GridFit(values + mean, covariance, {name: _interval_95(grid.sizes[:, place], weights)
-                                               for place, name in enumerate(names)},
-                   likeliest_sizes, float(grid.log_likelihood[best]),
-                   float(np.log(np.mean(np.exp(grid.log_likelihood - grid.log_likelihood[best])))
-                         + grid.log_likelihood[best]),
-                   residual, all_values[count:], influence, unobservable_variance, noise)
+def average_hypotheses(weights: Array, values: Array, covariances: Array) -> tuple[Array, Array]:
+    """
+    Return mean and covariance of values that hold with some probability, by total variance.
+
+    The shapes are (k,), (k, m) and (k, m, m).
+    """
+    mean = weights @ values
+    apart = values - mean
+    return mean, np.tensordot(weights, covariances, 1) + (apart * weights[:, None]).T @ apart
 
 
 def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:
@@ -494,29 +423,3 @@ def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:
     below = np.cumsum(weights[order]) - 0.5 * weights[order]
     low, high = np.interp([0.025, 0.975], below, np.log(sizes[order]))
     return math.exp(float(weights @ np.log(sizes))), math.exp(low), math.exp(high)
-
-
-def _errors_in_variables(regression: _Regression, noise: TridiagonalMatrix, precision: Array,
-                         likeliest_sizes: Mapping[str, float], values: Array, mean: Array,
-                         column_index: int) -> Array:
-    """Return the values with a noisy column smoothed by what is observed as the instrument."""
-    parts = [(likeliest_sizes[part.name] ** 2, part)
-             for part in regression.banded if part.name in ('reference', 'motion')]
-    for _ in range(3):
-        scale = values[column_index] + mean[column_index]
-        solved = noise.solve(regression.observed - regression.columns @ values)
-        error = np.zeros(len(solved))
-        for variance, part in parts:
-            error += variance * part.diagonal * solved
-            if part.off_diagonal is not None:
-                error[1:] += variance * part.off_diagonal[1:] * solved[:-1]
-                error[:-1] += variance * part.off_diagonal[1:] * solved[1:]
-        instrument = regression.columns.copy()
-        instrument[:, column_index] += error / math.copysign(max(abs(scale), 1e-3), scale)
-        weighted = noise.solve(instrument)
-        normal = weighted.T @ regression.columns + np.diag(precision)
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(normal)), 1e-300))
-        values = sizes * np.linalg.lstsq(normal * np.outer(sizes, sizes),
-                                         sizes * (weighted.T @ regression.observed),
-                                         rcond=1e-13)[0]
-    return values

@@ -10,8 +10,6 @@
 
 """The instants at which a reference that is slower than the gyro has values of its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,9 +25,7 @@ _LONGEST_INTERVAL = 1.0
 MAX_GYRO_LAG = 0.1
 #: Step of a heading from which on it is that of an encoder, whose changes are exact, rad.
 MAX_ROUNDING_STEP = 2e-4
-#: Largest change of the slope on a straight line as a share of the usual slope, and least number
-#: of instants.
-_MAX_SLOPE_CHANGE, _MIN_INSTANTS = 1e-3, 20
+_MIN_INSTANTS = 20
 
 
 class OwnInstants(NamedTuple):
@@ -47,12 +43,8 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     Return where a slow reference has its own values, or None if it has one in each sample.
 
     Values that are held change in single samples. Straight lines between values meet at corners,
-    which may lie between two samples. Both must come at even intervals.
-
-    Parameters
-    ----------
-    time, values : of the samples, s, and rad or rad/s without nan, shape (n,)
-
+    which may lie between two samples. Both must come at even intervals. Times, s, and values have
+    shape (n,), without nan.
     """
     step, sample = quantization_step(values), float(np.median(np.diff(time)))
     change = np.diff(values)
@@ -87,11 +79,7 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
 
 
 def _even_interval(gaps: Array, sample: float, are_all_shown: bool = False) -> float | None:
-    """
-    Return the usual interval of instants, s, some of which may be hidden; None if uneven.
-
-    In a motion that is calculated, of steady rates and ramps, only every second gap is the usual.
-    """
+    """Return the usual interval of instants, s, some of which may be hidden; None if uneven."""
     if len(gaps) < _MIN_INSTANTS or np.quantile(gaps, 0.1) < 1.5 * sample:
         return None
     usual = float(np.median(gaps))
@@ -108,7 +96,7 @@ def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array
     slope = np.diff(values) / np.diff(time)
     usual = float(np.mean(np.abs(slope)))
     rounding = 2.0 * step / float(np.diff(time).min()) if step < MAX_ROUNDING_STEP else 0.0
-    runs = find_runs(np.abs(np.diff(slope)) <= max(_MAX_SLOPE_CHANGE * usual, rounding))
+    runs = find_runs(np.abs(np.diff(slope)) <= max(1e-3 * usual, rounding))
     first, last = np.array([(run.start, run.stop + 1) for run in runs],
                            dtype=np.intp).reshape(-1, 2).T
     # two corners within two samples each leave one interval in between on a line of its own
@@ -128,14 +116,9 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     """
     Return a log whose reference is known at its own instants alone, and these.
 
-    It is nan in between. Where instants lie between samples, the samples next to them get the
-    values of a cubic spline. A rate that is held as a command is not slow.
-
-    Returns
-    -------
-    the log; the instants next to its samples, (n,), and their values, or None if no reference is
-    slow
-
+    Where instants lie between samples, the samples next to them get the values of a cubic spline.
+    A rate that is held as a command is not slow. The instants next to samples have shape (n,),
+    with nan; None if no reference is slow.
     """
     kept = None
     for name in ('reference_rate', 'reference_heading'):
@@ -174,12 +157,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
 
 
 def output_delay(log: Log, rate: Array) -> float:
-    """
-    Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s.
-
-    A robot is later than its command, and a rate that was measured and is held is later than the
-    motion, by half of the time that it is held.
-    """
+    """Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s."""
     assert log.time is not None and log.output is not None
     known, output = np.isfinite(rate), bridge_gaps(log.output)
     sample = float(np.median(np.diff(log.time)))

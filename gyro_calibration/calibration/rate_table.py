@@ -11,10 +11,10 @@
 """
 From dwells to a gyro's model: values of effects, covariance, and errors of left-out sweeps.
 
-The errors are also those of full turns of 360 degrees (Ojeda et al., section 4): an error of the
-rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion to the duration
-of the turn. Two errors are compared: with the bias of a rest before the mission only, and with a
-model and then the bias that remains at rest. Dwells that allow no answer raise `DataRefused`.
+The errors are also those of full turns of 360 degrees (Ojeda et al., section 4), of the heading in
+each turn, rad, in proportion to its duration: with the bias of a rest before the mission only, and
+with a model and then the bias that remains at rest. Dwells that allow no answer raise
+`DataRefused`.
 """
 
 from __future__ import annotations
@@ -44,8 +44,6 @@ _MAX_CONDITION_NUMBER = 1e3
 CONFOUNDERS = {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}
 #: rad/s; the error of slower turns is mostly bias, not scale; as published.
 MIN_TURN_RATE = 5.0 * DEGREE
-#: A dwell that turns slower than this is a rest.
-_MAX_REST_RATE = 0.1 * DEGREE
 
 
 class _ColumnTest(NamedTuple):
@@ -62,13 +60,11 @@ class Calibration:
 
     terms: tuple[Term, ...]  # effects with their values
     dwells: Dwells  # all of them
-    # the model that is corrected; an ideal gyro where there is none. Its effects that are not
-    # fitted count as known
-    given: GyroModel
+    given: GyroModel  # that is corrected; its effects that are not fitted count as known
     scatter: Scatter  # of the dwells, and which were fitted
     residual: Array  # error of each dwell that the effects do not explain, rad/s, shape (n,)
-    # the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying dwells,
-    # infinite where the other sweeps do not determine it
+    # of a fit without the dwell's sweep, rad/s, (n,); nan at outlying dwells, infinite where the
+    # other sweeps do not determine it
     left_out_residual: Array
     deviation: Array  # standard deviation of each dwell, rad/s, shape (n,)
     condition_number: float  # number of the columns, each of length one
@@ -97,11 +93,10 @@ class Calibration:
         residual = self.residual[self.scatter.inliers]
         if model.uses_channel('output'):
             # The polynomial depends on the output. With the measured one in the columns, a scale
-            # factor error of -1 would make every residual zero for any error of sweeps, and the
-            # likelihood would prefer a large scatter of their scale: the Jacobian of output
-            # against error is missing there. Columns and residual are therefore those of the
-            # output that the model expects: its change is that of the error over 1 - g, with g
-            # the slope of the error over the output.
+            # factor error of -1 would make every residual zero: the Jacobian of output against
+            # error is missing there. Columns and residual are those of the output that the model
+            # expects: its change is that of the error over 1 - g, with g the slope of the error
+            # over the output.
             expected, step = model.output_from_channels(channels), 1e-5
             below, here, above = (channels.with_rate(channels.rate, expected + change)
                                   for change in (-step, 0.0, step))
@@ -168,9 +163,9 @@ class Calibration:
         """
         Test whether columns explain the errors of the fitted dwells, given other columns.
 
-        It is an F test, averaged over what the scatter may be, in addition to the uncertainty of
-        the given model. The columns, (n, m), those of other fitted values, (n, k), and an error in
-        addition to the residual, rad/s, (n,), are given.
+        It is an F test, averaged over what the scatter may be, beside the uncertainty of the given
+        model. Given are the columns, (n, m), those of other fitted values, (n, k), and an error in
+        addition to the residual, rad/s, (n,).
         """
         known_basis, white, new = self._whiten_beside(known, unexplained, columns)
         # a sine may have its zeros at the rates of all dwells
@@ -212,11 +207,7 @@ class Calibration:
 
     @cached_property
     def given_errors(self) -> Array:
-        """
-        Return what independent errors of the given model's values do to the fitted dwells, rad/s.
-
-        Each is one standard deviation; shape (n, k), where k is 0 if they are unknown.
-        """
+        """Return the errors of fitted dwells by independent ones of the given model, rad/s."""
         known, covariance = static_terms(self.given), self.given.covariance
         if covariance is None:
             return np.empty((len(self.used), 0))
@@ -259,11 +250,7 @@ class Calibration:
 
     @property
     def left_out_rate(self) -> Array:
-        """
-        Return the rate of each dwell by a fit without its sweep, rad/s, shape (n,).
-
-        It is not finite at outlying dwells and where the other sweeps do not determine the model.
-        """
+        """Return the rate of each dwell by a fit without its sweep, rad/s, shape (n,)."""
         slope = GyroModel(self.terms).output_slope(channels_of(self.dwells))
         return np.asarray(self.dwells.rate + self.left_out_residual / slope)
 
@@ -306,17 +293,11 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     """
     Fit effects to dwells by generalised least squares, solved by QR.
 
-    Effects of the rate are evaluated at the reference rate. The polynomial of Ojeda et al. (eq. 9
-    to 12) is evaluated at the output, whose noise is small where it is an average. A shape is
-    found by Gauss-Newton steps from the best of a grid over its bounds. Dwells in which effects
-    look alike are refused.
-
-    Parameters
-    ----------
-    effects : each once
-    scatter : of the dwells, if it is known already
-    given : model that is corrected: its effects are known, unless they, or their confounders, are
-        among the fitted ones. Temperatures count from its reference temperature, or the mean
+    Effects of the rate are evaluated at the reference rate, the polynomial of Ojeda et al. (eq. 9
+    to 12) at the output, whose noise is small where it is an average. A shape is found by
+    Gauss-Newton steps from the best of a grid over its bounds. Dwells in which effects look alike
+    are refused. Of a given model that is corrected, effects are known unless they, or their
+    confounders, are among the fitted ones, and temperatures count from its reference temperature.
     """
     _refuse_unobservable(dwells, effects)
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
@@ -446,8 +427,8 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
     """
     Return each dwell's residual of a fit without its part: the deleted residuals.
 
-    They are those of a fit with an error of its own for each dwell of the part. Where the part is
-    not a whole sweep, the others of its sweep show the bias and scale that they share.
+    Where the part is not a whole sweep, the others of its sweep show the bias and scale they
+    share.
     """
     left_out = np.full(len(whitened), math.inf)
     for part in range(parts.max() + 1):
@@ -461,8 +442,6 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
             left_out[rows] = np.linalg.solve(remaining_gram, own.T @ whitened[sweep]) / lengths
     return left_out
 
-
-# refusals
 
 def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
     thermal = [effect.name for effect in effects if 'temperature' in effect.inputs]
@@ -478,19 +457,15 @@ def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
             f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature')
 
 
-# bins of errors
-
 @dataclass(frozen=True)
 class _Bin:
     """Dwells of nearly one rate, or nearly one temperature."""
 
-    # low, high: ends of the bin, in the unit of what was binned
-    low: float
+    low: float  # in the unit of what was binned
     high: float
     count: int  # of dwells
-    # uncorrected, residual: mean error without the model and with it, rad/s
-    uncorrected: float
-    residual: float
+    uncorrected: float  # mean error without the model, rad/s
+    residual: float  # and with it
     deviation: float  # standard deviation of the mean residual, rad/s
     rms: float  # of the residual, rad/s
 
@@ -534,8 +509,8 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     """
     Return the errors of full turns at the rates and temperatures of dwells that are not outlying.
 
-    The rates by the model, rad/s, shape (n,), as in `Calibration.left_out_rate`, are not finite
-    where there is none. A turn is faster than `min_rate`, rad/s.
+    The rates by the model, rad/s, shape (n,), are as `Calibration.left_out_rate`. A turn is faster
+    than `min_rate`, rad/s.
     """
     known = np.isfinite(rate)
     wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded
@@ -579,7 +554,7 @@ def _find_rests(dwells: Dwells) -> tuple[dict[int, tuple[Numbers, Array]], str]:
     sweeps = np.unique(dwells.sweep).tolist()
     for number in sweeps:
         rows = np.flatnonzero(dwells.sweep == number)
-        rests = rows[speed[rows] <= _MAX_REST_RATE]
+        rests = rows[speed[rows] <= 0.1 * DEGREE]
         if len(rests):
             at_rest[number] = rests, np.full(len(rests), 1.0 / len(rests))
         ways = [rows[way * dwells.rate[rows] > 0.0] for way in (1.0, -1.0)]

@@ -10,8 +10,6 @@
 
 """The errors of a reference: noise beside that of the gyro, steps, and whether it is a course."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 
@@ -29,36 +27,12 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 
-#: Span over which the errors of gyro and reference are compared, s.
-_COMPARISON_SPAN = 1.0
-#: Delays of the gyro behind a reference that are tried, and those around the best, s; and the
-#: rows that are compared.
-_TRIAL_DELAYS, _FINE_DELAYS = (0.1 * np.arange(-15.0, 16.0)).tolist(), 0.01 * np.arange(-9.0, 10.0)
-_TRIAL_ROWS = 5000
-#: Largest error of an exact reference heading as a share of the difference of the headings over a
-#: second: a fifth of its variance.
-_MAX_HEADING_ERROR_SHARE = 0.25
-#: Noise of a reference rate that is not white is detected from so many standard deviations on, in
-#: this quietest share of the log, in blocks of so many samples.
-_DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
-#: Number of spans of a log whose scatter is estimated: to 4 %.
-_USUAL_SPANS = 500
-#: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
-#: the errors of an encoder are at most so many times its rounding error.
-_MIN_LOST_SHARE, MAX_ROUNDING_RATIO = 0.003, 1.5
-#: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
-#: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
-#: fixes; simulated odometry with noise up to 0.02 deg: up to 5).
-_COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
-#: Least noise of a course, rad, over a second or from span to span; by RTK fixes of a car in town
-#: it is 0.4 deg, and a motion capture with short gaps has less.
+#: Samples of a block.
+_BLOCK_SAMPLES = 25
+#: The errors of an encoder are at most so many times its rounding error.
+MAX_ROUNDING_RATIO = 1.5
+#: Least noise of a course, rad, over a second or from span to span; RTK in town has 0.4 deg.
 MIN_COURSE_NOISE = 0.25 * DEGREE
-#: Time for which a recorder misses a reference that is not lost, as it does not begin, nor end, to
-#: receive all topics at once, s; or five intervals of the reference, as for gaps of a recording.
-_MAX_LATE_START = 0.1
-#: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
-#: straight between fixes.
-_MAX_STRAIGHT_RATIO = 0.1
 
 
 def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np.intp], Mask]:
@@ -71,8 +45,8 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
     scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    # of the quietest rest, as of filtered noise single seconds are far quieter by chance; where
-    # steps hide the noise, a rest does not show the bias
+    # of filtered noise single seconds are quieter by chance; where steps hide the noise, a rest
+    # does not show the bias
     quietest = (maximum_filter1d(scatter, 3)[1:-1].min(initial=math.inf) if scatter.all()
                 else 0.0)
     is_quiet = scatter <= 2.0 * quietest + 1e-12
@@ -92,18 +66,13 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
 
 
 def step_evenness(log: Log, step: float) -> float:
-    """
-    Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
-
-    Rounding errors are independent from sample to sample if the rate varies. At a constant rate
-    they are a sawtooth, which passes for tones, and at rest they are constant.
-    """
+    """Return how evenly a shaft moves through its steps, 0 to 1: then errors pass for tones."""
     assert log.time is not None and log.output is not None
     interval = float(np.median(np.diff(log.time)))
     # means over a fifth of a second, as the noise of single samples is too large
     rate = uniform_filter1d(bridge_gaps(log.output),
-                            max(round(0.2 * _COMPARISON_SPAN / interval), 5))
-    count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
+                            max(round(0.2 / interval), 5))
+    count = max(round(2.0 / interval), _BLOCK_SAMPLES)
     blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
     if not len(blocks):
         return 1.0
@@ -114,17 +83,15 @@ def step_evenness(log: Log, step: float) -> float:
 class HeadingDifference:
     """Difference of the headings of gyro and reference over a second."""
 
-    # standard deviation of the part that does not grow with time, rad: errors of the reference, of
-    # stamps, or by vibration of the gyro
-    constant_error: float
+    constant_error: float  # of the part that does not grow with time, rad
     # angle random walk that is equivalent to the whole difference in a second, rad/√s
     total_walk: float
 
     @property
     def is_significant(self) -> bool:
         """Tell whether the error is a significant part of the difference over a second."""
-        # a simulated log without noise has numerical errors of 1e-9 rad
-        return self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk, 1e-9)
+        # a fifth of the variance; a simulated log without noise has numerical errors of 1e-9 rad
+        return self.constant_error > max(0.25 * self.total_walk, 1e-9)
 
 
 def heading_difference(log: Log) -> HeadingDifference:
@@ -132,8 +99,8 @@ def heading_difference(log: Log) -> HeadingDifference:
     Separate the difference of the headings of gyro and reference by its growth over time.
 
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    a lag, a scale factor and a misalignment of the axis are fitted, the delay to second order from
-    the best of some. An error that was smoothed shows at lags beyond its time constant.
+    to second order from the best of some, a lag, a scale factor and a misalignment are fitted. An
+    error that was smoothed shows at lags beyond its time constant.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     stamps, output = log.time, bridge_gaps(log.output)
@@ -147,7 +114,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     # a slow reference has its values at the samples next to its own instants
     apart = np.diff(time)
     interval = float(apart[apart < 2.0 * np.median(apart)].mean())
-    longest = max(round(_COMPARISON_SPAN / interval), 4)
+    longest = max(round(1.0 / interval), 4)
 
     def find_variance(lag: int, delay: float, every: int = 1) -> float:
         """Return the variance of second differences, rad²; nan where too few are known."""
@@ -171,11 +138,12 @@ def heading_difference(log: Log) -> HeadingDifference:
                    - by_output, 0.0)
 
     # a delay that explains less than half is chance
-    usual, delay, every = find_variance(longest, 0.0), 0.0, max(len(time) // _TRIAL_ROWS, 1)
+    usual, delay, every = find_variance(longest, 0.0), 0.0, max(len(time) // 5000, 1)
+    coarse = (0.1 * np.arange(-15.0, 16.0)).tolist()
     if tried := [each for each in ((find_variance(longest, trial, every), trial)
-                                   for trial in _TRIAL_DELAYS) if each[0] < 0.5 * usual]:
+                                   for trial in coarse) if each[0] < 0.5 * usual]:
         delay = min((find_variance(longest, near, every), near)
-                    for near in (min(tried)[1] + _FINE_DELAYS).tolist())[1]
+                    for near in (min(tried)[1] + 0.01 * np.arange(-9.0, 10.0)).tolist())[1]
     variance = {lag / longest: find_variance(lag, delay) for lag in (
         *(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest)}
     variance = {part: each for part, each in variance.items() if not math.isnan(each)}
@@ -220,10 +188,10 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
         blocks = len(every) // block
         energies = np.sum(every[:blocks * block].reshape(blocks, block) ** 2, axis=1)
-        # selected by the blocks on both sides, as a block that is quiet itself may be so by
-        # chance; one with far more energy than these is a motion between two rests
+        # by the blocks on both sides, as one may be quiet by chance; one with far more energy than
+        # these is a motion between two rests
         sides = np.maximum(np.roll(energies, 1), np.roll(energies, -1))
-        most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
+        most = np.quantile(sides, min(max(0.03, 8.0 / blocks), 1.0))
         quiet = np.repeat((sides <= most) & (energies <= 3.0 * most), block)
         part = every[:len(quiet)][quiet]
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
@@ -241,18 +209,14 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
         # third differences of white noise are correlated over three samples
         deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
         variance = float(np.mean(product)) / line[0]
-        if not variance > _DETECTION_SIGMAS * deviation:
+        if not variance > 3.0 * deviation:
             return 0.0
     gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
 
 
 def is_course(log: Log) -> bool:
-    """
-    Tell whether a heading is lost at times, as a course at low speed, and errs like one.
-
-    A direction of travel has no rotation about other axes, so an attitude is none.
-    """
+    """Tell whether a heading that is no attitude is lost at times and errs like a course."""
     log, _ = keep_own_instants(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
@@ -262,17 +226,17 @@ def is_course(log: Log) -> bool:
         return False
     stamps, (first, last) = log.time[rows], rows[[0, -1]]
     at_ends = max(stamps[0] - log.time[0], log.time[-1] - stamps[-1])
-    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), _MAX_LATE_START)
+    # a recorder does not begin, nor end, to receive all topics at once
+    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), 0.1)
             and not find_lost_reference(known[first:last + 1]).any()):
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
-    # a heading between slower fixes lies on straight lines
+    # least ratio to the noise of the gyro: measured are 4.6 to 920, below 8 only where a heading
+    # between slower fixes is on straight lines, and up to 5 for odometry
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > _MIN_LOST_SHARE
-              else _COURSE_NOISE_RATIO)
-    # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
-    # the variance
+    larger = 2.0 if usual < 0.1 * large and lost > 0.003 else 8.0
+    # an encoder errs by its rounding; a difference over a second has 3 times the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
     return heading_difference(log).total_walk > max(larger * walk, MAX_ROUNDING_RATIO * rounding,
                                                     MIN_COURSE_NOISE)
@@ -282,11 +246,10 @@ def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> 
     """
     Return the usual bend and change of a heading difference over a span, rad, shape (2,).
 
-    They are the standard deviations of its second difference over halves of the span, which is
-    that of the end of a random walk, and of its change beyond the bias, by their medians; 0 where
-    no span is known.
+    By medians, they are the standard deviations of its second difference over halves of the span,
+    as of the end of a random walk, and of its change beyond the bias; 0 where no span is known.
     """
-    starts = np.linspace(time[0], time[-1] - span, _USUAL_SPANS)
+    starts = np.linspace(time[0], time[-1] - span, 500)
     first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
                            for share in (0.0, 0.5, 1.0))
     changes = np.array([first - 2.0 * middle + last, last - first - bias * span])
@@ -304,7 +267,7 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     1 %), and the error of the reference and its step; or where it changes beyond its usual bias by
     that. The reference must then jump rather by what the gyro turned than not at all: a bias may
     drift in a rest. The random walk is that of the difference to the reference elsewhere, or the
-    scatter of that difference over as long a time, if it is larger, as that of a wandering bias.
+    scatter of that difference over as long a time, if it is larger.
     """
     heading = log.reference_heading
     known = np.flatnonzero(np.isfinite([] if heading is None else heading))

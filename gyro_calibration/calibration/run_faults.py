@@ -15,8 +15,6 @@ The fault is the motion that explains the run best: the profile with one deviati
 faster or slower, at limited rates, begun late, or ended early.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
@@ -29,9 +27,8 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-#: Minimum length of the pieces in which motions are compared, and step of the tried starts, ends
-#: and offsets, s; largest number of pieces: the time of the search is proportional to its cube.
-_TRIAL_STEP, _MAX_PIECES = 0.1, 650
+#: Shortest pieces in which motions are compared, and step of the tried offsets, s.
+_TRIAL_STEP = 0.1
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
 MAX_UNEXPLAINED_SHARE = 0.1
 #: Factor by which a motion with a deviating stretch must leave less than one without.
@@ -69,11 +66,7 @@ UNIT_TOLERANCE = 1.1
 
 
 def refuse_unit_error(scale: float, reference: str) -> None:
-    """
-    Raise `DataRefused` for a scale, reported over true rate, that a confused unit explains.
-
-    The name of the reference is given if its unit may be the wrong one; else ''.
-    """
+    """Refuse a scale, reported over true rate, that a confused unit explains."""
     size = max(abs(scale), 1e-300)
     found = [factor for factor in _UNIT_CONFUSIONS
              if 1.0 / UNIT_TOLERANCE < size / factor < UNIT_TOLERANCE]
@@ -118,18 +111,14 @@ class RunPieces:
 def split_run(time: Array, rate: Array) -> RunPieces:
     """Return a run in pieces."""
     length = max(_TRIAL_STEP, 2.0 * float(np.median(np.diff(time))),
-                 float(time[-1] - time[0]) / _MAX_PIECES)
+                 float(time[-1] - time[0]) / 650)  # the time is proportional to the cube of this
     edges = np.arange(time[0], time[-1], length)
     return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
 
 
 def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
                         slip: str = '') -> None:
-    """
-    Raise `DataRefused` for a run that another motion explains far better than its profile.
-
-    `slip` is a message on a slip, where one is known better than the pieces show it.
-    """
+    """Refuse a run that another motion explains far better; `slip` is a message on a slip."""
     trials = [(unexplained, unexplained, message) for unexplained, message
               in _try_motions(run, motion, largest_offset)]
     # a stretch of another turn

@@ -14,10 +14,8 @@ The scatter of dwells about a gyro's effects, and the uncertainty of the effects
 The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
 that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
 that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
-dwells of one sweep do not count as thirty independent ones.
-
-The sizes are estimated about a smooth surface over rate and temperature, before any effect is
-fitted. About too few effects, they would include the error of a missing effect.
+dwells of one sweep do not count as thirty independent ones: about a smooth surface over rate and
+temperature, as about too few effects they would include the error of a missing effect.
 
 The covariance of the values states how well the dwells determine them, if the model is complete
 and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
@@ -40,29 +38,24 @@ from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_
 from gyro_calibration.logs.quality import robust_deviation
 from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 from scipy.optimize import minimize
+from scipy.special import softmax
 from scipy.stats import t as student
 
 #: With fewer, the others do not determine a model without one of them.
 MIN_SWEEPS = 4
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _MIN_DWELLS = 12
-#: Standard deviations between gyros, by data sheets: the change of the bias with temperature,
-#: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
-#: the nonlinearity at the fastest rate that is not fitted, 1 (L3G4200D: 0.2 %).
+#: Standard deviations between gyros (L3G4200D): of the bias, rad/s/K, the scale factor, 1/K, and
+#: the nonlinearity at the fastest rate, 1.
 BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, _NONLINEARITY_DEVIATION = (
     Prior().coefficient, 3e-4, 2e-3)
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """
-    Standard deviations of dwells about a smooth surface over rate and temperature.
-
-    The surface is as smooth as the number of dwells allows. The scatter does not depend on the
-    effects that are fitted: one found with too few of them would include what they leave.
-    """
+    """Standard deviations of dwells about a smooth surface over rate and temperature."""
 
     dwell_bias: float  # of a dwell, beyond its own deviation, rad/s
     # of the scale factor from dwell to dwell, 1, such as that of a table's speed
@@ -72,11 +65,7 @@ class Scatter:
     inliers: Mask  # which dwells are not outlying, shape (n,)
 
     def deviation(self, dwells: Dwells) -> Array:
-        """
-        Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,).
-
-        A deviation of its own that is not known is the rms of the others.
-        """
+        """Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,)."""
         known = np.isfinite(dwells.deviation)
         typical = rms(dwells.deviation[known]) if known.any() else 0.0
         return np.sqrt(np.where(known, dwells.deviation, typical) ** 2 + self.dwell_bias ** 2
@@ -105,9 +94,8 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
-    It is the sweep, since errors that its dwells have in common do not predict other sweeps. Fewer
-    than four sweeps do not determine a model without one of them, nor do two temperatures the
-    slope between them: then parts are about 60 blocks of time within sweeps, or the dwells.
+    It is the sweep, since errors that its dwells have in common do not predict other sweeps. With
+    fewer than `MIN_SWEEPS`, parts are about 60 blocks of time within sweeps, or the dwells.
     """
     sweeps, count = _sweep_numbers(dwells), min(len(dwells), 60)
     if sweeps.max() + 1 >= MIN_SWEEPS:
@@ -160,19 +148,15 @@ class Whitener:
         return values
 
 
-# its size
-
 def estimate_scatter(dwells: Dwells) -> Scatter:
     """Return how dwells scatter, by restricted likelihood, and which of them are outlying."""
     kept = find_inliers(dwells)
     used = select_dwells(dwells, kept)
     error, surface = used.output - used.rate, _smooth_surface(used)
-    # The likelihood does not depend on the part that the surface explains; without its removal,
-    # small errors would be lost in rounding.
+    # without the removal of what the surface explains, small errors would be lost in rounding
     error = error - surface @ (surface.T @ error)
     fastest = max(float(np.abs(used.rate).max()), 1e-9)
-    # of exact values above their rounding, or what is rounded would be explained, and the Gram
-    # matrix of a dwell that is exact beside others would be singular
+    # above rounding, or that would be explained and the Gram matrix of exact dwells singular
     size = (rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1))
             + 1e-12 * fastest + 1e-3 * float(np.nan_to_num(used.deviation).max(initial=0.0)))
     relative = size / fastest
@@ -209,15 +193,14 @@ def find_inliers(dwells: Dwells) -> Mask:
     Return which dwells are not outlying, by a robust fit of the surface.
 
     Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
-    dwells of a sweep whose scale differs are not outlying. Nor is what the deviation of a dwell of
-    its own explains, such as that by the steps of the output where rests are all on one step.
+    dwells of a sweep whose scale differs are not outlying.
     """
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
         parts = _sweep_numbers(dwells)
         own = (parts[:, None] == np.arange(parts.max() + 1)).astype(float)
         turning = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
-        extended = _orthonormal_basis(np.column_stack([columns, own, own * turning[:, None]]))
+        extended = orth(np.column_stack([columns, own, own * turning[:, None]]), 1e-4)
         if 2 * extended.shape[1] <= len(dwells):
             columns = extended
     residual = np.abs(robust_residual(columns, dwells.output - dwells.rate, 20))
@@ -241,13 +224,7 @@ def _smooth_surface(dwells: Dwells) -> Array:
     products = [rate ** i * temperature ** j for i, j in powers]
     columns = np.column_stack([*products[:4], np.abs(rate),
                                *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
-    return _orthonormal_basis(columns)
-
-
-def _orthonormal_basis(columns: Array) -> Array:
-    """Return orthonormal columns that span others, shape (n, m)."""
-    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, sizes > 1e-4 * sizes[0]]
+    return np.asarray(orth(columns, 1e-4))
 
 
 def surface_dof(dwells: Dwells) -> int:
@@ -260,9 +237,9 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     """
     Fit columns (n, m) to an error (n,) for each of k scatters of sweeps' bias and scale, (k, 2).
 
-    Returned are the logarithm of the determinants of the covariance, in that of the dwells, and of
-    the Gram matrix, (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and
-    the inverse of the Gram matrix of the whitened columns, (k, m, m).
+    Return the logarithm of the determinants of covariance, in that of the dwells, and Gram matrix,
+    (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and the inverse of
+    the Gram matrix of the whitened columns, (k, m, m).
     """
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
@@ -281,23 +258,18 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
             values, inverse)
 
 
-# uncertainty of the values
-
 @dataclass(frozen=True)
 class Uncertainty:
     """
     The uncertainty of values fitted to dwells.
 
-    Few dwells and few sweeps do not determine how large the scatter is. So the distribution of the
+    Few dwells and few sweeps do not determine how large the scatter is, so the distribution of the
     values is averaged over possible scatters, weighted by their restricted likelihood: that of the
     dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
     uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
     its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
-    sweeps alone are then those of Student's distribution with as many degrees of freedom as there
-    are sweeps more than values. That sweeps do not differ has the weight of a factor of e in that
-    variance: without it, the intervals of sweeps that do not differ would be too wide. The maximum
-    of the likelihood alone would be at zero in about half of the cases, and its intervals would be
-    too narrow.
+    sweeps alone are then those of Student's distribution. That sweeps do not differ has the weight
+    of a factor of e in that variance, without which their intervals would be too wide.
     """
 
     weights: Array  # of possible scatters, shape (k,)
@@ -314,8 +286,7 @@ class Uncertainty:
         """
         Average over the possible scatters of dwells, of which there are more than values.
 
-        The columns are the change of the error for each value, shape (n, m), and the error is the
-        residual of the fitted values, rad/s, shape (n,).
+        Given are the change of the error for each value, (n, m), and the residual, rad/s, (n,).
         """
         lengths, deviation = np.linalg.norm(columns, axis=0), scatter.deviation(dwells)
         dof, likeliest = len(dwells) - len(lengths), (scatter.sweep_bias, scatter.sweep_scale)
@@ -340,7 +311,7 @@ class Uncertainty:
         log_determinant, misfit, offsets, inverses = (np.concatenate(each) for each in zip(*(
             _fit_values(dwells, deviation, columns / lengths, error, each) for each in sizes)))
         logarithm = -0.5 * (log_determinant + dof * np.log(misfit))
-        weights = np.exp(logarithm - logarithm.max()) * np.outer(*priors).ravel()
+        weights = softmax(logarithm) * np.outer(*priors).ravel()
         likely = weights > 1e-4 * weights.sum()
         weights = weights[likely] / weights[likely].sum()
         size = misfit[likely] / dof
@@ -388,19 +359,16 @@ class Uncertainty:
         return covariance * np.outer(widening, widening)
 
 
-# errors in another run
-
 def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
                        columns: Callable[[Array, Array], Array], covariance: Array) -> Tolerance:
     """
     Return the error of a rate that the covariance of the values, (m, m), does not contain.
 
     Effects that were not fitted may exist below the noise: a fit with more columns has a larger
-    variance than that of the values. Its mean over the fitted dwells is added to the variance of
-    the bias; its value half a width outside of the calibrated range gives the slopes. Given are
-    the scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,), and a
-    function of rates, rad/s, and temperatures, degC: the change of the output for each value,
-    (n, m).
+    variance. Its mean over the fitted dwells is added to the variance of the bias; its value half
+    a width outside of the calibrated range gives the slopes. Given are the scatter of bias and
+    scale factor from sweep to sweep, rad/s and 1, (2,), and a function of rates, rad/s, and
+    temperatures, degC: the change of the output for each value, (n, m).
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = (np.zeros(len(dwells)) if dwells.temperature is None

@@ -18,8 +18,6 @@ tried. Sine response and cubic nonlinearity explain nearly the same; where the d
 distinguish them, the one by the physics of the instrument is taken, if the instrument is known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
@@ -35,11 +33,9 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
-#: Probability of taking an effect that is not there, in one calibration, and of an alarm in a
-#: fleet without outliers, changes and missing effects.
+#: Probability of taking an effect that is not there, and of a false alarm in a fleet.
 FALSE_ALARM_RATE = 0.01
-#: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
-#: one of thirty thousand calibrations.
+#: Standard deviations from which on two causes are distinguished.
 MIN_DISTINGUISHING_SIGMAS = 4.0
 #: Technology -> which of sine response and cubic nonlinearity its physics causes.
 TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
@@ -56,10 +52,9 @@ class _EffectChoice:
 
     effect: str  # its name
     taken: bool  # whether it is in the model
-    # error_without, error_with: error of left-out sweeps, rad/s; nan where a fit was not possible
-    error_without: float
+    error_without: float  # of left-out sweeps, rad/s; nan where a fit was not possible
     error_with: float
-    p_value: float  # p-value of the effect; nan as before
+    p_value: float
     reason: str  # one sentence
 
 
@@ -67,15 +62,10 @@ class _EffectChoice:
 class _ConfoundedPair:
     """Two effects that explain the same errors."""
 
-    # taken, other: their names
-    taken: str
+    taken: str  # its name
     other: str
-    # standard deviations by which the data prefer the one that was taken; negative where they
-    # prefer the other
-    sigmas: float
-    # slowest rate, rad/s, at which two dwells each way would distinguish them; None if it is above
-    # three times the fastest
-    distinguishing_rate: float | None
+    sigmas: float  # by which the data prefer the one taken; negative for the other
+    distinguishing_rate: float | None  # rad/s; None above three times the fastest
     reason: str  # why it was taken, one sentence
 
     @property
@@ -99,11 +89,7 @@ class SelectedEffects:
 
 
 def select_effects(dwells: Dwells, technology: str | None = None) -> SelectedEffects:
-    """
-    Fit the effects that the dwells support, each with its reason.
-
-    The technology of the instrument, one of `TECHNOLOGY_EFFECTS`, decides where causes tie.
-    """
+    """Fit the effects that the dwells support, each with its reason; a technology decides ties."""
     base = _add_slopes(_fit_base(dwells, None))
     best = _add_slopes(find_supported_effects(dwells, FALSE_ALARM_RATE, base=base))
     best, confounders = resolve_confounders(
@@ -132,7 +118,7 @@ def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
     Fit the effects that predict left-out sweeps better, at a false alarm rate.
 
     The best one is added until none is supported, then those that later ones made superfluous are
-    removed. With a given model they are changes of it. The effects of a `base` are in the fit.
+    removed. With a given model they are changes of it. The effects of a `base` stay.
     """
     best = base = base or _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
@@ -167,11 +153,7 @@ def _fit_base(dwells: Dwells, given: GyroModel | None) -> Calibration:
 
 
 def _is_supported(smaller: Calibration, larger: Calibration, significance: float) -> bool:
-    """
-    Return whether more effects predict left-out sweeps better, and each is significant.
-
-    A response that no longer grows with the rate at some dwells cannot be undone there.
-    """
+    """Return whether more effects predict left-out sweeps better, and each is significant."""
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.cross_validation_misfit() < smaller.cross_validation_misfit()
     return (predicts and larger.min_non_monotonic_rate is None
@@ -198,16 +180,14 @@ def _remove_superfluous(fit: Calibration, base: Sequence[Effect],
     return fit
 
 
-# confounders
-
 def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect: Effect
                         | None = None) -> tuple[Calibration, tuple[_ConfoundedPair, ...]]:
     """
     Decide between sine response and cubic nonlinearity where a fit has one of them.
 
-    The one that fits better is taken, but for the one by the physics of the technology if the data
-    do not distinguish them, and without a technology for a `bounded_effect`, whose error stays
-    bounded beyond the rates that were seen, if the data do not prefer the other one.
+    The one that fits better is taken, or, if the data do not decide, the one by the physics of the
+    technology, and without one a `bounded_effect`, whose error stays bounded beyond the rates
+    seen.
     """
     effect = next((each for each in CONFOUNDERS if each in fit.effects), None)
     if effect is None:
@@ -237,12 +217,7 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
 
 
 def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
-    """
-    Return the slowest new rate, rad/s, at which two dwells each way distinguish two fits.
-
-    Their outputs are then to differ by one standard deviation more than is needed. None if that is
-    more than three times the fastest rate.
-    """
+    """Return the slowest rate, rad/s, at which two dwells each way distinguish fits, or None."""
     known = fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
     deviation = np.full(4, np.median(known) if len(known) else np.nan)
     temperature = np.full(4, fit.model.reference_temperature)
@@ -261,8 +236,6 @@ def try_replace(fit: Calibration, taken: Effect, other: Effect) -> Calibration |
     """Fit another effect in place of one of a fit; None if that is not possible."""
     return try_fit(fit, [other if each is taken else each for each in fit.effects])
 
-
-# reasons
 
 def _explain_choice(fit: Calibration, effect: Effect, significance: float,
                     confounders: Sequence[_ConfoundedPair]) -> _EffectChoice:

@@ -21,8 +21,6 @@ model, where it differs, which shows a gyro that is dead or at its limit. `noise
 gyro, if it is known. Data that are not credible raise `DataRefused`, with reason and remedy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 
@@ -37,22 +35,17 @@ from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
-from gyro_calibration.model.motion import Motion, motion_from_rates
+from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
-#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
-#: equal slip in all turns is indistinguishable from a scale factor error.
-_MAX_WHEEL_SLIP = 0.01
-#: Standard deviations from which on a stretch is a slip. With three times the noise of the
-#: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
+#: Standard deviations from which on a stretch is a slip: 6 of 800 good runs exceed it, and 1 deg,
+#: with three times the noise of the XV-3500, none with its own.
 _MIN_SLIP_SIGMAS = 4.5
-#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
-#: is stated, s.
+#: Duration of the drive for which the precision of a calibration is stated, s.
 DRIVE_DURATION = 300.0
-#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
-#: which the robot is driving, rad/s.
+#: Time after the profile at which a robot is at rest, s; change of the rate of a drive, rad/s.
 SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
 
 
@@ -62,8 +55,7 @@ class RunLimits:
 
     min_samples: int = 50  # minimum number of samples
     max_gap: float = 0.5  # longest between samples, s
-    # smallest standard deviation of the profile's rate, rad/s; one speed does not separate scale
-    # from bias
+    # smallest standard deviation of the profile's rate, rad/s
     min_rate_spread: float = 1.0 * DEGREE
     max_scale_factor_error: float = 0.3  # largest, 1
     max_bias: float = 10.0 * DEGREE  # largest, rad/s
@@ -71,16 +63,14 @@ class RunLimits:
     # largest significant deviation of a stretch of the run from the profile, rad
     max_stretch_residual: float = 1.0 * DEGREE
     max_time_offset: float = 1.0  # largest lag of the gyro behind the profile, either way, s
-    # largest noise that accumulates in the heading, as a multiple of the known noise, or else of
-    # the white noise of the samples, and as its heading error over the run, rad; a run that
-    # exceeds both is refused
+    # largest noise that accumulates in the heading, over the known one or else that of the
+    # samples, and its heading error over the run, rad; a run that exceeds both is refused
     max_noise_ratio: float = 8.0
     max_unexplained_angle: float = 1.0 * DEGREE
     rest_duration: float = 2.0  # length of the check after the run, s
     # largest corrected rate at rest after the run, rad/s, unless the noise explains more
     max_rest_rate: float = 2e-4
-    # largest error of the heading after five minutes, rad, unless it was larger without the
-    # calibration (`likelihood` only): that of a bias of 0.1 deg/s, which a gyro has at least
+    # largest error of the heading after five minutes, rad, unless it was larger before
     max_heading_error: float = 30.0 * DEGREE
 
 
@@ -95,18 +85,12 @@ class ReferenceErrors:
 
 
 def default_reference_errors(motion: Motion) -> ReferenceErrors:
-    """Return the usual errors of a reference whose errors are not given: commanded rates slip."""
-    commanded = motion.rate is not None
-    return ReferenceErrors(_MAX_WHEEL_SLIP / math.sqrt(3.0)) if commanded else ReferenceErrors()
+    """Return the usual errors: at commanded rates wheels slip by up to 1 % of each turn."""
+    return ReferenceErrors(0.0 if motion.rate is None else 0.01 / math.sqrt(3.0))
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
-    """
-    Fit by Hong and Park's heading reference, unchanged (eq. 4 to 7).
-
-    The rectangle rule of eq. 4 is kept: against a continuous heading it errs by several percent
-    where the sampling is slow.
-    """
+    """Fit by Hong and Park's heading reference, with the rectangle rule of eq. 4 (eq. 4 to 7)."""
     step = np.diff(time)
     g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
     z = motion.heading_at(time[1:]) - motion.heading_at(time[:1])
@@ -139,15 +123,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     """
     Fit a run by one of `METHODS` and refuse one that is not credible.
 
-    Parameters
-    ----------
-    noise : the wander of the bias goes into its standard deviation, and the residual is compared
-        with it
-    reference : the errors of the motion; goes into the standard deviations. By default a motion of
-        rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
-    prior : standard deviations of (s, b) about zero before the run, as
-        `GyroModel.prior_deviations` of a fleet, shape (2,); what the run leaves open is drawn to
-        it, in a method that gives a covariance
+    The reference has by default `default_reference_errors`. The prior are standard deviations of
+    (s, b) about zero before the run, as `GyroModel.prior_deviations` of a fleet, shape (2,).
     """
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits, output)
@@ -159,9 +136,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
                               reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
-    # errors not observable in a run: wander of the bias, and errors of the reference with the
-    # slip that all turns have; the root mean square of slips between zero and a largest one is
-    # twice their standard deviation
+    # not observable: wander of the bias, errors of the reference, the slip that all turns have;
+    # the rms of slips between zero and a largest one is twice their standard deviation
     scale = 1.0 + fit.scale_factor_error
     unobservable = np.diag(
         [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
@@ -199,8 +175,7 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
     By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
     error, which is no noise of a fit; between codes the errors are independent, of the sizes of
-    `rounding_errors`. Ramps within a block average them out. The covariance has shape (2, 2), the
-    variance is in (rad/s)²; both are zero without steps.
+    `rounding_errors`. Shape (2, 2) and (rad/s)²; both are zero without steps.
     """
     step = quantization_step(output)
     if not step:
@@ -217,8 +192,7 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
     local = mean + (change - np.roll(change, 1)) / (1.0 + before + after)
     code = np.unique(np.rint(local), return_inverse=True)[1]
-    # a ramp may begin within a block: those next to one are no evidence of the noise, nor those in
-    # which the rate changes by a tenth of a step
+    # a ramp may begin within a block
     slow = np.abs(np.roll(mean, -2) - np.roll(mean, 2)) < 4.0 * 0.1
     weight = count * np.where(quiet & before & after & slow, 1.0, 1e-6)
     total: Array = np.bincount(code, weight).astype(float)
@@ -233,22 +207,19 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
-                    slip_deviation: float,
-                    excess_turn: tuple[float, float] | None = None) -> ScaleBiasFit:
+                    slip_deviation: float) -> ScaleBiasFit:
     """Fit on the stamps, or on an even grid if that leaves less."""
     even_stamps = even_times(time)
     jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
     fit = min((fit_likelihood(stamps, rate, motion, largest_time_offset,
-                              slip_deviation=slip_deviation, excess_turn=excess_turn)
+                              slip_deviation=slip_deviation)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
     if motion.rate is not None:
         return fit
-    # Against a profile the fit includes a scale difference between both senses of turning; for
-    # measured headings its variance is added. Such an error is proportional to the absolute value
-    # of the rate. The part of it that is proportional to the rate, or constant, is
-    # indistinguishable from scale factor error and bias. In a swing without rests, the mean
-    # absolute rate is indistinguishable from a bias.
+    # Against a profile the fit includes a scale difference between both senses of turning. Such an
+    # error is proportional to the absolute rate; the part of that which is proportional to the
+    # rate, or constant, is indistinguishable from scale factor error and bias.
     columns = np.column_stack([rate, np.ones(len(rate))])
     absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
     return replace(
@@ -326,11 +297,7 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
 
 def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits,
                 white_noise: float) -> None:
-    """
-    Refuse by the first cause found; causes that spoil later checks come first.
-
-    `white_noise` is that of the samples, rad/√s.
-    """
+    """Refuse by the first cause found, in the order in which they spoil later checks."""
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual
     s = fit.scale_factor_error
@@ -338,8 +305,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     has_slipped = excess_angle > limits.max_stretch_residual and sigmas > _MIN_SLIP_SIGMAS
     slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
             else '')
-    # against measured headings the deviations include the noise of mount and encoder; a wobble
-    # with the wheels passes for noise of the rate, but does not accumulate in the heading
+    # the noise of mount and encoder deviates too; a wobble does not accumulate in the heading
     noise_ratio = (fit.goodness.noise_ratio if fit.goodness
                    else fit.angle_random_walk / max(white_noise, 1e-300))
     strays = (motion.rate is not None and fit.heading_difference > limits.max_unexplained_angle
@@ -380,12 +346,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
-    """
-    Return a remark on a scale factor error that gyros of a technology hardly have, or ''.
-
-    The standard deviation of the scale factor error of such gyros, 1, and the name of the motion
-    are given.
-    """
+    """Return a remark on a scale factor error beyond what such gyros have, or ''."""
     size = 100.0 * fit.scale_factor_error
     sigmas = abs(fit.scale_factor_error) / math.hypot(
         prior_deviation, float(np.nan_to_num(math.sqrt(fit.covariance[0, 0]))))
@@ -408,13 +369,12 @@ class RestCheck:
 
 
 def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise(),
-               limits: RunLimits = RunLimits(), false_refusal_rate: float = 1e-3) -> RestCheck:
+               limits: RunLimits = RunLimits()) -> RestCheck:
     """
     Check a calibration by a rest after its run, and refuse it if the gyro still drifts.
 
     The rest lasts at least 75 % of the length in the limits. Without a known noise its white noise
-    is taken from the samples; `false_refusal_rate` tells how often a good calibration is refused,
-    if the noise is as given.
+    is taken from the samples.
     """
     duration = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     if duration < 0.75 * limits.rest_duration or len(time) < 10:
@@ -428,14 +388,10 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale, updated = 1.0 + fit.scale_factor_error, fit
     if np.isfinite(fit.covariance).all():
-        gain, covariance = combine_with_rest(fit.covariance, scale * mean, scale ** 2 * variance)
-        s, b = (gain * scale * mean + (fit.scale_factor_error, fit.bias)).tolist()
-        # run and rest may be on the same place of a step
-        covariance[1, 1] = max(covariance[1, 1], fit.rounding_variance)
-        updated = replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
+        updated = _add_rest(fit, scale * mean, scale ** 2 * variance)
+    # one good calibration in a thousand is refused, if the noise is as given
     check = RestCheck(mean, deviation, max(limits.max_rest_rate,
-                                           -float(ndtri(0.5 * false_refusal_rate)) * deviation),
-                      updated)
+                                           -float(ndtri(0.5e-3)) * deviation), updated)
     if half_difference > 2.0 * max(MAX_NOISE_SIGMAS * white_deviation, _MIN_DRIVING_RATE_CHANGE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
                           f'{half_difference / DEGREE:.2f} deg/s: leave it at rest after the run')
@@ -448,14 +404,12 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise = Noise
 
 
 def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
-              noise: Noise = Noise(),
-              reference: ReferenceErrors | None = None) -> ScaleBiasFit:
+              noise: Noise = Noise()) -> ScaleBiasFit:
     """
     Return a calibration by a profile whose log has too short a rest after it for `check_rest`.
 
     A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
-    bias. The samples after the motion show it, even where the robot still settles: its response
-    to the profile is fitted together with the rest. A turn that they do not show, of a prior
+    bias, which the samples after the motion show. A turn that they do not show, of a prior
     deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
     they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn. The fit
     is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
@@ -463,33 +417,15 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     the motion, or goes on turning after it.
     """
     limits = RunLimits()
-    reference = default_reference_errors(motion) if reference is None else reference
     end = motion.duration + max(fit.time_offset, 0.0)
-    duration = float(time[-1]) - end
+    duration, rest = float(time[-1]) - end, rate[time > end]
     if (motion.rate is None or motion.rate[-1] != 0.0 or motion.name != 'profile'
-            or not np.isfinite(fit.covariance).all() or np.count_nonzero(time > end) < 10
+            or not np.isfinite(fit.covariance).all() or len(rest) < 10
             or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
         return fit
-    with_rest = motion_from_rates(np.append(motion.time, time[-1] + limits.max_time_offset),
-                                  np.append(motion.rate, 0.0))
-    # the robot may turn on until the mean rate of the rest changes beyond white noise
-    turn_end, after, rest = end, time[time > end], rate[time > end]
-    count = np.arange(5, len(rest) - 4)
-    if len(count):
-        before = np.cumsum(rest)[count - 1]
-        changes = np.abs(before / count - (rest.sum() - before) / (len(rest) - count))
-        change_sigmas = changes / np.sqrt(1.0 / count + 1.0 / (len(rest) - count))
-        best = int(np.argmax(change_sigmas))
-        if change_sigmas[best] > _MIN_SLIP_SIGMAS * white_noise_deviation(rest, 1):
-            turn_end = float(after[count[best]])
-    at_rest = _fit_likelihood(
-        time, rate, with_rest, limits.max_time_offset, reference.scale_deviation,
-        (turn_end - max(fit.time_offset, 0.0), limits.max_bias))
-    change = at_rest.bias - fit.bias
-    # the few increments of the rest may by chance have less than the noise of the gyro
-    known_ratio = max(noise.angle_random_walk / at_rest.angle_random_walk, 1.0)
-    variance = (known_ratio ** 2 * at_rest.covariance[1, 1]
-                + float(noise.mean_change_variance(duration, duration)) + fit.rounding_variance)
+    change = float(rest.mean()) - fit.bias
+    variance = fit.rounding_variance + rest_variance(
+        noise, duration, _deviation_of_mean(rest), _half_difference(rest))
     sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
     stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
     if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
@@ -500,10 +436,17 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
             'standard deviations): the robot turned throughout the run, or still turned after '
             'it; run again and leave it at rest for '
             f'{SETTLING_TIME + limits.rest_duration:g} s after it')
+    fit = _add_rest(fit, change, variance)
+    unseen = 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
+    return replace(fit, covariance=fit.covariance + np.diag([0.0, unseen]))
+
+
+def _add_rest(fit: ScaleBiasFit, change: float, variance: float) -> ScaleBiasFit:
+    """Return a calibration with a mean at rest less its bias, rad/s, and the variance of that."""
     gain, covariance = combine_with_rest(fit.covariance, change, variance)
     s, b = (gain * change + (fit.scale_factor_error, fit.bias)).tolist()
-    # a turn that the rest does not show
-    covariance[1, 1] += 1.0 / (1.0 / variance + 1.0 / EXCESS_RATE_DEVIATION ** 2)
+    # run and rest may be on the same place of a step
+    covariance[1, 1] = max(covariance[1, 1], fit.rounding_variance)
     return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
 
 
@@ -513,8 +456,7 @@ def rest_variance(noise: Noise, duration: float, white_deviation: float,
     Return the variance of a mean at rest about the bias, (rad/s)².
 
     Given are the duration, s, the deviation of the mean by the white noise of the samples, and by
-    how much the means of both halves differ, rad/s: a robot that settles in the first half of the
-    rest moves the mean by half of the change.
+    how much the means of both halves differ, rad/s: a robot that settles moves the mean by half.
     """
     return (max(white_deviation, noise.angle_random_walk / math.sqrt(duration)) ** 2
             + float(noise.mean_change_variance(duration, duration)) + 0.25 * half_difference ** 2)
@@ -524,12 +466,11 @@ def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[
     """
     Return derivatives of (s, b) by the rate at rest, shape (2,), and their covariance, (2, 2).
 
-    The rest after a run is combined with the covariance of (s, b) by the run, shape (2, 2). The
-    rate is the mean of the output at rest less the bias of the run, rad/s; its variance is that of
-    the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a turn by
-    hand, or another response of the robot. That and a run as stated have even odds before the rest
-    is seen. The ratio of that error to the stated deviation has a half-Cauchy prior with a median
-    of 1.
+    The rate is the mean of the output at rest less the bias of the run, rad/s; its variance is
+    that of the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a
+    turn by hand, or another response of the robot. That and a run as stated have even odds before
+    the rest is seen. The ratio of that error to the stated deviation has a half-Cauchy prior of
+    median 1.
     """
     stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
@@ -553,9 +494,8 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
-    It begins later, by up to its length in the limits, where the robot still moves then, as after
-    an overshoot. It lasts until the robot moves, at most as long as the motion did. None where
-    the log ends before, or the robot drives on.
+    It begins up to its length in the limits later where the robot still moves, and is at most as
+    long as the motion. None where the log ends before, or the robot drives on.
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
@@ -597,11 +537,9 @@ def _deviation_of_mean(rate: Array) -> float:
 def calibrate_bias(time: Array, rate: Array, limits: RunLimits = RunLimits(),
                    noise: Noise = Noise(), output: Array | None = None) -> tuple[float, float]:
     """
-    Return the bias of a gyro at rest and its standard deviation, rad/s.
+    Return the bias of a gyro at rest, with the Earth's rate, and its standard deviation, rad/s.
 
-    See Ojeda et al., eq. 1, or 15 for compensated rates. The mean includes the Earth's rate about
-    the axis. A slow and steady turn looks like a bias; only the limit on the bias excludes it. The
-    noise gives the smallest standard deviation of the mean.
+    See Ojeda et al., eq. 1, or 15 for compensated rates. A slow and steady turn looks like a bias.
     """
     refuse_samples(time, rate, limits, output)
     parts = np.array_split(rate, 10)

@@ -15,8 +15,6 @@ The robot rests on the mark, turns at any rates, and rests on the mark again. Th
 reference. The rests give the bias, and the remaining angle over the turns gives the scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 
@@ -31,16 +29,13 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
 
-#: Standard deviation of the heading of a robot put on a mark by hand or eye, rad: two marks a
-#: finger's width apart at half a metre.
+#: Standard deviation of a robot put on a mark by hand or eye, rad: a finger at half a metre.
 MARK_DEVIATION = 1.0 * DEGREE
 #: Shortest rest, s.
 _MIN_REST_DURATION = 1.0
-#: Length of the means that separate rest from motion, s; the one beside the motion is left
-#: out. And the smallest deviation that is motion for any noise of the gyro, rad/s.
+#: Length of the means that separate rest from motion, s; smallest deviation of motion, rad/s.
 _PART_DURATION, _MIN_MOVING_RATE = 0.25, 0.5 * DEGREE
-#: Largest difference between the angle and the number of turns, in turns; half a turn would be as
-#: near to the next number.
+#: Largest difference between the angle and the number of turns, in turns.
 _MAX_COUNT_ERROR = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
 _MAX_COUNTING_SCALE_ERROR = 0.05
@@ -65,15 +60,10 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     """
     Find scale factor error and bias from whole turns between two rests on one mark.
 
-    The rates of the turns do not matter, only the net number of turns. The number is accepted only
-    where the gyro agrees to less than `_MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
-    factor error needs few turns. Arguments and `DataRefused` are those of `self_calibrate`.
-
-    Parameters
-    ----------
-    turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
-        factor error up to `_MAX_COUNTING_SCALE_ERROR`
-    mark_deviation : standard deviation of the angle between the two rests on the mark, rad
+    Only the net number of turns matters, counter-clockwise positive; None is the nearest whole
+    one, for a scale factor error up to `_MAX_COUNTING_SCALE_ERROR`. The gyro must agree to less
+    than `_MAX_COUNT_ERROR` of a turn; so one with a large error needs few turns. The deviation is
+    that of the angle between the rests on the mark, rad. The rest is that of `self_calibrate`.
     """
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)

@@ -26,14 +26,14 @@ from typing import Any
 from gyro_calibration.calibration.dwells import format_list
 from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
 from gyro_calibration.calibration.rate_table import bin_errors, Calibration
-from gyro_calibration.calibration.scatter import MIN_SWEEPS
+from gyro_calibration.calibration.scatter import MIN_SWEEPS, rms
 from gyro_calibration.calibration.selection import SelectedEffects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
 from gyro_calibration.files import suggest_nearest
-from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
@@ -44,10 +44,10 @@ import numpy as np
 def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
-    parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
+    parser.add_argument('--method', choices=['dwells', 'likelihood', 'course'],
                         help='dwells: means at constant rates; likelihood: by the reference '
-                        'heading; course: by a course over ground; rate: by the rate of the '
-                        'reference heading. Default: by the columns of the log')
+                        'heading; course: by a course over ground. Default: by the columns of the '
+                        'log')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
@@ -128,8 +128,8 @@ def run(given: argparse.Namespace) -> Answer:
         data |= {'method': found.method, 'time_offset_s': fit.time_offset,
                  'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
                  'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
-                 **{f'{name}_heading_{when}_rad': getattr(residual, name)
-                    for name in ('rms', 'largest') for when, residual in (
+                 **{f'{name}_heading_{when}_rad': size(residual)
+                    for name, size in (('rms', rms), ('largest', _largest)) for when, residual in (
                         ('before', found.residual_before), ('after', found.residual_after))},
                  'remarks': list(found.remarks)}
     return Answer(lines, data, (given.picture, given.out))
@@ -155,8 +155,8 @@ class Fitted(PrintedResult):
             return plots.draw_residuals(path, found.calibration)
         motion = found.reference
         return plots.draw_reference(
-            path, motion.time, motion.heading - motion.heading[0], found.residual_before.heading,
-            found.residual_after.heading,
+            path, motion.time, motion.heading - motion.heading[0], found.residual_before,
+            found.residual_after,
             'course over ground' if found.method == 'course' else 'reference')
 
 
@@ -232,15 +232,19 @@ def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
                             'would distinguish them.')
 
 
+def _largest(residual: Array) -> float:
+    return float(np.abs(residual).max())
+
+
 def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
     yield from (*_value_lines(model), '')
     if math.isfinite(found.fit.time_offset):
         yield (f'Delay of the gyro behind the reference: {1000.0 * found.fit.time_offset:.1f} ms; '
                'the errors are corrected for it.')
     for name, residual in (('before', found.residual_before), ('after', found.residual_after)):
-        yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
-               f'{residual.largest / DEGREE:.3f} deg at most.')
-    if found.residual_after.rms > 5.0 * DEGREE:
+        yield (f'Heading error {name}: {rms(residual) / DEGREE:.3f} deg rms, '
+               f'{_largest(residual) / DEGREE:.3f} deg at most.')
+    if rms(found.residual_after) > 5.0 * DEGREE:
         remedy = ('The reference has errors of this size, or shows another motion: compare its '
                   'turns with known ones before using the model.' if found.method == 'course' else
                   'If the gyro is nonlinear or depends on temperature, use --method dwells; it '

@@ -224,7 +224,7 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
     check = (None if rest is None
              else check_rest(time[known][rest], rate[known][rest], fit, model.noise))
     fit = (check.fit if check is not None else
-           check_end(time[known], rate[known], fit, motion, model.noise, reference))
+           check_end(time[known], rate[known], fit, motion, model.noise))
     return CalibratedRun(fit, check, run, time[run], rate[run], motion)
 
 

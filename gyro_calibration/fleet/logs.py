@@ -282,8 +282,7 @@ def _fit_spans(log: Log, time_offset: float, heading: tuple[Array, Array] | None
         """Fit scale factor error, bias and a column; return the last value and its deviation."""
         found = fit_noise_grid(
             increments, np.column_stack([*turns, np.diff(edges), *column]), noise,
-            *bias_wander_columns(edges), noisy_column=0 if turns else None,
-            wandering_value=len(turns))
+            *bias_wander_columns(edges), wandering_value=len(turns))
         return float(found.values[-1]), float(found.deviations[-1])
 
     return edges, fit

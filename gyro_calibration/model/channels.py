@@ -26,8 +26,7 @@ from gyro_calibration.logs.log import Log, Number
 from gyro_calibration.model.effects import Channels, lag_difference
 import numpy as np
 
-#: State at the last sample, by (channel, time constant) of a lag and ('heating', filter time,
-#: threshold) of the sign of heating.
+#: By (channel, time constant) of a lag, and ('heating', filter time, threshold).
 _LagStates = dict[tuple[Any, ...], float]
 
 
@@ -48,8 +47,7 @@ class ChannelHistory:
         """
         Take the next sample (numbers) or samples (shape (n,), n > 0), and return its channels.
 
-        Stamps are in s, quantities in degC, m/s², V and rad, or None where they are not known.
-        Rate and output of the channels are 0.
+        Stamps are in s, quantities in degC, m/s², V and rad, or None. Rate and output are 0.
         """
         if self._block is None:
             self._start_time = float(_edge_value(time, 0))

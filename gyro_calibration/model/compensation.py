@@ -36,18 +36,14 @@ _MAX_COMPUTABLE_RATE = math.sqrt(sys.float_info.max)
 class CompensatedSamples:
     """Compensated samples: numbers, or arrays of shape (n,)."""
 
-    # rate after the model and before the self-calibration, rad/s; input of the next self-
-    # calibration
-    model_rate: Number
+    model_rate: Number  # after the model, before the self-calibration, rad/s
     rate: Number  # rad/s
     temperature: Number  # degC, limited to plausible temperatures
-    # the temperature is outside the calibrated range. Up to `GyroModel.extrapolation_range` the
-    # correction is extrapolated, beyond that it is held
+    # outside the calibrated temperatures; up to `GyroModel.extrapolation_range` the correction is
+    # extrapolated, beyond that held
     temperature_clipped: Number
-    # the output is outside the calibrated range of rates, or not plausible, or no rate has this
-    # output. Up to `GyroModel.rate_limit` the correction is extrapolated. Beyond that, and where
-    # the response no longer grows with the rate, the last correction is held, so that the rate is
-    # always finite
+    # the output is outside the calibrated rates, or no rate has it; up to `GyroModel.rate_limit`
+    # the correction is extrapolated, beyond that, or at a fold of the response, held
     beyond_range: Number
 
 
@@ -123,10 +119,9 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     Return the derivative of the rate by each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then the
-    `GyroModel.active_tolerances` errors, then (s, b) of the self-calibration, if there is one; the
-    order of `covariance`. The rate of the model solves ``rate = output - error(rate)``, so the
-    derivative of the error is divided by the slope of the output there: 0.5 for a sine response at
-    a phase of 60 deg. Effects that compensation cannot undo have a derivative of 0.
+    `GyroModel.active_tolerances`, then (s, b) of the self-calibration. The rate of the model
+    solves ``rate = output - error(rate)``, so the derivative of the error is divided by the slope
+    of the output there. Effects that compensation cannot undo have a derivative of 0.
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None or model.active_tolerances:

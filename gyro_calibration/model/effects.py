@@ -51,8 +51,7 @@ class Channels:
     # 'temperature', 'specific_force', and 'vibration', the squared deviation of the specific force
     # from its own mean over 1 s
     lagged: Callable[[str, float], Number] | None = None
-    # (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell, 0 before
-    # either
+    # (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell, else 0
     heating: Callable[[float, float], Number] | None = None
 
     def with_rate(self, rate: Number, output: Number) -> Channels:
@@ -73,9 +72,7 @@ class Parameter:
 
     name: str
     unit: str
-    # a convention, such as a reference temperature; without one it is a property of the gyro, and
-    # is fitted
-    default: float | None = None
+    default: float | None = None  # a convention; without one it is fitted
     bounds: tuple[float, float] = (-np.inf, np.inf)
     begin_with: tuple[float, ...] = ()  # first values of a nonlinear one in a diagnosis
 
@@ -93,11 +90,7 @@ class Effect:
     # nonlinear parameters, on which the columns depend
     nonlinear_parameters: tuple[Parameter, ...] = ()
     experiment: str = ''  # experiment that separates it from similar effects
-    # (channels, shapes, coefficients) -> the sum of the columns times the coefficients, where a
-    # faster formula exists
-    sum_columns: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
-    # (signal, time, *values) -> signal, of a whole log, for an effect that adds nothing but
-    # changes the signal itself
+    # (signal, time, *values) -> signal, for an effect that changes the signal of a whole log
     distortion: Callable[..., Array] | None = None
     # of the distortion: 'rate' before anything is added to the rate, or 'output' after the noise
     stage: str = ''
@@ -116,9 +109,7 @@ class Effect:
         """Return a function of channels: what the effect adds to the output, rad/s."""
         shapes = values[:len(self.nonlinear_parameters)]
         coefficients = values[len(self.nonlinear_parameters):]
-        sum_columns, columns = self.sum_columns, self.columns
-        if sum_columns is not None:
-            return lambda channels: sum_columns(channels, shapes, coefficients)
+        columns = self.columns
         if len(coefficients) == 1:
             value, = coefficients
             return lambda channels: value * columns(channels, *shapes)[0]
@@ -147,8 +138,7 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
 
 def _solve_recurrence(factors: Array, added: Array, initial: float) -> Array:
     """Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,)."""
-    # Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
-    # row before is propagated through each row.
+    # rows of sqrt(n) samples in parallel from zero; then the end of each is propagated to the next
     count = len(factors)
     width = math.isqrt(max(count - 1, 0)) + 1
     padding = (0, -count % width)
@@ -169,38 +159,22 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     """
     Return the error polynomial of Ojeda, Chung and Borenstein (2000), eq. 9 to 13.
 
-    It is one of the output, not of the true rate, so that compensation is one subtraction (eq.
-    13). Its powers are centred and scaled, since the condition number of raw powers of deg/s and
-    degC is about 1e11. The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of
-    output. The index of eq. 10 as printed collides; here each product has its own column. The
-    orders are p and q of the paper, not negative.
+    It is one of the output, so that compensation is one subtraction (eq. 13). Its powers are
+    centred and scaled, since the condition number of raw powers of deg/s and degC is about 1e11.
+    The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of output; the index of
+    eq. 10 as printed collides. The orders are p and q of the paper, not negative.
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 
-    def scale_inputs(channels: Channels, output_centre: float, output_scale: float,
-                     temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
-        output = channels.output - output_centre
-        output *= 1.0 / output_scale
+    def columns(channels: Channels, output_centre: float, output_scale: float,
+                temperature_centre: float, temperature_scale: float) -> Sequence[Number]:
+        outputs = _powers((channels.output - output_centre) / output_scale, rate_order)
         if not temperature_order:  # the temperature may be unknown
-            return output, 0.0 * output
-        temperature = channels.temperature - temperature_centre
-        temperature *= 1.0 / temperature_scale
-        return output, temperature
-
-    def columns(channels: Channels, *shapes: float) -> Sequence[Number]:
-        output, temperature = scale_inputs(channels, *shapes)
-        outputs = _powers(output, rate_order)
+            return outputs
+        temperature = (channels.temperature - temperature_centre) / temperature_scale
         return [of_temperature * of_output
                 for of_temperature in _powers(temperature, temperature_order)
                 for of_output in outputs]
-
-    def sum_columns(channels: Channels, shapes: Sequence[float],
-                    coefficients: Sequence[float]) -> Number:
-        output, temperature = scale_inputs(channels, *shapes)
-        width = rate_order + 1
-        inner = [_evaluate_horner(coefficients[begin:begin + width], output)
-                 for begin in range(0, len(coefficients), width)]
-        return _evaluate_horner(inner, temperature)
 
     return Effect(
         'rate_temperature_polynomial',
@@ -211,7 +185,7 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
          Parameter('output_scale', 'rad/s', 1.0, (1e-9, np.inf)),
          Parameter('temperature_centre', 'degC', 0.0),
          Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))),
-        'turn at more rates, at more temperatures, or take lower orders', sum_columns)
+        'turn at more rates, at more temperatures, or take lower orders')
 
 
 def _powers(value: Number, order: int) -> list[Number]:
@@ -219,18 +193,6 @@ def _powers(value: Number, order: int) -> list[Number]:
     for _ in range(order):
         powers.append(powers[-1] * value)
     return powers
-
-
-def _evaluate_horner(coefficients: Sequence[Number], value: Number) -> Number:
-    """Return the sum of coefficients times `_powers`, by Horner's rule, with one new array."""
-    if len(coefficients) == 1:
-        return coefficients[0] * (value * 0.0 + 1.0)
-    total = coefficients[-1] * value
-    total += coefficients[-2]
-    for coefficient in coefficients[-3::-1]:
-        total *= value
-        total += coefficient
-    return total
 
 
 def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:

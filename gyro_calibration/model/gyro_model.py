@@ -10,8 +10,6 @@
 
 """A gyro's model: its effects with values and their covariance, and the last self-calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -26,13 +24,11 @@ from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: The response is inverted where the slope of the output over the rate is at least this, 1: noise
-#: is amplified up to ten times.
+#: The response is inverted where the slope of the output over the rate is at least this, 1.
 _MIN_OUTPUT_SLOPE = 0.1
 #: Python floats need no error state of numpy; setting one for each sample would cost time.
 _NO_ERROR_STATE = nullcontext()
-#: Largest last step of a converged iteration, relative to 1 rad/s plus the rate; the error is much
-#: smaller.
+#: Largest last step of a converged iteration, relative to 1 rad/s plus the rate.
 STEP_TOLERANCE = 1e-10
 
 
@@ -126,8 +122,7 @@ class SelfCalibration:
 class Tolerance:
     """Errors of the rate beyond the covariance of the values: standard deviations."""
 
-    # their change from one run to the next, rad/s and 1; not used where there is a self-
-    # calibration, which estimates them
+    # from one run to the next, rad/s and 1; a self-calibration replaces them
     bias: float = 0.0
     scale_factor_error: float = 0.0
     # per K outside of the calibrated temperatures, rad/s/K and 1/K
@@ -189,8 +184,7 @@ class GyroModel:
     @cached_property
     def rate_limit(self) -> float:
         """Return the largest plausible output, rad/s."""
-        # It is twice the largest valid rate, but at least 10 rad/s, which robots reach: a model
-        # may have been fitted at rest.
+        # twice the largest valid rate, but at least 10 rad/s: a model may have been fitted at rest
         farther = max(map(abs, self.rate_range))
         return max(2.0 * farther, 10.0) if farther < math.inf else 100.0
 
@@ -225,8 +219,7 @@ class GyroModel:
     @cached_property
     def prior_deviations(self) -> Array | None:
         """Return the deviations of (s, b) before a calibration, shape (2,); inf if unknown."""
-        # The tolerance of a fleet model is the spread between units of a type. Tolerances of other
-        # models are those of one gyro in a laboratory, and not used as a prior.
+        # the tolerance of a fleet is the spread of a type, that of another model of one gyro
         if 'fleet' not in self.origin:
             return None
         return np.array([getattr(self.tolerance, name) or math.inf
@@ -236,7 +229,7 @@ class GyroModel:
     def rate_domain(self) -> tuple[float, float]:
         """Return the rates between which the response is inverted, rad/s."""
         # They begin at the valid rate nearest to zero, and end where the output no longer grows
-        # with the rate at some used temperature, or where the output would not be plausible.
+        # with the rate at some used temperature, or would not be plausible.
         low, high = self.rate_range
         centre = min(max(0.0, low), high)
         dependent, ends = self._split_by_rate[1], list[float]()
@@ -296,8 +289,8 @@ class GyroModel:
         """
         Return the rate, rad/s, at the output and the surroundings of channels.
 
-        The rate of the channels is not used. The second value tells whether no rate of the
-        `rate_domain` has this output; the correction at the end of the domain is held there.
+        The second value tells whether no rate of the `rate_domain` has this output; the correction
+        at the end of the domain is held there.
         """
         output, (independent, dependent) = channels.output, self._split_by_rate
         given = output - _sum_errors(independent, channels)

@@ -80,11 +80,7 @@ def motion_from_headings(time: Array, heading: Array) -> Motion:
 
 
 def motion_from_log(log: Log) -> tuple[Motion, float]:
-    """
-    Return the motion of the reference of a log, and the time of its beginning, s.
-
-    Raise `InputError` without a reference over time, `DataRefused` with less than two values.
-    """
+    """Return the motion of the reference of a log, and its begin, s."""
     for values, motion in ((log.reference_heading, motion_from_headings),
                            (log.reference_rate, motion_from_rates)):
         if values is not None and log.time is not None:
@@ -113,13 +109,11 @@ def _turns_and_rests(first_rest: float, turns: Iterable[tuple[float, float, floa
         stretch for duration, rate, rest in turns for stretch in ((duration, rate), (rest, 0.0)))])
 
 
-#: 20 s that separate scale factor error from bias: both signs, two speeds, rests, ramps of 0.5 s,
-#: and the first heading at the end.
+#: 20 s that separate scale factor error from bias: both signs, two speeds, and rests.
 CALIBRATION_MOTION = _turns_and_rests(1.0, (
     (duration, rate, 1.0) for duration, speed in ((4.0, 45.0), (3.5, 30.0))
     for rate in (speed, -speed)))
-#: 160 s of a robot in a building, half of it at rest or on straight paths: turns of 90 deg and the
-#: ramps after them.
+#: 160 s of a robot in a building, half of it at rest or on straight paths, with turns of 90 deg.
 ROBOT_MOTION = _turns_and_rests(10.0, (
     (90 / abs(rate) + 0.5, rate, rest) for rate, rest in (
         (15, 6), (-15, 8), (-10, 6), (10, 6), (20, 8), (-20, 7), (-20, 8), (20, 7), (10, 6),
@@ -149,12 +143,10 @@ _COLUMN_UNITS = {name: factor for column, (quantity, factor) in COLUMNS.items()
 
 def read_motion(path: str | Path) -> Motion:
     """
-    Read a motion profile from a CSV file.
+    Read a motion profile from a CSV file, or raise `MotionError`.
 
     It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s. The reference of a log
     is a profile too: its heading where it has both, and without the rows where it was lost.
-
-    Raise `MotionError` for other columns, values that are not finite, times that do not increase.
     """
     try:
         lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
@@ -221,8 +213,8 @@ def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
     """
     Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
 
-    The channels have the true rate and surroundings at the stamps, s, shape (n,). The noise is
-    that of samples at their median interval; without a generator there is none.
+    The channels have the true rate and surroundings at the stamps, s, (n,). The noise is that of
+    their median interval; without a generator there is none.
     """
     rate = model.distort('rate', channels.rate, time)
     output = model.output_from_channels(channels.with_rate(rate, rate))

@@ -23,8 +23,7 @@ from scipy.special import xlogy
 ALLAN_FLOOR_RATIO = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Averaging time of the bias estimate, s: the length of a self-calibration.
 BIAS_AVERAGING_TIME = 20.0
-#: Time constants, s, a factor of 10 apart, of the Gauss-Markov processes that approximate flicker
-#: from 1 s to some hours.
+#: Time constants, s, of the Gauss-Markov processes that approximate flicker from 1 s to hours.
 _FLICKER_TIME_CONSTANTS = np.geomspace(3.0, 3000.0, 4)
 
 
@@ -53,17 +52,15 @@ class Noise:
     def mean_change_variance(self, elapsed: Number, duration: float) -> Number:
         """Return the variance of a change of means over `duration` s in `elapsed` s, (rad/s)²."""
         # White noise is not included. Flicker with the two-sided spectrum B² / (2 pi f) has the
-        # generalized covariance -B² / pi log|t|. Means over T at a distance t far above T then
-        # differ with the variance 2 B² / pi (log(t / T) + 3/2).
+        # generalized covariance -B² / pi log|t|.
         flicker = 2.0 / math.pi * self.bias_instability ** 2 * (
             np.log(np.maximum(elapsed / duration, 1.0)) + 1.5)
         return flicker + self.rate_random_walk ** 2 * np.maximum(elapsed, duration)
 
     def flicker_processes(self) -> tuple[Array, float]:
         """Return k time constants, s, and the variance, (rad/s)², of processes for flicker."""
-        # The constants have shape (k,); all processes have the same variance. With time constants
-        # a factor r apart and variances of B² ln(r) / pi, the two-sided spectrum between them is
-        # B² / (2 pi f).
+        # With time constants a factor r apart and variances of B² ln(r) / pi, the two-sided
+        # spectrum between them is B² / (2 pi f).
         constants = (_FLICKER_TIME_CONSTANTS
                      if self.bias_instability else _FLICKER_TIME_CONSTANTS[:0])
         return constants, self.bias_instability ** 2 * math.log(10.0) / math.pi
@@ -83,12 +80,7 @@ class Noise:
 
 
 def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
-    """
-    Return the variance of the mean of a process over `BIAS_AVERAGING_TIME` s, and a covariance.
-
-    The process is a Gauss-Markov process of unit variance; the covariance is that of the mean and
-    the value at the end of the interval.
-    """
+    """Return variance, and covariance with the end, of a unit process's calibration mean."""
     ratio = BIAS_AVERAGING_TIME / time_constant
     decayed = 1.0 - np.exp(-ratio)
     return 2.0 * (ratio - decayed) / ratio ** 2, decayed / ratio
@@ -98,9 +90,8 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     """
     Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
 
-    Flicker and random walk have no finite variance, but their increments do
-    (`NoiseTerm.angle_covariance`). The result holds for sums whose weights add up to zero, such as
-    the difference of two biases.
+    Flicker and random walk have no finite variance, so it holds for sums whose weights add up to
+    zero, such as the difference of two biases.
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
     angle = (noise.bias_instability ** 2 * FLICKER.angle_covariance(apart)
@@ -147,8 +138,7 @@ class NoiseTerm:
     unit: str  # in SI
     slope: float  # of log Allan deviation over log averaging time
     allan_factor: float  # of coefficient² * time ** (2 slope) in the Allan variance
-    #: Covariance of the angle at a time difference, for a coefficient of 1, except terms that
-    #: second differences remove.
+    #: at a time difference, for a coefficient of 1, except what second differences remove
     angle_covariance: Callable[[Number], Array]
 
     def allan_variance(self, time: Number) -> Array:
@@ -171,8 +161,7 @@ NOISE_TERMS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION_NOISE,
 def simulate_noise(noise: Noise, count: int, interval: float,
                    generator: np.random.Generator) -> Array:
     """Return noise of shape (count,), rad/s, for samples every `interval` s."""
-    # Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116; its spectrum is
-    # B² / (2 pi f).
+    # Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116.
     white = generator.standard_normal(count) * noise.angle_random_walk / math.sqrt(interval)
     innovations = generator.standard_normal(count) * noise.bias_instability
     response = np.cumprod(np.concatenate([[1.0], 1.0 - 0.5 / np.arange(1.0, count)]))

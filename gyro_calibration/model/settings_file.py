@@ -33,12 +33,10 @@ _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 def read_settings(path: str | Path) -> Any:
     """
-    Read a YAML file of names, texts, numbers, true, false, null and lists.
+    Read a YAML file of names, texts, numbers, true, false, null and lists, or raise `ValueError`.
 
     Dates are texts, and 1e-4, a text in YAML 1.1, is a number. A file that names its format, as
     programs write it, must end with a line end: a truncated 9.3e-06 could read as 9.3.
-
-    Raise `ValueError` for any other file; its message is part of a sentence.
     """
     try:
         text = read_bytes(path, _MAX_SETTINGS_BYTES).decode('utf-8-sig')
@@ -67,8 +65,8 @@ def validate(key_path: str, value: Any, schema: Any) -> Any:
     """
     Return a value, at a place such as `noise.angle_random_walk`, as parsed by its schema.
 
-    A schema is a function of place and value; or a mapping of names to schemas, all of them
-    optional in the file; or None, for a mapping of any names. Raise `InvalidValue` for others.
+    A schema is a function of place and value; or a mapping of optional names to schemas; or None,
+    for a mapping of any names. Raise `InvalidValue` for others.
     """
     if callable(schema):
         return schema(key_path, value)

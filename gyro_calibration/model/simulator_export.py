@@ -32,9 +32,9 @@ def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussM
     """
     Return the process that fits bias instability and rate random walk best, and its error.
 
-    The logarithms of the Allan variances, angle random walk included, are compared at one
-    averaging time per octave, from the interval of the samples to the span, s. The error is the
-    largest relative one of the Allan deviation. If both figures are 0, the process has density 0.
+    The logarithms of the Allan variances, angle random walk included, are compared at octaves from
+    the interval of the samples to the span, s. The error is the largest relative one of the Allan
+    deviation. If both figures are 0, the process has density 0.
     """
     floor, walk = noise.bias_instability, noise.rate_random_walk
     if not floor and not walk:
@@ -78,8 +78,7 @@ def simulator_parameters(model: GyroModel, sample_rate: float, temperature: floa
     """
     Return the parameters of a model that simulators support, and the error of their wander.
 
-    The sample rate is in Hz, the operating temperature in degC; span and error are those of
-    `fit_gauss_markov`.
+    The sample rate is in Hz, the temperature in degC; the span is that of `fit_gauss_markov`.
     """
     interval = 1.0 / sample_rate
     run = model.self_calibration
@@ -99,9 +98,8 @@ def simulator_parameters(model: GyroModel, sample_rate: float, temperature: floa
 
 def _format_sdf(parameters: _SimulatorParameters) -> tuple[str, set[str]]:
     """Return the noise of the z axis for an `<imu>` in SDF."""
-    # Gazebo draws the sign of `bias_mean` at random and decays it with the correlation time, so
-    # the bias is exported as the mean of the noise. `dynamic_bias_stddev` is the density of a
-    # Gauss-Markov process.
+    # Gazebo draws the sign of `bias_mean` at random and decays it, so the bias is the mean of the
+    # noise. `dynamic_bias_stddev` is the density of a Gauss-Markov process.
     values = {'mean': parameters.bias, 'stddev': parameters.white_noise, 'bias_mean': 0.0,
               'bias_stddev': parameters.bias_deviation}
     names = {'bias', 'bias_instability', 'rate_random_walk', 'angle_random_walk'}

@@ -218,7 +218,6 @@ def test_outliers_repeated_and_lost_samples_are_reported_and_left_out(reference,
     assert 'outliers, left out: 3, at 5.00 s, 90.00 s, 90.01 s' in said
     assert 'repeated once, at 120.01 s (79 samples)' in said
     assert 'lost once, for 40 samples, at 250.00 s' in said
-    assert 'samples missing within the dwells: 7, after 299.99 s' in said
 
 
 def test_a_dwell_that_warms_is_divided(generator):

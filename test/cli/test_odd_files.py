@@ -384,7 +384,7 @@ VERBS = {'compensate': 'compensate {log} --model {model} --out {out}',
          'threshold': 'compensate {log} --model {model} --out {out} --threshold 0',
          'fit': 'fit {log} --out {out}', 'polynomial': 'fit {log} --polynomial',
          **{f'fit by {name}': f'fit {{log}} --method {name}'
-            for name in ('dwells', 'likelihood', 'rate')},
+            for name in ('dwells', 'likelihood')},
          'allan': 'allan {log} --out {out}', 'self-calibrate': 'self-calibrate {log} --out {out}',
          'profile': 'self-calibrate {log} --profile {log} --out {out}',
          'turns': 'self-calibrate {log} --turns nearest --out {out}',
