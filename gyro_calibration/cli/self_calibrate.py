@@ -24,9 +24,11 @@ from typing import Any
 
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
+from gyro_calibration.calibration.run_faults import (
+    fit_profile, MAX_UNEXPLAINED_SHARE, refuse_unit_error, split_run)
 from gyro_calibration.calibration.self_calibration import (
     check_end, check_rest, default_reference_errors, describe_implausible_scale, find_rest_after,
-    METHODS, ReferenceErrors, RestCheck, self_calibrate, to_model_record)
+    METHODS, ReferenceErrors, RestCheck, RunLimits, self_calibrate, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
@@ -204,10 +206,16 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
                   reference: ReferenceErrors) -> CalibratedRun:
     """Calibrate by the motion that began at a time of the log, s, and by the rest after it."""
     time, known = np.asarray(log.time) - begin, plausible_rows(model, log)
-    run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
+    output, within = np.asarray(log.output), (time >= -1.0) & (time <= motion.duration + 1.0)
+    run, whole = known & within, np.isfinite(output) & within
+    if (whole & ~known).any():  # in a wrong unit rates may be implausible
+        unexplained, scale, _ = fit_profile(
+            split_run(time[whole], output[whole]), motion, RunLimits().max_time_offset)
+        if unexplained <= MAX_UNEXPLAINED_SHARE:
+            refuse_unit_error(scale, motion.name)
     rate = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rate[run], motion, method, noise=model.noise,
-                         reference=reference, output=np.asarray(log.output)[run],
+                         reference=reference, output=output[run],
                          prior=model.prior_deviations)
     rest = find_rest_after(time[known], rate[known], fit, motion)
     check = (None if rest is None

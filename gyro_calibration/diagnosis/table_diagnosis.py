@@ -190,7 +190,7 @@ class _NamedCauses:
         causes = [each for each in fit.effects if each not in BASIC_EFFECTS
                   or model is not None and fit.p_value(each) < _significance_level(each)]
         values = {term.effect: term.values for term in fit.terms}
-        if BIAS_TEMPERATURE_QUADRATIC in values:
+        if {BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC} <= values.keys():
             # If a parabola over temperature has its vertex near the measured ones, the slope is
             # that at the temperature which it happens to be counted from.
             origin, slope = values[BIAS_TEMPERATURE]

@@ -187,8 +187,9 @@ class HeadingTracker:
         variance = self.variance - self._pending_correction ** 2
         if self._keeps_steps and self._last_sample is not None:
             state, turn = self._state, self._open_integral + self._block_integral
-            self._propagate_state(
-                self._with_still_sensitivity(turn) if self.is_resting else turn, self._last_time)
+            if turn.duration > TIME_TOLERANCE:  # else a measurement at rest without variance
+                self._propagate_state(self._with_still_sensitivity(turn) if self.is_resting
+                                      else turn, self._last_time)
             self.recalibrations.append((len(self.steps), self._state))
             self._state = state
         self._energy.clear()

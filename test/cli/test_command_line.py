@@ -10,6 +10,7 @@
 
 """The program as people and other programs call it."""
 
+from dataclasses import replace
 import hashlib
 import io
 import itertools
@@ -211,6 +212,13 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
                             '--model', tmp_path / 'model.yaml', '--json', *words)
     assert code == 0, error
     assert abs(json.loads(text)['bias']) < 1e-5
+
+
+def test_a_run_in_thousandths_whose_turns_are_implausible_is_told_its_unit(run, log, tmp_path):
+    run_log = read_log(log)
+    write_log(tmp_path / 'milli.csv', replace(run_log, output=1.1e3 * run_log.output))
+    code, _, error = run('self-calibrate', tmp_path / 'milli.csv')
+    assert code == 1 and 'the gyro is in thousandths (mdeg/s, mrad/s)' in error
 
 
 def test_a_log_of_counts_wants_its_sensitivity(compensate, model):

@@ -98,6 +98,15 @@ def test_a_true_model_is_adequate_and_stays_as_it_is():
     assert found.verdict == 'adequate' and found.gain is None and found.model is model
 
 
+def test_a_parabola_over_temperature_stays_where_its_slope_is_withdrawn():
+    dwells = WANDERING.measure(gyro('bias_temperature_quadratic', 1e-5), np.random.default_rng(6))
+    found = diagnosis._name_causes(dwells, None)
+    slope = STATIC_EFFECTS['bias_temperature']
+    assert {slope, STATIC_EFFECTS['bias_temperature_quadratic']} <= set(found.fit.effects)
+    withdrawn = diagnosis._name_causes(dwells, None, [slope])
+    assert STATIC_EFFECTS['bias_temperature_quadratic'] in withdrawn.causes
+
+
 # sets, and what separates them
 
 def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(without_gain):

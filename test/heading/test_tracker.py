@@ -319,6 +319,16 @@ def test_another_calibration_at_rest_keeps_the_correction_that_waits_for_motion(
     assert tracker.heading == pytest.approx(200.0 * DEGREE, abs=1.0 * DEGREE)
 
 
+def test_calibrations_in_one_instant_of_a_rest_leave_finite_states():
+    tracker = HeadingTracker(XV3500, KNOWN, TrackerSettings(), keeps_steps=True)
+    for index in range(800):
+        tracker.add(INTERVAL * index, 0.0, np.array([0.0, -1.0]))
+    assert tracker.is_resting
+    for _ in range(2):  # no time passes for the second one, in which nothing is measured
+        tracker.use_calibration(XV3500, KNOWN)
+    assert all(np.isfinite(state.mean).all() for _, state in tracker.recalibrations)
+
+
 # how good, and how true
 
 def random_drive(generator, duration):
