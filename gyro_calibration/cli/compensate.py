@@ -91,6 +91,9 @@ def run(given: argparse.Namespace) -> Answer:
                          'or record the column moving.')
         if estimator.bias_message:
             lines.append(as_sentence(estimator.bias_message))
+        if not data['temperature_known']:
+            lines.append('The log has no temperature: a change of the bias with it is not in the '
+                         'standard deviation; record the column temperature_degc.')
     if found.errors:
         sums, counts, last = zip(*found.errors)
         mean = sum(sums) / sum(counts)
