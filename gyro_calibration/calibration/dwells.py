@@ -159,8 +159,12 @@ def dwells_from_table(log: Log) -> Dwells:
     remark = (f'{len(lost)} rows without output or reference are left out: '
               f'{format_list([str(row) for row in lost])}')
     rate, names = log.reference_rate[rows], log.others.get('sweep')
-    sweep = (_number_sweeps(rate) if names is None else np.array(
-        [list(dict.fromkeys(names)).index(names[row]) for row in rows]))
+    remarks = [remark] if len(lost) else []
+    if names is None:
+        sweep, how = _number_sweeps(rate)
+        remarks.append(f'without a column sweep, the {sweep[-1] + 1} sweeps are {how}')
+    else:
+        sweep = np.array([list(dict.fromkeys(names)).index(names[row]) for row in rows])
     try:
         deviation: Array = np.array(log.others.get(
             'deviation_dps', [math.nan] * len(log)), dtype=float)[rows] * DEGREE
@@ -178,7 +182,7 @@ def dwells_from_table(log: Log) -> Dwells:
         rounding, deviation = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
     return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
                   np.where(deviation > 0.0, deviation, np.nan), sweep,
-                  tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
+                  tuple(f'row {row + 1}' for row in rows), tuple(remarks),
                   tuple(np.split(rows, len(rows))), rounding)
 
 
@@ -195,31 +199,51 @@ def _largest_divisor(values: Array) -> float:
     return 0.0
 
 
-def _number_sweeps(rate: Array) -> Numbers:
+def _number_sweeps(rate: Array) -> tuple[Numbers, str]:
     """
-    Return the number of the sweep of each dwell, shape (n,).
+    Return the number of the sweep of each dwell, by the order of the rates, shape (n,), and how.
 
-    The rates of a sweep increase or decrease, or their absolute values do with changing sign, with
-    or without a rest between them; else nine blocks of consecutive dwells are taken as sweeps.
+    The rates of a sweep, without its rests, increase or decrease, or their absolute values do with
+    changing sign: whichever gives the fewest sweeps. Where the median of these has less than four
+    dwells, a sweep is the shortest block of dwells of three rates or more whose repetition is the
+    whole, in any order. Else nine blocks of consecutive dwells are taken as sweeps.
     """
-    turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
-    for used in (np.full(len(rate), True), turning) if turning.any() else ():
-        for value in (rate, np.abs(rate)):
-            sweep = np.zeros(len(rate), dtype=int)
-            sweep[used] = _number_passes(value[used])
-            # A rest belongs to the dwell before it.
-            sweep = np.maximum.accumulate(np.where(used, sweep, 0))
-            lengths = np.bincount(sweep[used])
-            if len(lengths) > 1 and np.median(lengths) >= 4:
-                return sweep
-    return np.arange(len(rate)) * min(9, len(rate)) // len(rate)
-
-
-def _number_passes(value: Array) -> Numbers:
-    """Assign numbers to passes, from where the direction reverses; repeats there are shared."""
-    change = np.diff(value)
+    number, largest = np.arange(len(rate)), float(np.abs(rate).max(initial=0.0))
+    turning = np.abs(rate) > max(1e-3 * largest, 0.01 * DEGREE)
     # Mean rates of opposite sign differ slightly in absolute value.
-    steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
+    tolerance = 0.005 * largest
+    if turning.any():
+        passes = min((_number_passes(value, tolerance)
+                      for value in (rate[turning], np.abs(rate[turning]))),
+                     key=lambda each: int(each[-1]))
+        # Of the rests between two sweeps, as many as precede the first sweep begin the next.
+        places, count = np.flatnonzero(turning), np.cumsum(turning)
+        after = np.minimum(count, len(places) - 1)
+        begins = ~turning & (places[after] - number <= places[0])
+        sweep = passes[np.where(begins, after, np.maximum(count - 1, 0))]
+        lengths = np.bincount(passes)
+        lengths += np.bincount(sweep) > lengths  # the rests of a sweep are one of its rates
+        if passes[-1] and np.median(lengths) >= 4:
+            return sweep, 'numbered by the order of the rates'
+    for length in range(3, len(rate) // 2 + 1):
+        if len(rate) % length == 0:
+            blocks = np.sort(rate.reshape(-1, length))
+            if ((np.ptp(blocks, axis=0) <= tolerance).all()
+                    and (np.diff(blocks[0]) > tolerance).sum() >= 2):
+                return number // length, 'numbered by the repetition of the rates'
+    return (number * min(9, len(rate)) // len(rate),
+            'blocks of consecutive dwells, since the order of the rates shows no sweeps')
+
+
+def _number_passes(value: Array, tolerance: float) -> Numbers:
+    """
+    Assign numbers to passes through values; a pass begins where the direction reverses.
+
+    Changes up to the tolerance have no direction. Values that are repeated where passes turn
+    belong to both in equal parts.
+    """
+    change = np.diff(value)
+    steps = np.where(np.abs(change) > tolerance, np.sign(change), 0.0)
     numbers = np.zeros(len(value), dtype=int)
     direction, last_step = 0.0, 0
     for place, step in enumerate(steps, 1):
@@ -381,7 +405,7 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None
                   else np.array([temperature[rows].mean() for rows in dwells]), deviation,
-                  _number_sweeps(rate),
+                  _number_sweeps(rate)[0],
                   tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
                   tuple(remarks), tuple(row[rows] for rows in dwells), rounding)
 

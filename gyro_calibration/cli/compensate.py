@@ -26,6 +26,7 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer
+from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
@@ -70,6 +71,26 @@ def run(given: argparse.Namespace) -> Answer:
         data.update(heading_rad=found.heading, heading_std_rad=deviation)
         known = '' if deviation is None else f' +- {deviation / DEGREE:.2f}'
         lines.append(f'Heading at the end: {found.heading / DEGREE:.2f}{known} deg.')
+    estimator = found.estimator
+    if estimator is None:
+        data['bias_is_calibrated'] = bool(model.self_calibration or model.fits_scale_and_bias[1])
+        if not data['bias_is_calibrated']:
+            lines.append('The bias is not known from a calibration: 0 was used, and its error is '
+                         'not in the standard deviation; run self-calibrate, or use --rest.')
+    else:
+        data.update(bias_is_calibrated=not estimator.is_bias_assumed,
+                    bias_ambiguity_rad_s=estimator.tracker.bias_ambiguity)
+        if estimator.is_bias_assumed and not found.has_wheels:
+            lines.append('The bias is not known from a calibration: the first steady rate within '
+                         f'{Assumptions.bias / DEGREE:g} deg/s was taken for that of a rest. If '
+                         'the log begins in a turn or a bend, the heading may be off by more than '
+                         'its standard deviation; run self-calibrate, begin the log with a rest, '
+                         'or record the column moving.')
+        if estimator.bias_message:
+            lines.append(as_sentence(estimator.bias_message))
+        if not data['temperature_known']:
+            lines.append('The log has no temperature: a change of the bias with it is not in the '
+                         'standard deviation; record the column temperature_degc.')
     if found.errors:
         sums, counts, last = zip(*found.errors)
         mean = sum(sums) / sum(counts)
@@ -125,12 +146,15 @@ class _Totals:
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
+    estimator: HeadingEstimator | None = None
+    has_wheels: bool = False
     errors: list[tuple[float, int, float]] = field(default_factory=list)
     first_error: float = math.nan
 
     def add(self, piece: CompensatedBlock) -> None:
         log, columns = piece.log, piece.columns
-        self.intervals = piece.intervals
+        self.intervals, self.estimator = piece.intervals, piece.estimator
+        self.has_wheels = log.moving is not None
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
         self.counts.update(
             rows=len(log), rows_without_output=without,
@@ -158,6 +182,7 @@ class CompensatedBlock:
     is_plausible: Mask
     columns: dict[str, Array]
     intervals: Intervals
+    estimator: HeadingEstimator | None = None  # after the block, where rests were detected
 
     def full_columns(self) -> dict[str, Array]:
         """Return the new columns of all rows; nan where the row is not plausible."""
@@ -280,4 +305,5 @@ def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> Compens
     return CompensatedBlock(log, known, {
         'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
         'rate_std_rad_s': np.sqrt(rate_variance), 'resting': resting.astype(float),
-        'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals)
+        'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals,
+        estimator)

@@ -83,6 +83,8 @@ class HeadingEstimator:
     of the uncertain values of the current model. `rate` is the last one, rad/s, zero at rest, and
     `corrected_rate` that before the tracker. `temperature`, degC, is None before the first. The
     sum of `heading_before_resets` and the heading of the tracker, rad, is not changed by resets.
+    `is_bias_assumed` tells whether neither the model nor a self-calibration has a bias with its
+    variance.
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
@@ -145,21 +147,30 @@ class HeadingEstimator:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
         model, here, self._calibration_message = self.model, self._known_temperature, ''
         calibration, assumed = model.self_calibration, self._assumptions.covariance
-        if calibration is None and model.covariance is None:
-            calibration = SelfCalibration(covariance=assumed)
+        fits_scale, fits_bias = (
+            (False, False) if model.covariance is None else model.fits_scale_and_bias)
+        if calibration is None and not (fits_scale and fits_bias):
+            # What is not calibrated is not known; a self-calibration takes the place of both
+            # tolerances of the model.
+            calibration = SelfCalibration(covariance=(
+                (model.tolerance.scale_factor_error ** 2 if fits_scale else assumed[0][0], 0.0),
+                (0.0, model.tolerance.bias ** 2 if fits_bias else assumed[1][1])))
         elif calibration is not None and (calibration.covariance is None
                                           or not np.isfinite(calibration.covariance).all()):
-            calibration = replace(calibration, covariance=assumed)
+            calibration, fits_bias = replace(calibration, covariance=assumed), False
+        self.is_bias_assumed = not fits_bias and (
+            self.model.self_calibration is None or calibration is not model.self_calibration)
         if calibration is not model.self_calibration:
             model = with_self_calibration(model, calibration)
         age: float | None = 0.0
-        if not is_fresh and calibration is None:
+        if not is_fresh and self.model.self_calibration is None and fits_bias:
             if here is None or not self.table.entries:
                 age = None
             else:  # the bias of earlier runs
                 bias, variance = self.table.predict(here, now)
+                of_scale = 0.0 if calibration is None else assumed[0][0]
                 model = with_self_calibration(
-                    model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance))))
+                    model, SelfCalibration(0.0, bias, ((of_scale, 0.0), (0.0, variance))))
         elif (not is_fresh and self.model.self_calibration is None
               and not self.table.entries):
             age = None

@@ -217,6 +217,24 @@ class GyroModel:
                      if value > 0.0 and name not in found)
 
     @cached_property
+    def fits_scale_and_bias(self) -> tuple[bool, bool]:
+        """Tell whether scale factor error and bias are values of the model, or sums of them."""
+        # whether columns of the effects add up to the rate, and to 1, in any surroundings
+        number = np.arange(100.0)
+        rates = np.cos(number)
+        channels = Channels(rates, rates, self.reference_temperature + 10.0 * np.sin(3.0 * number),
+                            number ** 2)
+        columns = [np.broadcast_to(row, rates.shape) for term in self.terms
+                   if not term.effect.not_compensated for row in term.sensitivity(channels)]
+        if not columns:
+            return False, False
+        wanted = np.array([rates, np.ones(len(rates))]).T
+        matrix = np.array(columns).T
+        rest = wanted - matrix @ np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+        scale, bias = (np.abs(rest).max(axis=0) < 1e-6).tolist()
+        return scale, bias
+
+    @cached_property
     def prior_deviations(self) -> Array | None:
         """Return the deviations of (s, b) before a calibration, shape (2,); inf if unknown."""
         # the tolerance of a fleet is the spread of a type, that of another model of one gyro

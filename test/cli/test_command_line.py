@@ -153,6 +153,26 @@ def test_compensate_looks_for_rests(run, compensate, tmp_path, words, resting):
             else seen is None)
 
 
+@pytest.mark.parametrize('words, said', [((), '0 was used'), (('--rest',), 'first steady rate')])
+@pytest.mark.parametrize('effects, known', [
+    ('{scale_factor_error: {scale_factor_error: 0.01}}', False), ('{bias: {bias: 0.01}}', True)])
+def test_compensate_warns_of_a_bias_that_is_not_calibrated(compensate, words, said, effects,
+                                                           known):
+    """The robot turns at 0.3 deg/s where the log begins, then rests."""
+    generator = np.random.default_rng(1)
+    rate = np.where(np.arange(3000) < 1500, 0.3 * DEGREE, 0.0)
+    log = Log(output=rate + 1e-3 * generator.standard_normal(3000), time=np.arange(3000) / 100.0)
+    model = f'effects: {effects}\ncovariance: [[1.0e-8]]\nnoise: {{angle_random_walk: 1.0e-4}}'
+    text = compensate(log, model, *words).text
+    assert ('The bias is not known from a calibration' in text and said in text) != known
+    answer = json.loads(compensate(log, model, *words, '--json').text)
+    assert answer['bias_is_calibrated'] == known
+    assert ('a change of the bias with it is not in the standard deviation' in text) == bool(words)
+    if words:
+        assert (answer['bias_ambiguity_rad_s'] > 0.1 * DEGREE) != known
+        assert ('everal steady rates may be that of a rest' in text) != known
+
+
 @pytest.mark.parametrize('words', [(), ('--rest',), ('--hindsight',)])
 def test_compensate_does_not_take_another_unit_of_time_for_seconds(compensate, words):
     in_ms = Log(output=np.full(300, DEGREE), time=10.0 * np.arange(300))

@@ -22,7 +22,8 @@ from gyro_calibration.heading.bias_table import BiasTable, Entry
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
+from gyro_calibration.model.effects import (
+    BIAS, BIAS_TEMPERATURE, CATALOGUE, rate_temperature_polynomial, SCALE_FACTOR_ERROR)
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
@@ -90,6 +91,33 @@ def test_the_scale_factor_error_acts_on_the_turn_and_not_on_the_bias_that_rests_
     gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=DEGREE).go(60.0, wheels=False)
     gyro.go(60.0, DEGREE * sense, wheels=True)
     assert gyro.deviation == pytest.approx(60.0 * DEGREE * 0.03, rel=0.35)
+
+
+@pytest.mark.parametrize('effects, unknown', [
+    ([], (True, True)), ([SCALE_FACTOR_ERROR], (False, True)), ([BIAS], (True, False)),
+    ([SCALE_FACTOR_ERROR, BIAS_TEMPERATURE], (False, True)),
+    ([BIAS, SCALE_FACTOR_ERROR], (False, False)),
+    ([rate_temperature_polynomial(1, 1)], (False, False))],
+    ids=lambda each: None if each and isinstance(each[0], bool) else ' '.join(
+        effect.name for effect in each))
+def test_what_a_model_was_not_fitted_to_is_not_known(effects, unknown):
+    terms = tuple(Term(effect, tuple(0.0 if each.default is None else each.default
+                                     for each in effect.parameters)) for effect in effects)
+    count = sum(len(term.fitted_indices) for term in terms)
+    live = begun(GyroModel(terms, 1e-12 * np.eye(count), noise=NOISE))
+    live.add(0.0, 1.0, NOW)
+    used = live.current_model.self_calibration
+    assert live.bias_variance == pytest.approx(
+        (0.5 * DEGREE) ** 2 if unknown[1] else 0.0, abs=1e-8)
+    assert live.is_bias_assumed == unknown[1]
+    assert (0.0 if used is None else used.covariance[0][0]) == (9e-4 if unknown[0] else 0.0)
+
+
+def test_a_bias_that_the_model_was_not_fitted_to_is_estimated_at_rest():
+    model = GyroModel((Term(SCALE_FACTOR_ERROR, (0.0,)),), np.array([[1e-8]]), noise=NOISE)
+    gyro = Gyro(begun(model), bias=0.3 * DEGREE).go(20.0).go(10.0, 0.5).go(20.0)
+    assert abs(gyro.error) < 4.0 * gyro.deviation
+    assert abs(gyro.live.tracker.bias[0] - 0.3 * DEGREE) < 0.02 * DEGREE
 
 
 @pytest.mark.parametrize('temperature', [25.0, None])

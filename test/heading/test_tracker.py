@@ -365,8 +365,8 @@ def simulated(parts, seed=0, bias=-0.2):
 def followed(parts, bias=0.5, hindsight=False, seed=0, true_bias=-0.2):
     """Return error and stated deviation of the heading, deg, with a prior of the bias, deg/s."""
     model = gyro_calibration.read_model({
-        'effects': {'bias': {'bias': 0.0}}, 'covariance': [[(bias * DEGREE) ** 2]],
-        'noise': vars(NOISE)})
+        'effects': {'bias': {'bias': 0.0}, 'scale_factor_error': {'scale_factor_error': 0.0}},
+        'covariance': [[(bias * DEGREE) ** 2, 0.0], [0.0, 0.0]], 'noise': vars(NOISE)})
     time, output, true = simulated(parts, seed, true_bias)
     found = gyro_calibration.track(Log(time, output), model, hindsight=hindsight)
     return (found.heading - found.heading[0]) / DEGREE - true, found.heading_std / DEGREE

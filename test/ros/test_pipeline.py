@@ -31,7 +31,8 @@ import yaml
 NOISE, BIAS, SLOW = 5e-4, 0.012, 0.04  # rad/√s, rad/s, s between samples
 KNOWN = ('effects: {bias: {bias: 0.01}}\n'
          'noise: {angle_random_walk: 5.0e-4, bias_instability: 1.0e-5}\n')
-CERTAIN = KNOWN + 'covariance: [[1.0e-8]]\norigin: {date: "2023-11-14T22:00:00+00:00"}\n'
+CERTAIN = KNOWN.replace('0.01}}', '0.01}, scale_factor_error: {scale_factor_error: 0.0}}') + (
+    'covariance: [[1.0e-8, 0.0], [0.0, 1.0e-10]]\norigin: {date: "2023-11-14T22:00:00+00:00"}\n')
 
 
 def noisy(seconds, rate=0.0, bias=BIAS, seed=0):
