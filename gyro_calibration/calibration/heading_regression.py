@@ -1174,11 +1174,12 @@ def find_motion_errors(log: Log) -> tuple[float, float] | None:
     """
     Return how a rate by odometry errs over a second in motion, and the gyro in rests, rad.
 
-    Such a rate is exactly 0 in rests. In motion its turns differ from those of the gyro by more
-    than in rests (F-test, at 1 %), and by more than a delay, a lag or effects of the gyro explain,
-    which are smooth functions of the rate (differences of neighbours: Rice, Annals of Statistics
-    12, 1984). None for another rate, for one that is mostly steady in motion, as of a rate table,
-    and for one that the motion follows later than a gyro does, as a robot its command.
+    Such a rate is exactly 0 in rests. In motion it errs by more than the gyro: the variance of the
+    difference of their turns is more than twice that of rests (F-test, at 1 %), beyond what a
+    delay, a lag or effects of the gyro explain, which are smooth functions of the rate
+    (differences of neighbours: Rice, Annals of Statistics 12, 1984). None for another rate, for
+    one that is mostly steady in motion, as of a rate table, and for one that the motion follows
+    later than a gyro does, as a robot its command.
     """
     rate, time = log.reference_rate, log.time
     known = np.isfinite([] if rate is None else rate)
@@ -1219,8 +1220,8 @@ def find_motion_errors(log: Log) -> tuple[float, float] | None:
     of_rests = of_rests[np.abs(of_rests) <= 5.0 * robust_deviation(of_rests)]
     usual = math.hypot(float(np.std(of_rests)), quantization_step(
         log.output[np.isfinite(log.output)]) / math.sqrt(12.0))
-    return ((errors, usual) if errors > usual * math.sqrt(fisher.isf(FALSE_ALARM_RATE, *freedom))
-            else None)
+    return ((errors, usual)
+            if errors ** 2 > 2.0 * usual ** 2 * fisher.isf(FALSE_ALARM_RATE, *freedom) else None)
 
 
 def _weighted_fit(columns: Array, observed: Array,
