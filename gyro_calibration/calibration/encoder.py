@@ -35,8 +35,8 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     interpolate_reference, join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, fit_course, is_noisy, MAX_ENCODER_OFFSET, MAX_FOLLOWED_RESIDUAL,
-    TECHNOLOGY_PRIORS, WANDER_COSINES)
+    COURSE_TREATMENT, find_motion_errors, fit_course, is_noisy, MAX_ENCODER_OFFSET,
+    MAX_FOLLOWED_RESIDUAL, TECHNOLOGY_PRIORS, WANDER_COSINES)
 from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
     ScaleBiasFit)
@@ -159,7 +159,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
     if method is None:
-        method = 'likelihood'
+        method = 'course' if find_motion_errors(log) is not None else 'likelihood'
         if log.reference_heading is not None and log.time is not None:
             sampled = replace(log, reference_heading=interpolate_reference(
                 log.time, log.reference_heading))

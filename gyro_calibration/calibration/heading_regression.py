@@ -1202,7 +1202,7 @@ def find_motion_errors(log: Log) -> tuple[float, float] | None:
     columns = np.column_stack([
         *(np.diff(np.interp(at - lag, time, powers[0])) for lag in lags),
         *(np.diff(np.interp(at, time, each)) for each in powers[1:]),
-        np.ones(len(at) - 1), at[1:], in_motion])
+        np.linspace(-1.0, 1.0, len(at) - 1)[:, None] ** np.arange(4.0), in_motion])  # a warm-up
     # the median of differences has a third of the freedom of a variance
     freedom = (in_motion.sum() - columns.shape[1]) / 3.0, at_rest.sum() - 2.0
     if min(freedom) < 1.0 or 2 * (in_motion & (changed == 0.0)).sum() > in_motion.sum():
