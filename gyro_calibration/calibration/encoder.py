@@ -30,7 +30,7 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, fit_course, is_noisy, lag_deviation, MAX_ENCODER_OFFSET,
+    COURSE_TREATMENT, find_motion_errors, fit_course, is_noisy, lag_deviation, MAX_ENCODER_OFFSET,
     MAX_FOLLOWED_RESIDUAL, TECHNOLOGY_PRIORS, WANDER_COSINES)
 from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
@@ -108,7 +108,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
     if method is None:
-        method = 'likelihood'
+        method = 'course' if find_motion_errors(log) is not None else 'likelihood'
         if log.reference_heading is not None:
             method = 'course' if is_course(log) or is_noisy(log) else 'likelihood'
             longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))

@@ -48,9 +48,10 @@ from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, bias_wander_columns, carried_shares, fit_noise_grid, GridFit,
     heading_noise, HierarchicalPrior, SharedNoise)
 from gyro_calibration.calibration.own_instants import (
-    is_slow, keep_own_instants, MAX_ROUNDING_STEP, OwnInstants)
+    is_slow, keep_own_instants, MAX_GYRO_LAG, MAX_ROUNDING_STEP, OwnInstants)
 from gyro_calibration.calibration.reference_noise import (
     find_rests, heading_difference, MIN_COURSE_NOISE, rate_noise_share)
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
@@ -65,6 +66,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import expit
+from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
@@ -89,6 +91,8 @@ MIN_STRETCHES = 3.0
 _DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
 #: Least number of spans, and largest deviation in a span from a gyro that follows, rad.
 _MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
+#: Lags that are fitted to see whether a motion follows a rate late, to both sides, s.
+_ERROR_LAGS = np.array([0.0, 0.05, 0.1, 0.2, 0.4, 0.8])
 
 
 def lag_deviation(delay: float) -> float:
@@ -557,7 +561,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         measured_rows &= ~find_lost_reference(np.isfinite(rate))
         if is_slow(rate):  # its integral errs by what happens between its values
             treatment = replace(treatment, errs_as_heading=True)
-        else:
+        elif treatment.is_fine:
             noisier = rate_noise_share(log)
             white = math.hypot(white, white_noise_deviation(rate))
     at_samples = reference if log.reference_heading is None else log.reference_heading
@@ -623,7 +627,10 @@ def _place_values(log: Log, instants: OwnInstants | None) -> tuple[Array, Array]
     if not is_slow(rate):
         return integrate_with_curvature(at, bridge_gaps(rate)), at
     turned = np.full(len(at), np.nan)
-    turned[own] = CubicSpline(at[own], values[own]).antiderivative()(at[own])
+    steps = np.diff(CubicSpline(at[own], values[own]).antiderivative()(at[own]))
+    # a spline swings where the motion stops
+    steps[(values[own][1:] == 0.0) & (values[own][:-1] == 0.0)] = 0.0
+    turned[own] = np.append(0.0, np.cumsum(steps))
     return turned, at
 
 
@@ -1068,6 +1075,60 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     drift = fit.reference_drift
     return drift if drift and fit.p_value(fit.value_slice(_DRIFT_TERM).start) < (
         MIN_FIT_PROBABILITY) else None
+
+
+def find_motion_errors(log: Log) -> tuple[float, float] | None:
+    """
+    Return how a rate by odometry errs over a second in motion, and the gyro in rests, rad.
+
+    Such a rate is exactly 0 in rests. In motion it errs by more than the gyro: the variance of the
+    difference of their turns is more than twice that of rests (F-test, at 1 %), beyond what a
+    delay, a lag or effects of the gyro explain, which are smooth functions of the rate
+    (differences of neighbours: Rice, Annals of Statistics 12, 1984). None for another rate, for
+    one that is mostly steady in motion, as of a rate table, and for one that the motion follows
+    later than a gyro does, as a robot its command.
+    """
+    rate, time = log.reference_rate, log.time
+    known = np.isfinite([] if rate is None else rate)
+    if rate is None or time is None or log.output is None or not known.any():
+        return None
+    rate = np.interp(time, time[known], rate[known])
+    turned = integrate(time, bridge_gaps(log.output))
+    powers = [integrate(time, each) for each in (
+        rate, np.abs(rate), rate ** 2, rate ** 3, (time - time.mean()) * rate)]
+    at = np.arange(time[0] + _ERROR_LAGS[-1], time[-1] - _ERROR_LAGS[-1], 1.0)
+    if len(at) < 2:
+        return None
+    is_lost = ~np.isfinite(log.output) | find_lost_reference(known)
+    counts = np.cumsum([np.ones(len(time)), is_lost, rate != 0.0,
+                        np.diff(rate, prepend=rate[0]) != 0.0], axis=1)
+    samples, lost, moved, changed = np.diff(counts[:, np.searchsorted(time, at)])
+    is_whole = (lost == 0.0) & (samples > 0.5 * np.median(samples))
+    in_motion, at_rest = is_whole & (moved > 0.5 * samples), is_whole & (moved == 0.0)
+    lags = np.append(-_ERROR_LAGS[:0:-1], _ERROR_LAGS)
+    columns = np.column_stack([
+        *(np.diff(np.interp(at - lag, time, powers[0])) for lag in lags),
+        *(np.diff(np.interp(at, time, each)) for each in powers[1:]),
+        np.linspace(-1.0, 1.0, len(at) - 1)[:, None] ** np.arange(4.0), in_motion])  # a warm-up
+    # the median of differences has a third of the freedom of a variance
+    freedom = (in_motion.sum() - columns.shape[1]) / 3.0, at_rest.sum() - 2.0
+    if min(freedom) < 1.0 or 2 * (in_motion & (changed == 0.0)).sum() > in_motion.sum():
+        return None
+    values, left = _robust_least_squares(
+        columns[is_whole], np.diff(np.interp(at, time, turned))[is_whole],
+        np.full(columns.shape[1], math.inf))
+    response = values[:len(lags)]
+    if response @ lags > MAX_GYRO_LAG * response.sum():
+        return None
+    by_rate = np.argsort(columns[in_motion, _ERROR_LAGS.size - 1], kind='stable')
+    errors = robust_deviation(np.diff(left[in_motion[is_whole]][by_rate])) / math.sqrt(2.0)
+    # in rests the rounding of an output with little noise does not scatter
+    of_rests = left[at_rest[is_whole]] - np.median(left[at_rest[is_whole]])
+    of_rests = of_rests[np.abs(of_rests) <= 5.0 * robust_deviation(of_rests)]
+    usual = math.hypot(float(np.std(of_rests)), quantization_step(
+        log.output[np.isfinite(log.output)]) / math.sqrt(12.0))
+    return ((errors, usual)
+            if errors ** 2 > 2.0 * usual ** 2 * fisher.isf(FALSE_ALARM_RATE, *freedom) else None)
 
 
 def is_noisy(log: Log) -> bool:

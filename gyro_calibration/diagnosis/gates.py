@@ -29,7 +29,7 @@ from typing import NamedTuple
 from gyro_calibration.calibration.dwells import (
     few_values_remedy, find_lost_reference, require_output)
 from gyro_calibration.calibration.encoder import choose_reference
-from gyro_calibration.calibration.heading_regression import find_drift
+from gyro_calibration.calibration.heading_regression import find_drift, find_motion_errors
 from gyro_calibration.calibration.own_instants import (
     interpolate_by_splines, is_slow, MAX_GYRO_LAG, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
@@ -715,7 +715,11 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
     if stated_kind is not None:
         return Reference(stated_kind, 'as given')
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        return Reference('rate_command', 'the log has a reference rate')
+        if (errors := find_motion_errors(log)) is None:
+            return Reference('rate_command', 'the log has a reference rate')
+        return Reference('odometry', 'its rate is 0 in rests, and errs in motion: over a second '
+                         'it differs from the gyro by {:.2g} deg there, by {:.2g} deg in rests'
+                         .format(*np.array(errors) / DEGREE))
     heading = log.reference_heading
     if heading is None or not np.isfinite(heading).any():
         return Reference('rest', 'the log has no reference')
@@ -741,12 +745,14 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     """Tell whether the errors of the reference, not those of the gyro, limit a diagnosis."""
     if log.time is None or log.output is None or reference.kind == 'rest':
         return False
+    if reference.kind == 'odometry':
+        return True
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
                 and (is_slow(log.reference_rate)
                      or rate_noise_share(log, reference.evidence == 'as given')
                      > _MAX_RATE_NOISE_SHARE))
-    if (reference.kind in ('course', 'odometry') or reference.evidence == 'as given'
+    if (reference.kind == 'course' or reference.evidence == 'as given'
             or cross_rotation(log).size):  # of which a part is in the output
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)

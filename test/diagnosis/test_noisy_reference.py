@@ -510,6 +510,51 @@ def test_what_the_gyro_does_in_motion_is_no_drift_of_the_reference(hidden):
     assert sum(each is not None for each in drifts) <= 1
 
 
+def wheels(seed, asymmetry=0.0, slip=0.01, noise=0.3 * DEGREE, every=1, lag=0.0):
+    """Return a log of turns and rests, whose reference is the rate of wheels, and the bias."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, 240.0, 0.02)
+    rate, end, smooth = np.zeros(len(time)), 0.0, np.hanning(21) / np.hanning(21).sum()
+    while end < time[-1]:
+        begin = end + generator.choice([0.0, 0.0, generator.uniform(3.0, 8.0)])
+        end = begin + generator.uniform(1.0, 4.0)
+        rate[(time >= begin) & (time < end)] = generator.normal(0.0, 0.6)
+    rate = np.convolve(rate, smooth, 'same')
+    bias = generator.normal(0.0, 0.1) * DEGREE
+    output = 1.002 * rate + asymmetry * np.abs(rate) + bias + 5e-4 * generator.normal(
+        size=len(time))
+    slips = lfilter([0.02], [1.0, -0.98], generator.normal(size=len(time)))
+    measured = (rate != 0.0) * (rate * (1.0 + slip * slips / slips.std())
+                                + noise * generator.normal(size=len(time)))
+    measured = np.interp(time + lag, time, measured)
+    measured[np.arange(len(time)) % every > 0] = np.nan
+    return Log(time=time, output=output, reference_rate=measured), bias
+
+
+@pytest.mark.parametrize('every', [1, 3])
+@pytest.mark.parametrize('asymmetry', [0.0, 0.03])
+def test_the_errors_of_a_rate_by_odometry_are_no_effects_of_the_gyro(asymmetry, every):
+    # taken for an exact rate, they were a dead zone, steps of the bias or slips
+    log, bias = wheels(5, asymmetry, every=every)
+    found = diagnosed(log)
+    assert found.reference.kind == 'odometry' and 'errs in motion' in found.reference.evidence
+    assert [*established(found)] == ['scale_factor_asymmetry'] * bool(asymmetry)
+    assert not found.unexplained
+    values = {name: (size, deviation) for name, _, size, deviation in found.model.estimates()}
+    assert abs(values['bias'][0] - bias) < 2.5 * values['bias'][1] < 0.03 * DEGREE
+    assert abs(values['scale_factor_error'][0] - 0.002) < 2.5 * values['scale_factor_error'][1]
+    fit = calibrate_encoder(log)
+    assert fit.method == 'course'
+    assert abs(fit.fit.bias - bias) < 2.5 * np.sqrt(fit.fit.covariance[1, 1]) < 0.03 * DEGREE
+
+
+@pytest.mark.parametrize('log', [
+    wheels(6, slip=0.0, noise=0.0)[0], wheels(6, 0.03, slip=0.0, noise=0.0)[0],
+    wheels(6, lag=0.25)[0]], ids=['exact', 'exact, asymmetric', 'late, as after a command'])
+def test_a_rate_that_is_exact_or_that_a_motion_follows_late_is_no_odometry(log):
+    assert classify_reference(log).kind == 'rate_command'
+
+
 @pytest.mark.parametrize('spans', [lay_out_spans(drive(3), 'course'),
                                    lay_out_spans(odometry(3, 0.0)[0])])
 def test_columns_of_steps_are_those_of_the_effect_but_beside_the_step(spans):
