@@ -327,8 +327,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
     elif settled:
         found = replace(found, unexplained=[settled[1]])
     else:
-        before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
-                         for each in (fit_causes(plain.problem, []), moved))
+        before, after = map(_residual_variance, (fit_causes(plain.problem, []), moved))
         found = replace(found, unexplained=[Unexplained(
             'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
     return replace(found, remarks=[_SETTLED_REMARK] if settled else [])
@@ -621,20 +620,19 @@ def _unexplained_structures(search: Search, fit: RegressionFit,
         name = (CAUSES[known.cause].along if is_named(known)
                 else unnamed_variable(known))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-    least = _residual_variance(search, causes)
-    most = _residual_variance(search, fit.causes)
+    least = _residual_variance(fit_causes(search.problem, causes))
+    most = _residual_variance(fit_causes(search.problem, fit.causes))
     structures = []
     for name, places in variables.items():
-        without = _residual_variance(
-            search, [known for place, known in enumerate(causes) if place not in places])
+        without = _residual_variance(fit_causes(search.problem, [
+            known for place, known in enumerate(causes) if place not in places]))
         chance = min(p_value(causes[place].cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures
 
 
-def _residual_variance(search: Search, causes: Sequence[Candidate]) -> float:
-    """Return the variance of the residual of some causes at the grid points."""
-    left = fit_causes(search.problem, causes).unbiased_residuals
-    return float(np.var(np.concatenate([each.resample(rest) for each, rest
-                                        in zip(search.problem.replays, left)])))
+def _residual_variance(fit: RegressionFit) -> float:
+    """Return the variance of the residual at the grid points, which have no gaps."""
+    return float(np.var(np.concatenate([each.resample(left) for each, left
+                                        in zip(fit.problem.replays, fit.unbiased_residuals)])))

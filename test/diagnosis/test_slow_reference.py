@@ -79,6 +79,28 @@ def test_a_slow_reference_shows_the_gyro_and_nothing_else(name, asymmetry, seed)
     assert estimates(found)['bias'][0] == pytest.approx(BIAS, abs=0.03 * DEGREE)
 
 
+@pytest.mark.parametrize('seed', seeds(1))
+def test_an_encoder_with_empty_cells_between_its_readings_shows_the_values(seed):
+    log, _, heading = turning(seed)
+    codes = 0.05 * DEGREE * np.round(heading(TIME) / (0.05 * DEGREE))
+    codes[np.arange(len(TIME)) % 5 > 0] = np.nan
+    found = diagnose([replace(log, reference_heading=codes)], np.random.default_rng(0))
+    assert found.reference.kind == 'encoder' and not established(found)
+    for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
+        estimate, deviation = estimates(found)[name]
+        assert abs(estimate - true) < 3.0 * deviation < 0.5 * abs(true)
+
+
+def test_a_reference_that_is_smoother_than_the_motion_has_a_share_of_the_residual():
+    log, rate, _ = turning(3)
+    window = np.hanning(12)[1:-1]
+    smoothed = np.convolve(rate(TIME), window / window.sum(), 'same')
+    smoothed[1::2] = np.nan  # as the last sample
+    found = diagnose([replace(log, reference_rate=smoothed)], np.random.default_rng(0))
+    assert [each.along for each in found.unexplained] == ['rate_change']
+    assert 0.9 < found.unexplained[0].share_of_variance <= 1.0
+
+
 def test_all_verbs_take_the_heading_where_a_rate_is_late_and_state_that_once():
     """The twist of odometry is often a mean over the last second, and its pose is not."""
     log, rate, heading = turning(4)
