@@ -280,6 +280,10 @@ def test_a_calculated_motion_has_no_encoder():
                         np.full(20, 0.05))
     assert (not encoder_step(np.cumsum(rate) * INTERVAL) and not encoder_step(np.sin(time))
             and not encoder_step(np.cumsum(ramps) * 0.05))
+    # an encoder whose steps pass in whole numbers at most rates, or in even patterns
+    for rates in ([0.0, 100.0, 200.0], [0.0, 60.0, -40.0, 10.0]):
+        swept = np.cumsum(np.convolve(np.repeat(rates, 2000), np.full(40, 0.025))) * INTERVAL
+        assert encoder_step(np.round(swept / 0.5) * 0.5) == pytest.approx(0.5)
     read = np.round(np.cumsum(ramps) * 0.05 / (0.03 * DEGREE)) * 0.03 * DEGREE
     assert encoder_step(read) == pytest.approx(0.03 * DEGREE)
 

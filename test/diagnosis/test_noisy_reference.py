@@ -348,6 +348,13 @@ def test_the_kind_of_a_reference_is_given_or_found():
             and not is_reference_limiting(exact, classify_reference(exact)))
     assert classify_reference(exact, 'odometry').kind == 'odometry' and is_reference_limiting(
         exact, classify_reference(exact, 'odometry'))
+    # noise that a file gives with many digits, and a fine encoder
+    turned, noise = exact.reference_heading, 1e-3 * np.random.default_rng(0).standard_normal(
+        len(log.time))
+    for heading, step, kind in ((turned + noise, 1.7e-6, 'motion_capture'),
+                                (turned, 9.59e-5, 'encoder')):
+        codes = np.round(heading / step) * step
+        assert classify_reference(replace(log, reference_heading=codes)).kind == kind
     assert classify_reference(replace(log, reference_rate=log.output)).kind == 'rate_command'
     assert classify_reference(replace(log, reference_heading=None)).kind == 'rest'
     assert classify_reference(replace(log, reference_rate=np.nan * log.output)).kind == 'course'
