@@ -298,8 +298,8 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
     difference = turned - np.diff(integrate(time, output)[known])
     late = MAX_ENCODER_OFFSET / float(np.median(np.diff(time)))
     around = 2 * math.ceil(min(late, len(time))) + 1
-    slowest, fastest = (find(output, around)[known[1:]] * apart
-                        for find in (minimum_filter1d, maximum_filter1d))
+    slowest, fastest = (most.reduceat(find(output, around), known)[:-1] * apart for most, find in (
+        (np.minimum, minimum_filter1d), (np.maximum, maximum_filter1d)))
     # a turn that the gyro shows late, or not at first, has such turns before and after it
     padded = np.pad(turned, 1, mode='edge')
     alone = turned - 0.5 * (padded[2:] + padded[:-2])

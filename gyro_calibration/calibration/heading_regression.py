@@ -1031,6 +1031,7 @@ class WhitenedRegression:
     # numbers of the stretch of each row, and, of an encoder, of the place of the shaft
     clusters: tuple[NDArray[np.intp], ...]
     stretch_count: int  # number of stretches of the log; those after them are priors
+    cosines: slice  # of the clusters, those of the cosines of the wandering bias
     noise: GridFit  # that whitens
 
     def whiten_columns(self, columns: Array) -> Array:
@@ -1057,13 +1058,15 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     columns = np.column_stack([design_matrix(spans, causes), waves])
     deviation = np.append(spans.prior_deviations(causes), np.sqrt(variance))
     prior = np.diag(1.0 / deviation)[np.isfinite(deviation)]
+    first = -waves.shape[1]
+    cosines = slice(first, (first + np.count_nonzero(shared[0].variance)) or None)
     stretches = spans.stretch_numbers
     sectors = [spans.shaft_sectors] if spans.uses_code_changes else []
     clusters = tuple(np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
                      for each in (stretches, *sectors))
     return WhitenedRegression(np.append(noise.whiten(spans.observed), np.zeros(len(prior))),
                               np.concatenate([noise.whiten(columns), prior]), clusters,
-                              int(stretches.max()) + 1, noise)
+                              int(stretches.max()) + 1, cosines, noise)
 
 
 # a course over ground

@@ -820,7 +820,8 @@ def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[s
     least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
     return [_cluster_robust_evidence(
         given[:, place], left,
-        clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], least[place])
+        clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], data.cosines,
+        least[place])
         for place, each in zip(places, terms)]
 
 
@@ -834,8 +835,13 @@ def _given_design(data: WhitenedRegression, columns: Array,
 
 
 def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
-                             min_sizes: Array) -> Evidence:
-    """Return the least evidence by any of the clusterings."""
+                             cosines: slice, min_sizes: Array) -> Evidence:
+    """
+    Return the least evidence by any of the clusterings.
+
+    Evidence against a wander of the bias counts as that of all its cosines, since all of them show
+    its size, although a slow cause is in few of them.
+    """
     information = x.T @ x
     size = np.sqrt(np.diag(information))
     if not (size > min_sizes).all():
@@ -848,6 +854,7 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
     for cluster in clusters:
         scores = np.array([np.bincount(cluster, part * off) for part in x.T])
         shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
+        shares[cosines] = shares[cosines].mean()
         effective = float(shares.sum() ** 2 / (shares ** 2).sum())
         scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
         ratio = max(float(np.linalg.eigvalsh(root @ scatter @ root.T).max()), 1.0)

@@ -137,6 +137,45 @@ def test_a_jump_of_the_heading_is_a_slip_of_the_reference_and_changes_nothing_el
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.003 * DEGREE)
 
 
+def stop_and_go(generator, time):
+    """Return the rate of a robot that turns for one to six seconds at a time, or rests."""
+    edges = np.cumsum(generator.uniform(1.0, 6.0, int(time[-1])))
+    rates = generator.choice([-1.0, 0.0, 1.0], len(edges)) * generator.uniform(
+        2.0, 80.0, len(edges)) * DEGREE
+    interval = time[1] - time[0]
+    return lfilter([interval / 0.2], [1.0, interval / 0.2 - 1.0], rates[np.searchsorted(
+        edges, time)])
+
+
+def test_turns_between_fixes_of_a_second_are_no_jumps_of_the_heading():
+    generator = np.random.default_rng(9)
+    time = np.arange(0.0, 400.0, 0.04)
+    rate = stop_and_go(generator, time)
+    course = np.full(len(time), np.nan)
+    course[::25] = (np.cumsum(rate) * 0.04 + 0.02 * rate)[::25]
+    course += 0.3 * DEGREE * generator.standard_normal(len(time))
+    output = rate + BIAS_TRUE + 0.03 * DEGREE * generator.standard_normal(len(time))
+    found = diagnosed(Log(output=output, time=time, reference_heading=course))
+    assert 'reference_slip' not in {each.effect for each in found.findings}, terminal_lines(found)
+
+
+@pytest.mark.parametrize('size', (0.0, 0.2))
+def test_a_bias_that_drifts_beside_motion_capture_is_a_ramp_and_one_that_does_not_is_none(size):
+    generator = np.random.default_rng(10)
+    time = np.arange(0.0, 600.0, 0.04)
+    rate, noise = stop_and_go(generator, time), generator.standard_normal((3, len(time)))
+    walk = np.cumsum(noise[0]) * 2e-6 * np.sqrt(0.04)
+    output = ((1.0 + SCALE) * rate + BIAS_TRUE + size * DEGREE * time / 600.0 + walk
+              + 0.05 * DEGREE * noise[1])
+    heading = np.cumsum(rate) * 0.04 + 0.05 * DEGREE * noise[2]
+    found = diagnosed(Log(output=output, time=time, reference_heading=heading))
+    named = established(found)
+    assert {*named} <= {'time_offset', *['rate_ramp'] * bool(size)}, terminal_lines(found)
+    if size:
+        slope = named['rate_ramp'].parameters['rate_ramp'].estimate
+        assert slope == pytest.approx(size * DEGREE / 600.0, rel=0.1)
+
+
 def test_the_noise_of_a_fine_heading_is_no_dead_zone():
     generator = np.random.default_rng(6)
     time = np.arange(0.0, 150.0, 0.02)
