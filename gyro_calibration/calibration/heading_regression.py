@@ -579,10 +579,17 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         walks = [min(walks[0], 5e-4)]  # more is vibration of the vehicle
     by_code = kind == 'encoder' and encoder_step(reference) > 0.0 and (at == time).all()
     if by_code:
-        # between two samples with different codes the shaft was in the middle of both
-        at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
-        reference = np.append(np.where(np.diff(reference) != 0.0,
-                                       0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
+        # between two readings with different codes the shaft was in the middle of both, but for
+        # what the gyro turns unevenly; a single code gives only a range, and its error at rest or
+        # at a reversal is systematic
+        rows = np.flatnonzero(np.isfinite(reference))
+        (begin, end), turned = (rows[:-1], rows[1:]), integrate(time, output)
+        middle, codes = 0.5 * (time[begin] + time[end]), reference
+        bent = np.interp(middle, time, turned) - 0.5 * (turned[begin] + turned[end])
+        passed = (codes[begin] != codes[end]) & (end - begin <= 1.5 * np.median(end - begin))
+        at, reference = time.copy(), np.full(len(time), np.nan)
+        at[begin] = middle
+        reference[begin[passed]] = (0.5 * (codes[begin] + codes[end]) + bent)[passed]
     rests, stands = find_rests(time, output, reference if treatment.is_fine else given)
     if treatment.is_fine:
         rests, stands = rests[~stands], stands[~stands]

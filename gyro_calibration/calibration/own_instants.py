@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.logs.log import Array, Log, MIN_SAMPLE_INTERVAL
-from gyro_calibration.logs.quality import bridge_gaps, find_runs, quantization_step
+from gyro_calibration.logs.quality import (
+    bridge_gaps, find_runs, is_rounded_at_each_sample, quantization_step)
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -55,6 +56,9 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     usual = _even_interval(np.diff(at)[fast], sample)
     is_held = usual is not None
     if usual is None:
+        # the codes of an encoder at a steady rate have even patterns, without straight lines
+        if step > MAX_ROUNDING_STEP and is_rounded_at_each_sample(values, step):
+            return None
         at, own = _find_corners(time, values, step)
         usual = _even_interval(np.diff(at), sample, are_all_shown=True)
     if usual is None:

@@ -30,9 +30,9 @@ from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_outpu
 from gyro_calibration.diagnosis.causes import sized_finding
 from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.gates import (
-    compare_headings, fit_line, identify_unit_factor, is_implausible_factor, model_scale_factor,
-    reference_angle, reference_rate, resample_reference, select_reference, spline_rate,
-    UNIT_FACTORS)
+    compare_headings, fit_line, identify_unit_factor, is_at_rest, is_implausible_factor,
+    model_scale_factor, reference_angle, reference_rate, resample_reference, select_reference,
+    spline_rate, UNIT_FACTORS)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps, encoder_step, find_codes, find_runs, QuantizationCodes, robust_deviation,
@@ -69,6 +69,7 @@ class _Comparison:
     expected: Array | None  # from the reference, nan in its gaps; None without a reference
     noise_deviation: float  # standard deviation of the white noise of a sample
     deviation: float  # standard deviation of a sample from the expected output, at least that
+    may_move: bool = False  # without an expectation, and not known to rest
 
 
 # codes
@@ -131,6 +132,8 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
     (low, high), found = codes.values[[0, -1]].tolist(), {1.0: math.inf, -1.0: math.inf}
     p_value = 1.0
     deviation, noise = comparison.deviation, comparison.noise_deviation
+    # a repetition fault begins at one of two extreme samples as seldom as at any other
+    by_fault = 2.0 * len(find_runs(np.diff(comparison.output) == 0.0)) / codes.counts.sum()
     fine = codes.step < _MIN_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
         values, counts = ((codes.values, codes.counts) if sign > 0.0
@@ -153,7 +156,8 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
                   else -math.inf)
         # The expected output errs by bias wander and nonlinearity, which these samples share.
         if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
-                or fine and len(find_runs(both)) > 2):  # a fault repeats it in one or two runs
+                or fine and stats.poisson.sf(
+                    len(find_runs(both)) - 1, by_fault) < FALSE_ALARM_CHANCE):
             found[sign], p_value = float(extreme), min(p_value, chance)
     return -found[-1.0], found[1.0], p_value
 
@@ -172,6 +176,15 @@ def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
     if not same.any():
         return repeats, p_value
     width = _local_code_steps(codes, comparison.output[:-1])
+    runs = find_runs(same)
+    if comparison.may_move:
+        # Codes that stand between changes of one or two are those of a steady rate, which steps
+        # coarser than the noise repeat; those of a rest between two fast turns look like a fault.
+        size = np.pad(np.abs(change), 1, constant_values=math.inf)
+        explained = [min(size[run.start], size[run.stop + 1]) < 2.5 * width[run.start]
+                     for run in runs]
+        if 2 * sum(explained) > len(runs):
+            return repeats, p_value
     # an upper bound of the probability of each repeat: that of a change by less than a step for
     # the scatter of changes of similar expectation, and no less than the share of changes by one
     # code or two, each way
@@ -202,7 +215,7 @@ def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
         repeats[1:], p_value = same & (chance < 0.02), by_number
     product, travel = (np.concatenate([[0.0], np.cumsum(each)])
                        for each in (np.log(np.maximum(chance, 1e-12)), expected))
-    for run in find_runs(same):
+    for run in runs:
         if run.stop - run.start < 2:
             continue
         if chance[run].max() < _COARSE_REPEAT_CHANCE:
@@ -365,7 +378,7 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         return DataQuality(tuple(units), notes, has_output)
     lost, remarks = _check_stamps(log.time, has_output)
     whole, noise = bridge_gaps(output), white_noise_deviation(output)
-    comparison = _Comparison(whole, None, noise, noise)
+    comparison = _Comparison(whole, None, noise, noise, rate is None and not is_at_rest(log))
     if rate is not None and line is not None:
         expected = line.factor * rate + line.offset
         off = (output - expected)[np.isfinite(output) & np.isfinite(expected)]

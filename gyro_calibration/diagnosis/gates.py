@@ -732,9 +732,13 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
                          f'{drift[0] / DEGREE:.2g} +- {drift[1] / DEGREE:.2g} deg/s against them')
     step = encoder_step(heading)
     if 0.0 < step < MAX_ROUNDING_STEP:
-        # a power of ten of a rad or a deg is the last digit of a file
-        powers = np.log10([step, step / DEGREE])
-        if np.abs(powers - np.rint(powers)).min() < 1e-4:
+        # The last digit of a file is a power of ten of a rad or a deg, or less than the noise of
+        # the heading, which is also in its difference to that of the gyro, without the motion.
+        assert log.time is not None and log.output is not None
+        powers, known = np.log10([step, step / DEGREE]), np.isfinite(heading)
+        own = integrate(log.time, bridge_gaps(log.output))
+        if np.abs(powers - np.rint(powers)).min() < 1e-4 or step < min(
+                white_noise_deviation(each[known]) for each in (heading, heading - own)):
             step = 0.0
     if step:
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')

@@ -306,8 +306,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
     if follows:
         return replace(found, findings=lag, followed=followed[0],
                        remarks=[] if within is None else [_SETTLED_REMARK])
-    before, after = (float(np.var(np.concatenate(each.unbiased_residuals)))
-                     for each in (fit_causes(plain.problem, []), moved))
+    before, after = map(_residual_variance, (fit_causes(plain.problem, []), moved))
     return replace(found, unexplained=[Unexplained(
         'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
 
@@ -559,19 +558,19 @@ def _unexplained_structures(search: Search, fit: RegressionFit,
         name = (CAUSES[known.cause].along if is_named(known)
                 else unnamed_variable(known))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-
-    def residual_variance(some: Sequence[Candidate]) -> float:
-        """Return the variance of the residual of some causes at the grid points."""
-        left = fit_causes(search.problem, some).unbiased_residuals
-        return float(np.var(np.concatenate([each.resample(rest) for each, rest
-                                            in zip(search.problem.replays, left)])))
-
-    least, most = residual_variance(causes), residual_variance(fit.causes)
+    least = _residual_variance(fit_causes(search.problem, causes))
+    most = _residual_variance(fit_causes(search.problem, fit.causes))
     structures = []
     for name, places in variables.items():
-        without = residual_variance(
-            [known for place, known in enumerate(causes) if place not in places])
+        without = _residual_variance(fit_causes(search.problem, [
+            known for place, known in enumerate(causes) if place not in places]))
         chance = min(p_value(causes[place].cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures
+
+
+def _residual_variance(fit: RegressionFit) -> float:
+    """Return the variance of the residual at the grid points, which have no gaps."""
+    return float(np.var(np.concatenate([each.resample(left) for each, left
+                                        in zip(fit.problem.replays, fit.unbiased_residuals)])))

@@ -54,6 +54,7 @@ from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq, minimize_scalar
 from scipy.special import softmax
 from scipy.stats import f as fisher
 from scipy.stats import t as student
@@ -258,8 +259,10 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     parameters = {term.cause: Estimate.from_half_width(size, within, unit)}
     for parameter, value in zip(() if effect is None else effect.nonlinear_parameters,
                                 term.shapes):
-        if parameter.default is None and parameter.name not in parameters:
-            parameters[parameter.name] = Estimate.from_half_width(value, 0.0, parameter.unit)
+        if (parameter.default is None and parameter.name not in parameters
+                and found_cause.shape_interval is not None):
+            parameters[parameter.name] = Estimate(value, found_cause.shape_interval,
+                                                  parameter.unit)
     if term.cause == 'bias_step':
         parameters = _step_parameters(fit, term, parameters[term.cause])
     shown = make_finding(
@@ -498,6 +501,7 @@ class FoundCause:
     selection_share: float  # share of the folds in which the same cause was selected
     is_established: bool  # whether it is confirmed
     probability: dict[str, float]  # of the cause and of its alternatives, by name
+    shape_interval: tuple[float, float] | None = None  # of 95 %; None if no shape was fitted
 
 
 def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
@@ -565,8 +569,9 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
             each.cause_term for each in causes if each.is_established], false_alarm_rate)
     while established := [each.cause_term for each in found if each.is_established]:
         extended = fit_with(*established)
-        worst = max(established, key=lambda each: _implausibility(extended, each))
-        if _implausibility(extended, worst) < 1.0:
+        worst = max(established,
+                    key=lambda each: _implausibility(extended, each, false_alarm_rate))
+        if _implausibility(extended, worst, false_alarm_rate) < 1.0:
             return extended, found
         found = [replace(each, is_established=each.is_established and each.cause_term != worst)
                  for each in found]
@@ -677,15 +682,22 @@ def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> tuple[A
     return 0.5 * distinct * score ** 2 / information, distinct * score / information
 
 
-def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
-    """Return the ratio of an effect to the largest plausible one; inf if it may be 0."""
+def _implausibility(fit: SpanFit, cause: CauseTerm, false_alarm_rate: float) -> float:
+    """
+    Return the ratio of an effect to the largest plausible one; inf if it may be 0.
+
+    It may be if it is not significant under the noise that is fitted with it, by which the search
+    does not judge: a single value at the level of the search.
+    """
     places = fit.value_slice(cause)
     values = fit.values[places]
     if cause.cause == 'reference_once_per_rev':
         # from 1 on, the reference would turn back
         return float(np.hypot(*values))
-    if len(values) == 1 and abs(values[0]) < fit.half_width(places.start):
-        return math.inf
+    if len(values) == 1:
+        sigmas = abs(values[0]) / math.sqrt(fit.covariance[places.start, places.start])
+        if 2.0 * student.sf(sigmas, fit.freedom[places.start]) >= false_alarm_rate:
+            return math.inf
     if (CAUSES[cause.cause].along not in ('rate', 'heading')
             or cause.cause not in CATALOGUE):
         return 0.0
@@ -740,8 +752,45 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
         if name in equivalent}
     established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
                    and selected == 1.0 and evidences[simplest].stretches >= MIN_STRETCHES)
-    return FoundCause(terms[simplest], max(p_values[simplest], MIN_PROBABILITY), predicted,
-                      selected, established, probability)
+    term, interval = _profile_shape(spans, data, terms[simplest], [
+        each.shapes for each in terms if each.cause == terms[simplest].cause],
+        evidences[simplest].variance_ratio)
+    return FoundCause(term, max(p_values[simplest], MIN_PROBABILITY), predicted, selected,
+                      established, probability, interval)
+
+
+def _profile_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm,
+                   tried: Sequence[tuple[float, ...]], variance_ratio: float
+                   ) -> tuple[CauseTerm, tuple[float, float] | None]:
+    """
+    Return a term with its best shape, and the 95 % interval by the profile of the likelihood.
+
+    The shape is a positive one that the effect leaves to the data, such as a time constant. The
+    interval is within the range of those that were tried; None if there is no such shape.
+    """
+    effect = CATALOGUE.get(term.cause)
+    parameters = () if effect is None else effect.nonlinear_parameters
+    if len(parameters) != 1 or parameters[0].default is not None or len(tried) < 2:
+        return term, None
+
+    def likelihood(logarithm: float) -> float:
+        trial = CauseTerm(term.cause, (math.exp(logarithm),))
+        columns = data.whiten_columns(spans.cause_columns(trial))
+        (evidence,) = _term_evidences(data, columns, [slice(None)], [trial],
+                                      np.ones(len(data.observed), dtype=bool))
+        return evidence.gain * evidence.variance_ratio / variance_ratio
+
+    shapes = sorted(each for each, in tried)
+    place, logarithms = shapes.index(term.shapes[0]), np.log(shapes).tolist()
+    best = float(minimize_scalar(
+        lambda logarithm: -likelihood(logarithm), method='bounded',
+        bounds=(logarithms[max(place - 1, 0)],
+                logarithms[min(place + 1, len(shapes) - 1)])).x)
+    least = likelihood(best) - 0.5 * NORMAL_QUANTILE_975 ** 2
+    low, high = (math.exp(end if likelihood(end) > least else float(brentq(
+        lambda logarithm: likelihood(logarithm) - least, end, best)))
+        for end in (logarithms[0], logarithms[-1]))
+    return CauseTerm(term.cause, (math.exp(best),)), (low, high)
 
 
 def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[slice],

@@ -180,6 +180,40 @@ def test_samples_that_quantization_repeats_are_no_repeated_samples(step, generat
     assert list(found(coarse(swing(generator), step * SIGMA))) == ['quantization']
 
 
+def robot(generator, step=0.0):
+    """Return a log without a reference of a robot that turns and rests, 20 samples a second."""
+    rate = np.repeat(np.where(np.arange(160) % 2, generator.normal(0.0, 0.6, 160), 0.0), 30)
+    window = np.hanning(10)[1:-1]
+    rate = np.convolve(rate, window / window.sum(), 'same')
+    moving = np.convolve(np.abs(rate) > 0.0, np.ones(20) / 20.0, 'same')
+    noise = np.hypot(5e-4, 0.01 * moving) * generator.standard_normal(len(rate))
+    output = rate + noise + 2e-3
+    return Log(output=np.round(output / step) * step if step else output,
+               time=0.05 * np.arange(len(rate)))
+
+
+@pytest.mark.parametrize('step', [0.05 * DEGREE, 0.1 * DEGREE, 0.3 * DEGREE])
+def test_a_coarse_output_that_stands_in_rests_is_not_stuck(step, any_generator):
+    logs = [robot(any_generator, step) for _ in range(5)]
+    assert sum('stuck_samples' in found(log) for log in logs) <= most(5, STATED)
+
+
+@pytest.mark.parametrize('step', [0.0, 1e-4])
+def test_stuck_samples_are_found_without_a_reference_where_noise_shows(step, generator):
+    log = robot(generator, step)
+    for first in (645, 1120, 3300):
+        log.output[first:first + 8] = log.output[first]
+    assert value(found(log)['stuck_samples']) == pytest.approx(21.0, abs=1.0)
+
+
+def test_a_limit_that_two_turns_reach_is_found_without_a_reference(generator):
+    log = robot(generator)
+    fastest = np.sort(np.abs(log.output[15::30]))[-3:]
+    limit = 0.5 * (fastest[0] + fastest[1])
+    clipped = found(replace(log, output=np.clip(log.output, -limit, limit)))
+    assert value(clipped['saturation']) == limit and 'stuck_samples' not in clipped
+
+
 @pytest.mark.parametrize('ways', [1, 2])
 @pytest.mark.parametrize('within', [1.0, 3.0, 10.0, 50.0])
 def test_a_dead_band_is_no_fault_of_the_record(within, ways, any_generator):
@@ -245,6 +279,10 @@ def test_a_calculated_motion_has_no_encoder():
                         np.full(20, 0.05))
     assert (not encoder_step(np.cumsum(rate) * INTERVAL) and not encoder_step(np.sin(time))
             and not encoder_step(np.cumsum(ramps) * 0.05))
+    # an encoder whose steps pass in whole numbers at most rates, or in even patterns
+    for rates in ([0.0, 100.0, 200.0], [0.0, 60.0, -40.0, 10.0]):
+        swept = np.cumsum(np.convolve(np.repeat(rates, 2000), np.full(40, 0.025))) * INTERVAL
+        assert encoder_step(np.round(swept / 0.5) * 0.5) == pytest.approx(0.5)
     read = np.round(np.cumsum(ramps) * 0.05 / (0.03 * DEGREE)) * 0.03 * DEGREE
     assert encoder_step(read) == pytest.approx(0.03 * DEGREE)
 

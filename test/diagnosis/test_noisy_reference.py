@@ -17,9 +17,10 @@ from diagnosed import established, judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import (
     CauseTerm, find_drift, fit_spans, lay_out_spans)
+from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import select_causes
+from gyro_calibration.diagnosis.noisy_reference import FoundCause, select_causes
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
@@ -29,6 +30,7 @@ from gyro_calibration_bench.hidden.conditions import hide_with_reference, Imperf
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import t as student
 
 RATE, BIAS_TRUE, SCALE, DELAY = 25.0, 0.3 * DEGREE, 0.004, 0.4
 
@@ -248,6 +250,32 @@ def test_a_bias_in_part_of_a_log_is_a_step_at_its_begin_and_one_at_its_end(step)
     assert 'bias step at ' in ' '.join(terminal_lines(found))
 
 
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_time_constant_has_the_interval_of_the_profile_of_its_likelihood(seed):
+    found = diagnosed(turning_log(seed, lambda time, _: 0.006 * np.exp(-time / 40.0)),
+                      kind='motion_capture')
+    (warming,) = [each for each in found.findings if each.effect == 'warm_up']
+    low, high = warming.parameters['time_constant'].interval
+    assert low < warming.parameters['time_constant'].estimate < high
+    assert 15.0 < low < 40.0 < high < 100.0
+
+
+def test_a_cause_that_its_own_fit_does_not_show_at_the_level_is_suspected(monkeypatch):
+    log, name = turning_log(2, lambda time, _: 0.003), 'clock_rate'
+    log = replace(log, output=np.interp(log.time * (1.0 + 3e-5), log.time, log.output))
+    fit = fit_spans(lay_out_spans(log, 'motion_capture'))
+    with_rate = fit_spans(fit.spans, [CauseTerm(name)])
+    chance = float(2.0 * student.sf(
+        abs(with_rate.values[3]) / np.sqrt(with_rate.covariance[3, 3]), with_rate.freedom[3]))
+    assert chance < 0.01
+    for level, is_established in ((0.5 * chance, False), (2.0 * chance, True)):
+        found = iter([FoundCause(CauseTerm(name), 1e-4, 10.0, 1.0, True, {})])
+        monkeypatch.setattr(noisy_reference, '_find_best_cause',
+                            lambda *given, rest=found: next(rest, None))
+        (cause,) = select_causes(fit, level, lambda share, words: None)[1]
+        assert cause.is_established == is_established
+
+
 @pytest.mark.parametrize('name, size, step', [
     ('clock_rate', 3e-4, 0.5), ('time_offset', 0.03, 0.0), evidence('clock_rate', 3e-4, 0.0),
     evidence('time_offset', 0.03, 0.5)])
@@ -387,6 +415,13 @@ def test_the_kind_of_a_reference_is_given_or_found():
             and not is_reference_limiting(exact, classify_reference(exact)))
     assert classify_reference(exact, 'odometry').kind == 'odometry' and is_reference_limiting(
         exact, classify_reference(exact, 'odometry'))
+    # noise that a file gives with many digits, and a fine encoder
+    turned, noise = exact.reference_heading, 1e-3 * np.random.default_rng(0).standard_normal(
+        len(log.time))
+    for heading, step, kind in ((turned + noise, 1.7e-6, 'motion_capture'),
+                                (turned, 9.59e-5, 'encoder')):
+        codes = np.round(heading / step) * step
+        assert classify_reference(replace(log, reference_heading=codes)).kind == kind
     assert classify_reference(replace(log, reference_rate=log.output)).kind == 'rate_command'
     assert classify_reference(replace(log, reference_heading=None)).kind == 'rest'
     assert classify_reference(replace(log, reference_rate=np.nan * log.output)).kind == 'course'

@@ -16,7 +16,7 @@ import re
 from chance import seeds
 from diagnosed import established, estimates, limited
 from gyro_calibration.calibration.encoder import calibrate_encoder, choose_reference
-from gyro_calibration.calibration.own_instants import keep_own_instants
+from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
 from gyro_calibration.calibration.reference_noise import drop_repeated_headings, rate_noise_share
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
@@ -77,6 +77,38 @@ def test_a_slow_reference_shows_the_gyro_and_nothing_else(name, asymmetry, seed)
     assert not found.unexplained
     assert estimates(found)['scale_factor_error'][0] == pytest.approx(SCALE, abs=2e-3)
     assert estimates(found)['bias'][0] == pytest.approx(BIAS, abs=0.03 * DEGREE)
+
+
+@pytest.mark.parametrize('seed', seeds(1))
+def test_an_encoder_with_empty_cells_between_its_readings_shows_the_values(seed):
+    log, _, heading = turning(seed)
+    codes = 0.05 * DEGREE * np.round(heading(TIME) / (0.05 * DEGREE))
+    codes[np.arange(len(TIME)) % 5 > 0] = np.nan
+    found = diagnose([replace(log, reference_heading=codes)], np.random.default_rng(0))
+    assert found.reference.kind == 'encoder' and not established(found)
+    for name, true in (('bias', BIAS), ('scale_factor_error', SCALE)):
+        estimate, deviation = estimates(found)[name]
+        assert abs(estimate - true) < 3.0 * deviation < 0.5 * abs(true)
+
+
+def test_an_encoder_at_steady_rates_has_a_reading_in_each_sample():
+    rate = np.convolve(np.repeat([0.0, 20.0, -20.0, 40.0, -40.0, 0.0], 900), np.full(20, 0.05))
+    time, codes = 0.01 * np.arange(len(rate)), np.round(np.cumsum(0.02 * rate)) * 0.5 * DEGREE
+    assert find_own_instants(time, codes) is None
+    swing = np.round(180.0 * np.sin(0.5 * time)) * 0.5 * DEGREE
+    assert find_own_instants(time, swing) is None
+    slow = find_own_instants(time, np.interp(time, time[::5], swing[::5]))
+    assert slow is not None and slow.interval == pytest.approx(0.05)
+
+
+def test_a_reference_that_is_smoother_than_the_motion_has_a_share_of_the_residual():
+    log, rate, _ = turning(3)
+    window = np.hanning(12)[1:-1]
+    smoothed = np.convolve(rate(TIME), window / window.sum(), 'same')
+    smoothed[1::2] = np.nan  # as the last sample
+    found = diagnose([replace(log, reference_rate=smoothed)], np.random.default_rng(0))
+    assert [each.along for each in found.unexplained] == ['rate_change']
+    assert 0.9 < found.unexplained[0].share_of_variance <= 1.0
 
 
 def test_all_verbs_take_the_heading_where_a_rate_is_late_and_state_that_once():
