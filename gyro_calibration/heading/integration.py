@@ -30,7 +30,7 @@ from collections import deque
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.stamps import SHORT_RATIO
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
@@ -217,8 +217,17 @@ class ThresholdFilter:
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
-    turned = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
-    return np.cumsum(np.append(begin, turned))[:len(time)]
+    heading = np.empty(len(time))
+    heading[:1] = begin
+    for first in range(1, len(time), CACHE_BLOCK_SAMPLES):
+        stop = min(first + CACHE_BLOCK_SAMPLES, len(time))
+        here, before = slice(first, stop), slice(first - 1, stop - 1)
+        turned = rate[here] + rate[before]
+        turned *= 0.5
+        turned *= time[here] - time[before]
+        turned[0] += heading[first - 1]
+        np.cumsum(turned, out=heading[here])
+    return heading
 
 
 def integrate_with_curvature(time: Array, rate: Array) -> Array:

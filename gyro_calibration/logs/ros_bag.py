@@ -30,6 +30,7 @@ from itertools import repeat
 import os
 from pathlib import Path
 import re
+import shutil
 import sqlite3
 import struct
 import sys
@@ -455,39 +456,51 @@ def _read_database(source: Path, path: Path, contents: Contents,
 @contextmanager
 def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """Open a database read-only, and give it with the names of its tables of stored columns."""
-    # Tried in turn: with the journal of a killed writer, and without it. Computed columns are not
-    # read: their cost is not limited by the size of the file.
-    reason: Exception | None = None
-    for mode in ('mode=ro', 'mode=ro&immutable=1'):
-        try:
-            database = sqlite3.connect(f'file:{quote(str(source.resolve()))}?{mode}', uri=True)
-        except _DATABASE_ERRORS as error:
-            reason = error
-            continue
-        with closing(database):
+    # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
+    # count corrected. Computed columns are not read: their cost is not limited by the size of the
+    # file.
+    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
+        reason: Exception | None = None
+        for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
+            file = source
+            if mode == 'copy':
+                file, mode = Path(shutil.copy(source, folder)), 'mode=ro'
+                with open(file, 'r+b') as copy:
+                    head = copy.read(100)
+                    if len(head) == 100:
+                        size = int.from_bytes(head[16:18], 'big')
+                        size = 1 << 16 if size == 1 else max(size, 1)
+                        copy.seek(28)
+                        copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
             try:
-                database.text_factory = partial(str, encoding='utf-8', errors='replace')
-                # The smallest row of a file has a dozen bytes and takes some 30 steps of
-                # SQLite. A query is ended after a million steps plus ten per byte.
-                thousands = repeat(0, source.stat().st_size // 100 + 1000)
-                database.set_progress_handler(partial(next, thousands, 1), 1000)
-                if sys.version_info >= (3, 11):
-                    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
-                database.execute('PRAGMA trusted_schema = OFF')
-                tables = {name for name, text in database.execute(
-                    "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-                    if name in ('topics', 'messages', 'message_definitions')
-                    and str(text).upper().startswith('CREATE TABLE')
-                    and not any(hidden for *_, hidden in database.execute(
-                        f'PRAGMA table_xinfo({name})'))}
+                database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
-            if not {'topics', 'messages'} <= tables:
-                raise LogError('is a database, but not a ROS 2 recording with tables of '
-                               'stored columns; name a recording')
-            yield database, tables
-            return
+            with closing(database):
+                try:
+                    database.text_factory = partial(str, encoding='utf-8', errors='replace')
+                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
+                    # SQLite. A query is ended after a million steps plus ten per byte.
+                    thousands = repeat(0, file.stat().st_size // 100 + 1000)
+                    database.set_progress_handler(partial(next, thousands, 1), 1000)
+                    if sys.version_info >= (3, 11):
+                        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
+                    database.execute('PRAGMA trusted_schema = OFF')
+                    tables = {name for name, text in database.execute(
+                        "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+                        if name in ('topics', 'messages', 'message_definitions')
+                        and str(text).upper().startswith('CREATE TABLE')
+                        and not any(hidden for *_, hidden in database.execute(
+                            f'PRAGMA table_xinfo({name})'))}
+                except _DATABASE_ERRORS as error:
+                    reason = error
+                    continue
+                if not {'topics', 'messages'} <= tables:
+                    raise LogError('is a database, but not a ROS 2 recording with tables of '
+                                   'stored columns; name a recording')
+                yield database, tables
+                return
     raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '
                    'name a recording, or record again')
 

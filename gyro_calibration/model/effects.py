@@ -90,6 +90,8 @@ class Effect:
     # nonlinear parameters, on which the columns depend
     nonlinear_parameters: tuple[Parameter, ...] = ()
     experiment: str = ''  # experiment that separates it from similar effects
+    # (channels, shapes, coefficients) -> the sum of the columns, where a faster formula exists
+    sum_columns: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
     # (signal, time, *values) -> signal, for an effect that changes the signal of a whole log
     distortion: Callable[..., Array] | None = None
     # of the distortion: 'rate' before anything is added to the rate, or 'output' after the noise
@@ -109,7 +111,9 @@ class Effect:
         """Return a function of channels: what the effect adds to the output, rad/s."""
         shapes = values[:len(self.nonlinear_parameters)]
         coefficients = values[len(self.nonlinear_parameters):]
-        columns = self.columns
+        sum_columns, columns = self.sum_columns, self.columns
+        if sum_columns is not None:
+            return lambda channels: sum_columns(channels, shapes, coefficients)
         if len(coefficients) == 1:
             value, = coefficients
             return lambda channels: value * columns(channels, *shapes)[0]
@@ -166,15 +170,30 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 
-    def columns(channels: Channels, output_centre: float, output_scale: float,
-                temperature_centre: float, temperature_scale: float) -> Sequence[Number]:
-        outputs = _powers((channels.output - output_centre) / output_scale, rate_order)
+    def scale_inputs(channels: Channels, output_centre: float, output_scale: float,
+                     temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
+        output = channels.output - output_centre
+        output *= 1.0 / output_scale
         if not temperature_order:  # the temperature may be unknown
-            return outputs
-        temperature = (channels.temperature - temperature_centre) / temperature_scale
+            return output, 0.0 * output
+        temperature = channels.temperature - temperature_centre
+        temperature *= 1.0 / temperature_scale
+        return output, temperature
+
+    def columns(channels: Channels, *shapes: float) -> Sequence[Number]:
+        output, temperature = scale_inputs(channels, *shapes)
+        outputs = _powers(output, rate_order)
         return [of_temperature * of_output
                 for of_temperature in _powers(temperature, temperature_order)
                 for of_output in outputs]
+
+    def sum_columns(channels: Channels, shapes: Sequence[float],
+                    coefficients: Sequence[float]) -> Number:
+        output, temperature = scale_inputs(channels, *shapes)
+        width = rate_order + 1
+        inner = [_evaluate_horner(coefficients[begin:begin + width], output)
+                 for begin in range(0, len(coefficients), width)]
+        return _evaluate_horner(inner, temperature)
 
     return Effect(
         'rate_temperature_polynomial',
@@ -185,7 +204,7 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
          Parameter('output_scale', 'rad/s', 1.0, (1e-9, np.inf)),
          Parameter('temperature_centre', 'degC', 0.0),
          Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))),
-        'turn at more rates, at more temperatures, or take lower orders')
+        'turn at more rates, at more temperatures, or take lower orders', sum_columns)
 
 
 def _powers(value: Number, order: int) -> list[Number]:
@@ -193,6 +212,18 @@ def _powers(value: Number, order: int) -> list[Number]:
     for _ in range(order):
         powers.append(powers[-1] * value)
     return powers
+
+
+def _evaluate_horner(coefficients: Sequence[Number], value: Number) -> Number:
+    """Return the sum of coefficients times `_powers`, by Horner's rule, with one new array."""
+    if len(coefficients) == 1:
+        return coefficients[0] * (value * 0.0 + 1.0)
+    total = coefficients[-1] * value
+    total += coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
+        total *= value
+        total += coefficient
+    return total
 
 
 def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:

@@ -254,6 +254,17 @@ def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
                for note in log.notes)
 
 
+def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
+    time = np.arange(2000) / RATE
+    path = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)}))
+    data = path.read_bytes()
+    path.write_bytes(data[:len(data) * 2 // 3])
+    log = read_recording(path)
+    assert 100 < len(log) < 2000
+    np.testing.assert_array_equal(log.output, time[:len(log)])
+    assert any('read up to there' in note for note in log.notes)
+
+
 def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
     messages = [('/imu', BEGIN + number,
                  serialize(BEGIN + number * 10 ** 7, 'gyro', 37 * [float(number)]))
