@@ -560,7 +560,7 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
 _MIN_DWELLS = 3
 HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
-                 'effects, --matrix and --surface use --method dwells')
+                 'effects use --method dwells')
 
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,

@@ -214,7 +214,7 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
     if (whole & ~known).any():  # in a wrong unit rates may be implausible
         unexplained, scale, _ = fit_profile(
             split_run(time[whole], output[whole]), motion, RunLimits().max_time_offset)
-        if unexplained <= MAX_UNEXPLAINED_SHARE:
+        if unexplained <= MAX_UNEXPLAINED_SHARE and abs(scale) > 1.0:
             refuse_unit_error(scale, motion.name)
     rate = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rate[run], motion, method, noise=model.noise,
