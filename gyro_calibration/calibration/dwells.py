@@ -135,6 +135,9 @@ def require_output(log: Log) -> Array:
     if log.output is None:
         raise DataRefused('the log holds no gyro output in rad/s; with gyro_counts alone, say how '
                           'many deg/s a count is')
+    if not np.isfinite(log.output).any():
+        raise DataRefused('the output of the gyro has no numbers: check its column, and the line '
+                          'that it came by')
     return log.output
 
 

@@ -42,8 +42,7 @@ import math
 from typing import Any, NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.calibration.likelihood import (
-    MIN_FIT_PROBABILITY, robust_residual, ScaleBiasFit)
+from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, bias_wander_columns, carried_shares, fit_noise_grid, GridFit,
     heading_noise, HierarchicalPrior, SharedNoise)
@@ -68,6 +67,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import expit
 from scipy.stats import f as fisher
 from scipy.stats import t as student
+from scipy.stats import ttest_1samp
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
 TECHNOLOGY_PRIORS = {
@@ -1072,16 +1072,61 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     """
     Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
 
-    It is that of a regression with the rests in which the reference stands, a ramp of the bias,
-    and an asymmetry, which are of the gyro. None without two such rests, or within chance.
+    The bias that the motion shows is compared with that of the rests in which the reference
+    stands. Either may change steadily with time, and what depends on the rate is not of the
+    reference. None without such rests, or where both agree (Welch's test, at 1 %), as a whole or
+    in the ways from rest to rest, each compared with the rests around it: the bias may wander.
     """
     spans = lay_out_spans(log)
-    if np.count_nonzero(spans.stands) < 2 or len(spans.time) < _MIN_SPANS:
+    rests = spans.rests[spans.stands]
+    if len(rests) < 2:
         return None
-    fit = fit_spans(spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])
-    drift = fit.reference_drift
-    return drift if drift and fit.p_value(fit.value_slice(_DRIFT_TERM).start) < (
-        MIN_FIT_PROBABILITY) else None
+    time, output = np.asarray(spans.log.time), np.asarray(spans.log.output)
+    halves = [half for first, last in rests
+              for half in np.array_split(np.arange(first, last + 1), 2)]
+    middle, means = 0.5 * time[-1], np.array([output[half].mean() for half in halves])
+    spans = spans.with_corrected_rate(np.array([0.0, means.mean(), 0.0]))
+    rows = np.column_stack([spans.observed, design_matrix(
+        spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])])
+    rows = -rows[:len(spans.time) - 1]
+    rows = rows[rows[:, 2] > 0.0]
+    in_motion = np.insert(rows[:, [2, 1, 3, 6]], 1, rows[:, 5] - middle * rows[:, 2], axis=1)
+    at_rest = np.array([(1.0, time[half].mean() - middle) for half in halves])
+    if any(len(each) <= each.shape[1] for each in (in_motion, at_rest)):
+        return None
+    of_motion, one, freedom_of_one, left = _weighted_fit(in_motion, rows[:, 0], 1.0 / rows[:, 2])
+    of_rests, other, freedom_of_other, _ = _weighted_fit(
+        at_rest, means, np.array([len(half) for half in halves], dtype=float))
+    freedom = (one + other) ** 2 / (one ** 2 / freedom_of_one + other ** 2 / freedom_of_other
+                                    + 1e-300)
+    drift = of_rests[0] - of_motion[0]
+    deviation = math.hypot(math.sqrt(one + other), spans.rest_rounding)
+    if abs(drift) <= student.ppf(0.995, freedom) * deviation:
+        return None
+    # the bias on each way from rest to rest, and that of the rests around it
+    way = np.searchsorted(time[rests[:, 0]], in_motion[:, 1] / in_motion[:, 0] + middle) - 1
+    ways = len(rests) - 1
+    inside = (way >= 0) & (way < ways)
+    turned, duration = (np.bincount(way[inside], each[inside], ways) for each in (
+        in_motion[:, :2] @ of_motion[:2] + left, in_motion[:, 0]))
+    of_each = means.reshape(-1, 2).mean(axis=1)
+    known = duration > 0.0
+    differences = (turned[known] / duration[known]
+                   - 0.5 * (of_each[1:] + of_each[:-1])[known])
+    if len(differences) < 3 or ttest_1samp(differences, 0.0).pvalue > 0.01:
+        return None
+    return drift, float(student.ppf(0.975, freedom)) * deviation
+
+
+def _weighted_fit(columns: Array, observed: Array,
+                  weights: Array) -> tuple[Array, float, int, Array]:
+    """Return values, variance of the first, its degrees of freedom, and residual."""
+    root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
+    inverse = np.linalg.pinv(root[:, None] * columns)
+    values = inverse @ (root * observed)
+    left = observed - columns @ values
+    variance = float(weights @ left ** 2 / freedom * inverse[0] @ inverse[0])
+    return values, variance, freedom, left
 
 
 def find_motion_errors(log: Log) -> tuple[float, float] | None:

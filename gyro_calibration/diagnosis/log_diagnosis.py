@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells import find_dwells
+from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
@@ -101,6 +101,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
     all_gates: list[Gate] = []
+    for log in logs:
+        require_output(log)
     if reference_kind == 'rate_command':
         logs = [log if log.reference_rate is None else replace(log, reference_heading=None)
                 for log in logs]

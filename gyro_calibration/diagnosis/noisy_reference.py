@@ -211,9 +211,11 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
     name = 'reference_drift'
     if CauseTerm(name) not in fit.causes:
         return
+    asymmetry = CauseTerm('scale_factor_asymmetry')
+    if asymmetry not in fit.causes:  # it is in motion only, too
+        fit = fit_spans(fit.spans, [*fit.causes, asymmetry])
     place = fit.value_slice(CauseTerm(name)).start
-    deviation = math.sqrt(fit.covariance[place, place])
-    chance = float(2.0 * student.sf(abs(fit.values[place]) / deviation, fit.freedom[place]))
+    deviation, chance = math.sqrt(fit.covariance[place, place]), fit.p_value(place)
     if chance < false_alarm_rate:
         yield sized_finding(
             name, fit.values[place], fit.half_width(place), max(chance, MIN_PROBABILITY),
@@ -370,7 +372,7 @@ def _gyro_noise(fit: SpanFit) -> Noise:
                  **{part.name: fit.noise_size(part.name)
                     if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
                     for part in fit.spans.bias_wander()[1]
-                    if part.name not in ('smoothing', 'lag')})
+                    if part.name in vars(Noise())})
 
 
 # gain

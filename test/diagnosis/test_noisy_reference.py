@@ -583,6 +583,19 @@ def test_the_errors_of_a_rate_by_odometry_are_no_effects_of_the_gyro(asymmetry, 
     assert abs(fit.fit.bias - bias) < 2.5 * np.sqrt(fit.fit.covariance[1, 1]) < 0.03 * DEGREE
 
 
+def test_a_coarse_output_beside_odometry_is_diagnosed_and_drifts_of_neither_are_named():
+    log, _ = wheels(5)
+    step = 0.2 * DEGREE
+    found = diagnosed(replace(log, output=step * np.rint(log.output / step)), kind='odometry')
+    assert {*established(found)} <= {'quantization'}, terminal_lines(found)
+
+
+def test_an_output_without_numbers_is_refused():
+    time = np.arange(0.0, 60.0, 0.02)
+    with pytest.raises(DataRefused, match='the output of the gyro has no numbers'):
+        diagnosed(Log(time=time, output=np.full(len(time), np.nan), reference_heading=time))
+
+
 @pytest.mark.parametrize('log', [
     wheels(6, slip=0.0, noise=0.0)[0], wheels(6, 0.03, slip=0.0, noise=0.0)[0],
     wheels(6, lag=0.25)[0]], ids=['exact', 'exact, asymmetric', 'late, as after a command'])
