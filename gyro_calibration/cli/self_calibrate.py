@@ -25,7 +25,7 @@ from typing import Any
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, MAX_UNEXPLAINED_SHARE, refuse_unit_error, split_run)
+    fit_profile, MAX_UNEXPLAINED_SHARE, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.self_calibration import (
     check_end, check_rest, default_reference_errors, describe_implausible_scale, find_rest_after,
     METHODS, ReferenceErrors, RestCheck, RunLimits, self_calibrate, to_model_record)
@@ -214,8 +214,10 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
     if (whole & ~known).any():  # in a wrong unit rates may be implausible
         unexplained, scale, _ = fit_profile(
             split_run(time[whole], output[whole]), motion, RunLimits().max_time_offset)
-        if unexplained <= MAX_UNEXPLAINED_SHARE and abs(scale) > 1.0:
+        if unexplained <= MAX_UNEXPLAINED_SHARE and abs(scale) > UNIT_TOLERANCE:
             refuse_unit_error(scale, motion.name)
+            raise DataRefused(f'the gyro reports {scale:.4g} times what was turned: correct its '
+                              'unit or sensitivity')
     rate = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rate[run], motion, method, noise=model.noise,
                          reference=reference, output=output[run],

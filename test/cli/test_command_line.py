@@ -215,11 +215,15 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
     assert abs(json.loads(text)['bias']) < 1e-5
 
 
-def test_a_run_in_thousandths_whose_turns_are_implausible_is_told_its_unit(run, log, tmp_path):
+@pytest.mark.parametrize('factor, words', [
+    (1.1e3, 'the gyro is in thousandths (mdeg/s, mrad/s)'),
+    (145.0, 'times what was turned: correct its unit or sensitivity')], ids=['mdeg/s', 'counts'])
+def test_a_run_in_another_unit_whose_turns_are_implausible_is_refused_for_it(
+        run, log, tmp_path, factor, words):
     run_log = read_log(log)
-    write_log(tmp_path / 'milli.csv', replace(run_log, output=1.1e3 * run_log.output))
-    code, _, error = run('self-calibrate', tmp_path / 'milli.csv')
-    assert code == 1 and 'the gyro is in thousandths (mdeg/s, mrad/s)' in error
+    write_log(tmp_path / 'other.csv', replace(run_log, output=factor * run_log.output))
+    code, _, error = run('self-calibrate', tmp_path / 'other.csv')
+    assert code == 1 and words in error, error
 
 
 def test_a_log_of_counts_wants_its_sensitivity(compensate, model):
