@@ -689,7 +689,7 @@ def _implausibility(fit: SpanFit, cause: CauseTerm, false_alarm_rate: float) -> 
     Return the ratio of an effect to the largest plausible one; inf if it may be 0.
 
     It may be if it is not significant under the noise that is fitted with it, by which the search
-    does not judge: a single value at the level of the search.
+    does not test: a single value at the level of the search.
     """
     places = fit.value_slice(cause)
     values = fit.values[places]
