@@ -26,7 +26,8 @@ from typing import Any
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
 from gyro_calibration.calibration.whole_turns import FALSE_REFUSAL_RATE
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
+from gyro_calibration.logs.quality import (
+    bridge_gaps, find_runs, mask_outliers, quantization_step, robust_deviation)
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
     ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, QUANTIZATION_NOISE, RATE_RAMP,
@@ -136,17 +137,19 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
     """Refuse a record whose means change by more than noise, and name its longest part at rest."""
     angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
+    step = quantization_step(rate[np.isfinite(rate)])
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
         # changes of the mean over `size` samples, times `size`
-        end, step = len(angle) - 2 * size, max(1, size // 4)
-        at = np.arange(0, end, step)
+        end, every = len(angle) - 2 * size, max(1, size // 4)
+        at = np.arange(0, end, every)
         if lost is not None:
-            at = at[_mask_complete_windows(lost, size, 0, end, step)]
+            at = at[_mask_complete_windows(lost, size, 0, end, every)]
         if len(at) < MIN_WINDOWS:
             break
         change = np.abs(angle[at + 2 * size] - 2.0 * angle[at + size] + angle[at])
-        # the rms where most of them are zero
-        scale = robust_deviation(change) or float(np.sqrt(np.mean(change ** 2)))
+        # of a coarse output they are whole steps, and their median is known to half a step; the
+        # rms where most of them are zero
+        scale = robust_deviation(change + 0.5 * step) or float(np.sqrt(np.mean(change ** 2)))
         for begin in at[change > MAX_NOISE_SIGMAS * scale]:
             moved[begin:begin + 2 * size] = True
         if change.max() > worst * scale:
