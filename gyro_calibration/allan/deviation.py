@@ -147,13 +147,15 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
         if len(at) < MIN_WINDOWS:
             break
         change = np.abs(angle[at + 2 * size] - 2.0 * angle[at + size] + angle[at])
-        # of a coarse output they are whole steps, and their median is known to half a step; the
-        # rms where most of them are zero
-        scale = robust_deviation(change + 0.5 * step) or float(np.sqrt(np.mean(change ** 2)))
-        for begin in at[change > MAX_NOISE_SIGMAS * scale]:
+        # the rms where most of them are zero; beyond the limit as seldom as normal noise by
+        # Bernstein's inequality for sums of whole steps
+        scale = robust_deviation(change) or float(np.sqrt(np.mean(change ** 2)))
+        limit = MAX_NOISE_SIGMAS * (MAX_NOISE_SIGMAS * step / 6.0 + math.hypot(
+            MAX_NOISE_SIGMAS * step / 6.0, scale))
+        for begin in at[change > limit]:
             moved[begin:begin + 2 * size] = True
-        if change.max() > worst * scale:
-            worst, over = float(change.max() / scale), size
+        if change.max() > worst * limit:
+            worst, over = float(change.max() / limit), size
     if not moved.any():
         return
     rest = max(find_runs(~moved), key=lambda run: run.stop - run.start, default=slice(0, 0))
@@ -164,8 +166,8 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
         remedy = f'use the longest part at rest, from {begin:.1f} to {end:.1f} s, or record again'
     raise DataRefused('the gyro was moved, or its output jumped: from '
                       f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
-                      f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
-                      f'deviations: {remedy}')
+                      f'{over * stamps.interval:.3g} s change up to '
+                      f'{MAX_NOISE_SIGMAS * worst:.0f} standard deviations: {remedy}')
 
 
 def _integrate_angle(rate: Array) -> Array:
