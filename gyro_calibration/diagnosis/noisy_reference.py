@@ -651,14 +651,28 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
         influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, places]
         inside = data.clusters[0] < data.stretch_count
         stretches = effective_clusters(data.clusters[0][inside], influence[inside])
-        chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * student.sf(
-            sigmas, np.maximum(stretches - 1.0, 1.0)))
+        chances = 2.0 * student.sf(sigmas, np.maximum(stretches - 1.0, 1.0))
+        if fit.spans.treatment.is_fine:
+            # at the best of all times, beside the noise without the step
+            evidence = np.array([_step_evidence(with_steps, fit_with(
+                *causes, *(other for other in steps if other != each)), each) for each in steps])
+            chances = np.maximum(chances, 2.0 * len(times) * np.exp(-evidence))
+        else:
+            chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
         weakest = int(chances.argmax())
         if chances[weakest] < false_alarm_rate:
-            return [FoundCause(each, max(chance, MIN_PROBABILITY), 0.5 * size ** 2, 1.0, True, {})
-                    for each, chance, size in zip(steps, chances.tolist(), sigmas.tolist())]
+            return [FoundCause(each, max(chance, MIN_PROBABILITY), 0.5 * size ** 2, 1.0,
+                               count >= MIN_STRETCHES, {}) for each, chance, size, count in zip(
+                                   steps, chances.tolist(), sigmas.tolist(), stretches)]
         del steps[weakest]
     return []
+
+
+def _step_evidence(fit: SpanFit, without: SpanFit, step: CauseTerm) -> float:
+    """Return the gain in log-likelihood by a step, averaged over the noises of each fit."""
+    place = fit.value_slice(step).start
+    return (fit.fit.log_evidence - without.fit.log_evidence
+            - 0.5 * math.log(fit.fit.covariance[place, place]))
 
 
 def _best_pair(fit: SpanFit, data: WhitenedRegression,
