@@ -105,17 +105,23 @@ class HeadingState:
 
     def transition(self, rate_integral: RateIntegral) -> _Transition:
         """Return the transition of the state over an integral of rates."""
-        seen, kept, grown = _padded_transition(
-            self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved,
-            len(rate_integral.sensitivity))
-        seen, grown = seen.copy(), grown.copy()
-        seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
-        grown[HEADING_INDEX, HEADING_INDEX] += (
-            rate_integral.lost_variance + rate_integral.extra_noise_variance)
-        if not rate_integral.is_unobserved:
-            grown[HEADING_INDEX, HEADING_INDEX] += (
-                self.noise.angle_random_walk ** 2 * rate_integral.duration)
+        seen, kept, grown, variance = self._observation(rate_integral)
+        grown = grown.copy()
+        grown[HEADING_INDEX, HEADING_INDEX] = variance
         return _Transition(seen, kept, grown)
+
+    def _observation(self, rate_integral: RateIntegral) -> tuple[Array, Array, Array, float]:
+        """Return `_Transition` as arrays, and the variance of the noise of an integral, rad²."""
+        values = len(rate_integral.sensitivity)
+        seen, kept, grown = _padded_transition(
+            self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved, values)
+        seen = seen.copy()
+        seen[len(seen) - values:] = -rate_integral.sensitivity
+        variance = (float(grown[HEADING_INDEX, HEADING_INDEX]) + rate_integral.lost_variance
+                    + rate_integral.extra_noise_variance)
+        if not rate_integral.is_unobserved:
+            variance += self.noise.angle_random_walk ** 2 * rate_integral.duration
+        return seen, kept, grown, variance
 
     def propagate(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time in motion."""
@@ -128,11 +134,10 @@ class HeadingState:
 
     def heading(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the heading after a time in motion, rad, and its variance, rad²."""
-        step = self.transition(rate_integral)
-        step.observation[HEADING_INDEX] -= 1.0
-        return (rate_integral.angle - float(step.observation @ self.mean),
-                float(step.observation @ self.covariance @ step.observation
-                      + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
+        seen, _, _, variance = self._observation(rate_integral)
+        seen[HEADING_INDEX] -= 1.0
+        return (rate_integral.angle - float(seen @ self.mean),
+                float(seen @ self.covariance @ seen) + variance)
 
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time of constant heading, with its measurement."""
@@ -169,10 +174,8 @@ class HeadingState:
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
-        step = self.transition(rate_integral)
-        return (float(step.observation @ self.mean),
-                float(step.observation @ self.covariance @ step.observation
-                      + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
+        seen, _, _, variance = self._observation(rate_integral)
+        return float(seen @ self.mean), float(seen @ self.covariance @ seen) + variance
 
     @cached_property
     def wander_rate(self) -> tuple[float, float]:

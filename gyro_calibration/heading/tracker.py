@@ -120,7 +120,7 @@ class HeadingTracker:
         self.heading, self.rate, self.deleted_heading = heading, 0.0, 0.0
         self.is_resting = self._wheels_stand = False
         self._quiet_duration, self._pending_correction = WINDOW_DURATION, 0.0
-        self._held_integral = RateIntegral(0.0, 0.0, np.zeros(0))
+        self._recent_blocks = deque[RateIntegral]()  # in motion, which may be the begin of a rest
         self._rest_blocks = deque[RateIntegral](maxlen=_MAX_REST_BLOCKS)
         self._suspected_turn: SlowTurn | None = None
         self._last_finite_heading = heading, variance
@@ -542,12 +542,9 @@ class HeadingTracker:
         while (len(self._recent_blocks) > 2
                and duration - self._recent_blocks[0].duration >= least):
             duration -= self._recent_blocks.popleft().duration
-        first, *others = self._recent_blocks
-        self._held_integral = sum(others, first)
-        beyond = self._open_integral.duration - self._held_integral.duration
-        if beyond >= _STEP_DURATION - TIME_TOLERANCE:
+        if self._open_integral.duration - duration >= _STEP_DURATION - TIME_TOLERANCE:
             self._advance_state(self._held_integral)
-        if not quiet or self._held_integral.duration < least or len(self._recent_blocks) < 2:
+        if not quiet or duration < least or len(self._recent_blocks) < 2:
             return
 
         # whether the mean over them is that of a rest; in the first the robot may still move
@@ -573,9 +570,15 @@ class HeadingTracker:
         self._enter_rest(change)
         self._rest_blocks.extend([*self._recent_blocks][1:])
 
+    @property
+    def _held_integral(self) -> RateIntegral:
+        """Return the integral over the last blocks, which may be the begin of a rest."""
+        return sum(self._recent_blocks, self._zero_integral)
+
     def _close_block(self) -> RateIntegral:
         """Add the integral of the block to the open one, and return it."""
-        part, self._block_integral = self._block_integral, replace(self._zero_integral)
+        part = self._block_integral
+        self._block_integral = RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
         if part.duration > 0.0:
             part.block_count, part.block_square_sum = 1, part.angle ** 2 / part.duration
         self._open_integral += part
@@ -663,7 +666,7 @@ class HeadingTracker:
         if self.is_resting and len(self._snapshots) > 1:
             self._motion_start_time = self._last_time - self._open_integral.duration
         self.is_resting, self._quiet_duration = False, quiet_duration
-        self._recent_blocks, self._held_integral = deque[RateIntegral](), self._zero_integral
+        self._recent_blocks.clear()
 
     def _revert_to_motion(self, lag: float) -> None:
         """Revise a rest to a motion since `lag` s before the last block."""
@@ -872,8 +875,10 @@ class HeadingTracker:
 
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
-        return (turn + self._zero_integral if self._still_sensitivity is None
-                else replace(turn, sensitivity=turn.duration * self._still_sensitivity))
+        copy = turn + self._zero_integral
+        if self._still_sensitivity is not None:
+            copy.sensitivity = turn.duration * self._still_sensitivity
+        return copy
 
     def _adopt_state(self) -> None:
         """Adopt the new state and the noise of the samples; the heading does not jump."""
