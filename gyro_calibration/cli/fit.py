@@ -139,8 +139,8 @@ def run(given: argparse.Namespace) -> Answer:
 class Fitted(PrintedResult):
     """A calibration by a rate table, a turntable or a reference heading."""
 
-    model: GyroModel  # with the fitted effects and their covariance
-    #: Effects, dwells and residuals; or the fit of a reference heading.
+    model: GyroModel  # model with the fitted effects and their covariance
+    #: effects, dwells and residuals, or the fit of a reference heading
     found: SelectedEffects | EncoderCalibration = field(repr=False)
 
     def __str__(self) -> str:
