@@ -26,7 +26,8 @@ from typing import Any
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
 from gyro_calibration.calibration.whole_turns import FALSE_REFUSAL_RATE
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
+from gyro_calibration.logs.quality import (
+    bridge_gaps, find_runs, mask_outliers, quantization_step, robust_deviation)
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
     ANGLE_RANDOM_WALK, FLICKER, GaussMarkov, NOISE_TERMS, QUANTIZATION_NOISE, RATE_RAMP,
@@ -136,21 +137,25 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
     """Refuse a record whose means change by more than noise, and name its longest part at rest."""
     angle, lost = _integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
+    step = quantization_step(rate[np.isfinite(rate)])
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
         # changes of the mean over `size` samples, times `size`
-        end, step = len(angle) - 2 * size, max(1, size // 4)
-        at = np.arange(0, end, step)
+        end, every = len(angle) - 2 * size, max(1, size // 4)
+        at = np.arange(0, end, every)
         if lost is not None:
-            at = at[_mask_complete_windows(lost, size, 0, end, step)]
+            at = at[_mask_complete_windows(lost, size, 0, end, every)]
         if len(at) < MIN_WINDOWS:
             break
         change = np.abs(angle[at + 2 * size] - 2.0 * angle[at + size] + angle[at])
-        # the rms where most of them are zero
+        # the rms where most of them are zero; beyond the limit as seldom as normal noise by
+        # Bernstein's inequality for sums of whole steps
         scale = robust_deviation(change) or float(np.sqrt(np.mean(change ** 2)))
-        for begin in at[change > MAX_NOISE_SIGMAS * scale]:
+        limit = MAX_NOISE_SIGMAS * (MAX_NOISE_SIGMAS * step / 6.0 + math.hypot(
+            MAX_NOISE_SIGMAS * step / 6.0, scale))
+        for begin in at[change > limit]:
             moved[begin:begin + 2 * size] = True
-        if change.max() > worst * scale:
-            worst, over = float(change.max() / scale), size
+        if change.max() > worst * limit:
+            worst, over = float(change.max() / limit), size
     if not moved.any():
         return
     rest = max(find_runs(~moved), key=lambda run: run.stop - run.start, default=slice(0, 0))
@@ -161,8 +166,8 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
         remedy = f'use the longest part at rest, from {begin:.1f} to {end:.1f} s, or record again'
     raise DataRefused('the gyro was moved, or its output jumped: from '
                       f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
-                      f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
-                      f'deviations: {remedy}')
+                      f'{over * stamps.interval:.3g} s change up to '
+                      f'{MAX_NOISE_SIGMAS * worst:.0f} standard deviations: {remedy}')
 
 
 def _integrate_angle(rate: Array) -> Array:

@@ -532,7 +532,10 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                    'motion has the same effect as a bias, which the intervals do not include; '
                    'rest now and then')
         half = NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0])
-        largest = NORMAL_QUANTILE_975 * TECHNOLOGY_PRIORS[technology][0]
+        largest, largest_bias = NORMAL_QUANTILE_975 * np.array(TECHNOLOGY_PRIORS[technology])
+        if abs(fit.bias) > largest_bias:
+            yield (f'the bias is beyond what gyros of the technology {technology} have: check '
+                   '--technology and units')
         if abs(s) > largest:
             yield ('the scale factor error is beyond what gyros of the technology '
                    f'{technology} have: check the units, and the size and distance of wheels')

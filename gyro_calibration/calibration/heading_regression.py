@@ -699,7 +699,8 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
 
     Rests that the motion contradicts are left out where no causes are given. Wheels of another
     size may exceed what a gyro errs by: beside a course the values are means under the prior of
-    the technology and a wide one, weighted by their probability given the drive.
+    the technology and a wide one, weighted by their probability given the drive. A bias beyond the
+    technology is that of another one, whose bias may have any size.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
     corrected, point_variances = _correct_rate(spans, every)
@@ -716,10 +717,14 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     wide = _fit_with_noise(corrected, every, point_variances)
     assert spans.log.reference_heading is not None
     is_lost = find_lost_reference(np.isfinite(spans.log.reference_heading)).any()
-    least = abs(wide.values[0]) - wide.half_width(0)
-    probability = 0.0 if is_lost and least < NORMAL_QUANTILE_975 * prior[0] else float(expit(
-        wide.fit.log_evidence - usual.fit.log_evidence
-        + math.log(1e-3 if is_lost else 1.0)))  # what is lost at times has no wheels
+    evidence = wide.fit.log_evidence - usual.fit.log_evidence
+    of_scale, of_bias = (abs(wide.values[place]) - wide.half_width(place)
+                         > NORMAL_QUANTILE_975 * prior[place] for place in (0, 1))
+    if is_lost and of_bias and evidence > 0.0:  # it is not of the technology
+        return fit_spans(replace(spans, treatment=replace(spans.treatment, prior=(
+            TECHNOLOGY_PRIORS['mems'][0], spans.treatment.wide_prior[1], prior[2]))), causes)
+    probability = 0.0 if is_lost and not of_scale else float(expit(
+        evidence + math.log(1e-3 if is_lost else 1.0)))  # what is lost at times has no wheels
     likelier = wide if probability > 0.5 else usual
     if min(probability, 1.0 - probability) < 0.025:  # an interval of 95 % does not contain it
         return likelier

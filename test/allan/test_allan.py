@@ -230,6 +230,16 @@ def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
         fit_noise(record.rate, record.interval)
 
 
+@pytest.mark.parametrize('step', [1.0, 2.07, 4.0])
+def test_steps_of_the_output_are_no_motion(step):
+    """The steps are given in standard deviations of a sample."""
+    time, noise = stamps(300_000), np.random.default_rng(27).standard_normal(300_000)
+    coarse = step * np.round(noise / step)
+    assert build_rest_record(time, coarse).rate.std() > 0.0
+    with pytest.raises(DataRefused, match='moved'):
+        build_rest_record(time, coarse + 3.0 * step * (time > 700.0))
+
+
 def test_the_part_at_rest_that_is_proposed_is_accepted(tmp_path, run):
     """The times are those of --from and --to."""
     time, rate = stamps(20_000), simulate_noise(WHITE, 20_000, INTERVAL,

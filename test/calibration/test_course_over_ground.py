@@ -30,7 +30,7 @@ from scipy.signal import lfilter
 SCALE, BIAS = 1.01, 0.4 * DEGREE
 
 
-def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0):
+def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0, bias=BIAS):
     """Return 3 min at 50 Hz of random turns, with a course that is late, and lost for 20 s."""
     generator = np.random.default_rng(seed)
     time = np.arange(9000) / 50.0
@@ -41,7 +41,7 @@ def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0):
     noise += burst * DEGREE * np.sin(time) * ((time > 120.0) & (time < 130.0))
     course = np.interp(time - late, time, heading) + noise
     course[(time > 60.0) & (time < 80.0)] = math.nan
-    output = follows * SCALE * rate + BIAS + 0.05 * DEGREE * generator.standard_normal(9000)
+    output = follows * SCALE * rate + bias + 0.05 * DEGREE * generator.standard_normal(9000)
     return Log(time=time, output=output, reference_heading=course)
 
 
@@ -94,12 +94,23 @@ def test_a_burst_of_bad_fixes_does_not_move_the_bias():
 
 
 def test_a_drive_without_turns_leaves_the_scale_to_the_prior():
-    consumer, fibre = (calibrate_encoder(drive(3, turning=0.0), technology=name).fit
-                       for name in ('mems', 'closed_loop_fog'))
+    consumer, fibre = (
+        calibrate_encoder(drive(3, turning=0.0, bias=bias), technology=name).fit
+        for name, bias in (('mems', BIAS), ('closed_loop_fog', 0.0)))
     for fit, largest in ((consumer, 0.01), (fibre, 0.001)):
         assert abs(fit.scale_factor_error) < 0.5 * largest
         assert math.sqrt(fit.covariance[0, 0]) < 1.1 * largest
     assert consumer.covariance[0, 0] > 10.0 * fibre.covariance[0, 0]
+
+
+@pytest.mark.parametrize('bias', [0.03, 0.1, 2.0])
+def test_a_bias_beyond_the_technology_is_found(bias):
+    fits = [calibrate_encoder(drive(3, bias=bias * DEGREE), technology=name)
+            for name in ('mems', 'closed_loop_fog')]
+    for found in fits:
+        deviation = math.sqrt(found.fit.covariance[1, 1])
+        assert abs(found.fit.bias - bias * DEGREE) < 3.0 * deviation < 0.1 * DEGREE
+    assert any('beyond what gyros of the technology' in each for each in fits[1].remarks)
 
 
 @pytest.mark.parametrize(
