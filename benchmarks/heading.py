@@ -160,8 +160,8 @@ def rows(settings: Mapping[str, Mapping[str, float]]) -> dict[str, Row]:
             'eq. 7, threshold on 0.2 s': ('published', WINDOWED), 'likelihood': ('likely', None),
             'likelihood, threshold on 0.2 s': ('likely', WINDOWED)}.items()}
     ways = list(enumerate(('live', 'with hindsight')))
-    for words, told in (('', (1.0,)), (' told half the noise', (0.5,)),
-                        (' told twice the noise', (2.0,)), (' with wheels', (1.0, True))):
+    for words, told in (('', (1.0,)), (' given half the noise', (0.5,)),
+                        (' given twice the noise', (2.0,)), (' with wheels', (1.0, True))):
         found |= {f'this program{words}, {way}': lambda known, told=told, place=place: _tracked(
             known, *told)[place] for place, way in ways}
     for name, best in settings.items():

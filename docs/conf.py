@@ -94,7 +94,18 @@ def describe_fields(app, what, name, obj, options, lines):
             before = f'{before} {comment[1]}' if is_continued else comment[1]
         is_continued = bool(comment)
     if entries:
-        lines += ['', 'Parameters', '----------', *entries, '']
+        title = 'Attributes' if _is_result(obj) else 'Parameters'
+        lines += ['', title, '-' * len(title), *entries, '']
+
+
+def hide_results(app, what, name, obj, options, signature, returns):
+    """Show no signature of a record that only functions make."""
+    return ('', None) if what == 'class' and _is_result(obj) else None
+
+
+def _is_result(obj):
+    from gyro_calibration.cli.verb import PrintedResult
+    return issubclass(obj, PrintedResult)
 
 
 def describe_formats(app, docname, source):
@@ -124,4 +135,5 @@ def setup(app):
     app.connect('builder-inited', write_verbs)
     app.connect('autodoc-process-docstring', describe_entries, priority=400)
     app.connect('autodoc-process-docstring', describe_fields, priority=450)
+    app.connect('autodoc-process-signature', hide_results)
     app.connect('source-read', describe_formats)

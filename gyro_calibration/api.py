@@ -81,11 +81,17 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
         ``{'time': 't:ms', 'gyro': 'wz:deg/s', 'heading': 'yaw:deg'}``; without a unit SI;
         or 'attitude' -> the names of a quaternion, ``qw/qx/qy/qz``, whose rotation about the axis
         becomes the reference heading
-    axis : x, y or z of a gyro with three, and of an attitude
-    rate : Hz; the samples of a file came at this rate, whatever it says of time
+    axis : x, y or z: the axis of the gyro, for a gyro or an attitude with three
+    rate : sample rate, Hz, for a file whose times are not usable
     sensitivity : rad/s a count, for files with raw counts
-    unwrap : the reference heading jumps by whole turns; make it continuous
-    topic, reference_topic, temperature_topic : of a recording
+    unwrap : remove jumps by whole turns from the reference heading
+    topic, reference_topic, temperature_topic : of a recording; None takes the only gyro, no
+        reference, and the temperature whose name is nearest to that of the gyro
+
+    Returns
+    -------
+    Log
+        The log in SI.
 
     """
     if not isinstance(source, (str, Path)):
@@ -103,7 +109,7 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
 
 def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
     """
-    Return the model of a file, or of a mapping; raise `ValueError` where it is none.
+    Return the model of a file, or of a mapping with the same keys; `ValueError` if it is none.
 
     ``read_model({'effects': {'bias': {'bias': 0.002}}, 'noise': {'angle_random_walk': 7e-4}})``
     is a gyro with a bias and white noise.
@@ -123,8 +129,13 @@ def simulate(model: GyroModel, motion: _MotionLike = 'robot', *, sample_rate: fl
     motion : ``calibration`` (20 s), ``robot`` (160 s), ``rest`` (60 s), a profile file, (time,
         rate) in s and rad/s, or a log whose reference is the motion
     sample_rate : Hz
-    seed : of the noise; None simulates none
-    temperature : degC, of all samples or of each, shape (n,)
+    seed : seed of the noise; None simulates without noise
+    temperature : degC, one value or one for each sample, shape (n,)
+
+    Returns
+    -------
+    Log
+        Output and temperature of the gyro, with the true rate and heading.
 
     """
     _require_model(model)
@@ -138,11 +149,11 @@ def simulate(model: GyroModel, motion: _MotionLike = 'robot', *, sample_rate: fl
 class Headings(PrintedResult):
     """Rates and heading of a log, corrected by a model; nan where the output was not plausible."""
 
-    log: Log  # that was corrected
-    rate: Array  # rad/s, shape (n,)
-    rate_std: Array  # rad/s, shape (n,)
-    heading: Array | None  # from 0 on, rad, shape (n,); None for a log without time
-    heading_std: Array | None  # rad, shape (n,)
+    log: Log  # the log as it was given
+    rate: Array  # corrected rate, rad/s, shape (n,)
+    rate_std: Array  # its standard deviation, rad/s, shape (n,)
+    heading: Array | None  # integral of the rate, from 0, rad, shape (n,); None without time
+    heading_std: Array | None  # its standard deviation, rad, shape (n,)
     #: All columns that `gyro_calibration compensate` adds, by name.
     columns: Mapping[str, Array] = field(repr=False)
 
@@ -173,7 +184,7 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     """
     Correct the rates of a log by a model, and integrate them to a heading.
 
-    `ValueError` says that no row of the log is plausible.
+    Raises `ValueError` if no row of the log has a plausible output.
     """
     _require_logs(log)
     _require_model(model)
@@ -182,13 +193,18 @@ def compensate(log: Log, model: GyroModel) -> Headings:
 
 def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     """
-    Follow the heading of a log as the node does: at rest it stands, and the bias is estimated.
+    Estimate the heading of a log as the node does: constant at rest, where it estimates the bias.
 
     Parameters
     ----------
-    log : with time
-    model : with an angle random walk in its noise, which `allan` finds
+    log : a log in time
+    model : a model with an angle random walk, which `allan` determines
     hindsight : smooth the heading by all later samples
+
+    Returns
+    -------
+    Headings
+        Corrected rates and headings with their standard deviations.
 
     """
     _require_time(log)
@@ -208,15 +224,15 @@ def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
 
 @dataclass(frozen=True)
 class Run(PrintedResult):
-    """A self-calibration."""
+    """Scale factor error and bias by a self-calibration."""
 
     model: GyroModel  # the given model with the new self-calibration
-    scale_factor_error: float
-    bias: float  # rad/s
-    scale_factor_error_std: float
-    bias_std: float  # rad/s
-    fit: RunFit = field(repr=False)  # with the delay of the gyro and the goodness of fit
-    remarks: tuple[str, ...]  # on the rows of the log that were not used
+    scale_factor_error: float  # s, 1
+    bias: float  # b, rad/s
+    scale_factor_error_std: float  # standard deviation of s
+    bias_std: float  # standard deviation of b, rad/s
+    fit: RunFit = field(repr=False)  # delay of the gyro, goodness of fit
+    remarks: tuple[str, ...]  # on rows of the log that were not used
     _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
@@ -230,14 +246,19 @@ class Run(PrintedResult):
 def self_calibrate(log: Log, motion: _MotionLike | None = None, model: GyroModel | None = None, *,
                    method: str = 'likelihood') -> Run:
     """
-    Find scale factor error and bias in about 20 s of known motion.
+    Determine scale factor error and bias from about 20 s of known motion.
 
     Parameters
     ----------
-    log : of the run, beginning within 1 s of the motion
-    motion : that was driven; None takes the reference of the log
-    model : that corrects first, and whose noise counts
+    log : log of the run, beginning within 1 s of the motion
+    motion : the motion that was driven, as for `simulate`; None takes the reference of the log
+    model : model by which the log is corrected first, with its noise; None is an ideal gyro
     method : likelihood, heading or rate
+
+    Returns
+    -------
+    Run
+        The two values with their standard deviations, and the model with them.
 
     """
     model = GyroModel() if model is None else model
@@ -261,10 +282,16 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
 
     Parameters
     ----------
-    logs : of one gyro
-    effects : names of those to fit; None takes those that the data support
-    technology : open_loop_fog, closed_loop_fog or mems; decides where effects look alike
-    method : dwells, likelihood or course; None takes what the logs hold
+    logs : logs of one gyro
+    effects : names of the effects to fit; None selects those that the data support
+    technology : open_loop_fog, closed_loop_fog or mems; decides between effects that the data do
+        not distinguish
+    method : dwells, likelihood or course; None selects it by the references of the logs
+
+    Returns
+    -------
+    Fitted
+        The model, and the fit.
 
     """
     _require_logs(*logs)
@@ -282,9 +309,9 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
 
 def allan(log: Log) -> NoiseFigures:
     """
-    Find the noise figures of a gyro in a log at rest, by its Allan deviation.
+    Determine the noise figures of a gyro from a log at rest, by its Allan deviation.
 
-    `ValueError` says that the gyro moved, is dead, or has uneven stamps.
+    Raises `ValueError` if the gyro moved, is dead, or has uneven stamps.
     """
     _require_time(log)
     return find_noise_figures(log)
@@ -326,12 +353,18 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0, kind: st
 
     Parameters
     ----------
-    logs : of one gyro, each with a reference, or at rest; or a single rate table
-    model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
-    seed : of the random draws of significance tests
-    kind : of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or rest;
-        None takes what the log shows
-    time_limit : s; the search for causes ends after half of it, and what was found is confirmed
+    logs : logs of one gyro, each with a reference, or at rest; or a single rate table
+    model : model of the simulation; None is an ideal gyro with the bias and scale factor error
+        that fit the logs best
+    seed : seed of the random draws of significance tests
+    kind : kind of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or
+        rest; None detects it
+    time_limit : the search for causes ends after half of it, s, and what was found is confirmed
+
+    Returns
+    -------
+    Diagnosed
+        The causes, and the extended model.
 
     """
     _require_logs(*logs)

@@ -108,7 +108,8 @@ def row(parameter):
     limits = (' to '.join(map(number, parameter.range or ()))
               or ', '.join(map('`{}`'.format, parameter.choices)))
     return (f'| `{parameter.name}` | {text} | {parameter.unit} | {limits} | '
-            f'{"yes" if parameter.dynamic else ""} | {parameter.description} |')
+            f'{"yes" if parameter.dynamic else ""} | '
+            + parameter.description.replace('*', r'\*') + ' |')
 
 
 def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):

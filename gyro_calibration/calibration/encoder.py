@@ -306,7 +306,8 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         if not alike and late < 0.5 * unexplained:
             contradiction = f'is {abs(delay):.1f} s {"behind" if delay > 0.0 else "ahead of"}'
         # what noise or another delay may do to the scale is less than the root of what they leave
-        elif abs(scale - 1.0) >= max(1e-3, math.sqrt(max(unexplained, 0.0))):
+        elif ((turned.any() or not alike)
+              and abs(scale - 1.0) >= max(1e-3, math.sqrt(max(unexplained, 0.0)))):
             contradiction = f'turns {scale:.3f} times as far as'
         if contradiction and log.output is not None:
             rows = np.isfinite(log.output[known])

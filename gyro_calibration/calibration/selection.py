@@ -257,11 +257,11 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
     except DataRefused as error:
         return _EffectChoice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    reason = 'does not predict left-out sweeps better'
+    reason = 'does not predict left-out dwells better'
     if not larger.dof:
         reason = 'as many values as dwells: no significance can be stated; add dwells'
     elif taken:
-        reason = ('predicts left-out sweeps better'
+        reason = ('predicts left-out dwells better'
                   if _is_supported(smaller, larger, significance) else 'belongs to every model')
     elif larger.p_value(effect) >= significance:
         reason = f'its p-value is above {significance:.2g}, the limit for one effect'

@@ -93,7 +93,7 @@ def run(given: argparse.Namespace) -> Answer:
 class NoiseFigures(PrintedResult):
     """The noise of a gyro at rest: angle random walk, bias instability and so on."""
 
-    record: RestRecord = field(repr=False)
+    record: RestRecord = field(repr=False)  # numbered samples, gaps and delays of the stamps
     chart: AllanChart  # Allan deviations with their bounds
     fit: NoiseFit  # the noise figures
 

@@ -42,7 +42,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
     parser.add_argument('--reference-kind', choices=REFERENCE_KINDS,
-                        help='kind of the reference; default: detected from the log')
+                        help='kind of the reference, if it is not detected right; '
+                        'default: detected from the log')
     parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
                         'model.yaml, the extended model')
     parser.add_argument('--time-limit', type=verb.positive_number, metavar='S', help='the search '

@@ -139,8 +139,8 @@ def run(given: argparse.Namespace) -> Answer:
 class Fitted(PrintedResult):
     """A calibration by a rate table, a turntable or a reference heading."""
 
-    model: GyroModel  # with the fitted effects and their covariance
-    #: Effects, dwells and residuals; or the fit of a reference heading.
+    model: GyroModel  # model with the fitted effects and their covariance
+    #: effects, dwells and residuals, or the fit of a reference heading
     found: SelectedEffects | EncoderCalibration = field(repr=False)
 
     def __str__(self) -> str:
@@ -191,7 +191,8 @@ def _dwell_data(selection: SelectedEffects) -> dict[str, Any]:
 def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
     fit = selection.calibration
     table, sweeps = fit.dwells, len(np.unique(fit.dwells.sweep))
-    slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
+    slowest, fastest = (round(rate / DEGREE, 1) + 0.0  # which makes 0 of -0
+                        for rate in (table.rate.min(), table.rate.max()))
     temperatures = ('' if table.temperature is None
                     else f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
     yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
@@ -208,7 +209,8 @@ def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
         yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
                f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
         for part in bin_errors(fit, values):
-            yield (f'{f"{part.low * factor:.1f} to {part.high * factor:.1f}":22s} '
+            low, high = (round(each * factor, 1) + 0.0 for each in (part.low, part.high))
+            yield (f'{f"{low:.1f} to {high:.1f}":22s} '
                    f'{part.count:6d} {part.uncorrected / DEGREE:18.4f} '
                    f'{part.residual / DEGREE:10.4f} {part.deviation / DEGREE:8.4f} '
                    f'{part.rms / DEGREE:8.4f}')

@@ -118,7 +118,7 @@ def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
                    _side_by_side(map(draw_chart, [*_error_charts(curve, place),
                                                   _residual_chart(curve, place)]))]
     yield 'Simulation and measurement', misfit
-    yield 'Causes', [element('article', element('h3', f'{place} {cause_title(found)}'),
+    yield 'Causes', [element('article', element('h3', f'{place}. {cause_title(found)}'),
                              *(element('p', text) for text in cause_paragraphs(found, diagnosis)))
                      for place, found in enumerate(diagnosis.findings, 1)]
     parts = [] if diagnosis.heading is None else [draw_chart(_heading_chart(diagnosis.heading))]

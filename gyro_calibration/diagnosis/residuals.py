@@ -318,7 +318,9 @@ def _bin_variances(fit: RegressionFit, bins: Sequence[NDArray[np.intp]]) -> Arra
                 / fit.degrees_of_freedom) @ (1.0 / problem.weights)
     variances = problem.split_by_log(problem.deviation ** 2 * problem.by_coefficient(relative))
     for each, residual, variance, place in zip(problem.replays, fit.residuals, variances, bins):
-        point = np.minimum(each.grid_index // each.decimation, each.point_count - 1)
+        # samples beyond the points count as mirrored, as the transform continues the residual
+        point = each.grid_index // each.decimation
+        point = np.minimum(point, 2 * each.point_count - 1 - point)
         counts = np.bincount(place * each.point_count + point,
                              minlength=_CURVE_BINS * each.point_count).astype(float)
         counts = counts.reshape(_CURVE_BINS, each.point_count)

@@ -304,7 +304,8 @@ def lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
     if shares := diagnosis.heading_shares:
         names = {'reference': 'errors of the reference', 'left': 'not explained'}
         yield ('Shares of the mean square heading error over 60 s'
-               + (', above 100 % where causes cancel each other' * (max(shares.values()) > 1.0)),
+               + ', more than 100 % together where causes cancel each other' * (
+                   round(sum(shares.values()), 2) > 1.0),
                [f'{names.get(name, readable_name(name))}: {_format_share(share)}'
                 for name, share in sorted(shares.items(), key=lambda each: -each[1])])
     if diagnosis.cannot_show:

@@ -143,6 +143,9 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
     assert judge_diagnosis(
         log, found, ENCODER).is_right and set(names_of(found)) <= set(ENCODER), told(log, found)
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
+    # bands of the same length of log are alike, also at its end
+    bands = next(each.deviation for each in found.curves if each.along == 'time')
+    assert bands.max() < 2.0 * np.median(bands)
 
 
 @pytest.mark.parametrize('name',

@@ -24,7 +24,7 @@ from gyro_calibration.diagnosis.findings import (
     Change, Curve, Diagnosis, Estimate, Finding, Gain, Reference, Unexplained)
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import (
-    format_probability, format_quantity, headline, terminal_lines)
+    format_probability, format_quantity, headline, lists, terminal_lines)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -300,6 +300,13 @@ def test_causes_are_named_by_their_share_of_the_heading_error_and_faults_of_samp
         'time offset (or bandwidth) and 2 more')
     assert headline(replace(whole, findings=(lost,), unexplained=()))[0] == (
         'No error of the gyro is established; the record has dropped samples: 123.')
+
+
+@pytest.mark.parametrize('shares, cancel', [((0.6, 0.4), False), ((0.7, 0.6), True)])
+def test_shares_that_add_up_to_more_than_the_whole_are_said_to_cancel(shares, cancel):
+    found = replace(extended(), heading_shares=dict(zip(('bias', 'warm_up'), shares)))
+    title = next(title for title, _ in lists(found) if title.startswith('Shares'))
+    assert ('cancel' in title) == cancel
 
 
 def test_what_a_reference_with_errors_does_not_establish_is_not_said_to_be_noise():

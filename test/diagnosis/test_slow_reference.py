@@ -136,6 +136,8 @@ def test_a_heading_that_is_seldom_known_gives_way_to_the_rate():
     left, remarks = choose_reference(log)
     assert left.reference_heading is None and 'heading is known in 2000 samples only' in remarks[0]
     assert choose_reference(replace(log, reference_heading=heading(TIME)))[1] == []
+    still = np.zeros_like(TIME)
+    assert choose_reference(replace(log, reference_rate=still, reference_heading=still))[1] == []
 
 
 def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():
