@@ -32,10 +32,11 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer
-from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
+from gyro_calibration.driver.connection import (
+    Connection, ConnectionState, MAX_BAUD, sample_messages)
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE, TRISTATE
+from gyro_calibration.driver.protocols.protocol import ASSUMED_NOISE, TRISTATE
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
@@ -217,17 +218,9 @@ class McapRecorder(_Recorder):
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample as messages on the topics of the driver; the stamp is in ns."""
-        force, temperature = sample.specific_force, sample.temperature
-        of_force = (cdr.NOT_REPORTED_COVARIANCE
-                    if force is None else cdr.z_axis_covariance(ASSUMED_FORCE_NOISE ** 2))
-        messages = [] if temperature is None else [
-            ('/imu/temperature', cdr.TEMPERATURE, [temperature, 0.0])]
-        messages.append(
-            ('/imu/data_raw', cdr.IMU,
-             [0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE, 0.0, 0.0, sample.output,
-              *cdr.z_axis_covariance(self.variance), 0.0, 0.0, force or 0.0, *of_force]))
-        for topic, kind, numbers in messages:
-            self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
+        for kind, data in sample_messages(sample, stamp, 'gyro', self.variance):
+            topic = _DEFAULT_TOPICS['gyro' if kind == cdr.IMU else 'temperature']
+            self.writer.add(Message(f'/{topic}', kind, stamp, data))
 
     def flush(self, is_due: bool = False) -> None:
         if self.writer.pending_bytes:
@@ -338,7 +331,7 @@ class _PortSession:
         self.recorder = kind(given.out, self._file_notes)
 
     def counts(self) -> tuple[int, int]:
-        counts = self._connection.counts()
+        counts = self._connection.counts
         return counts.samples, counts.lost_samples
 
     def _file_notes(self) -> dict[str, str]:
@@ -383,7 +376,7 @@ class _PortSession:
     def conclude(self) -> tuple[dict[str, Any], list[str]]:
         found, recorder = self._connection, self.recorder
         remarks = [f'{count} {name.replace("_", " ")}.'
-                   for name, count in vars(found.counts()).items()
+                   for name, count in vars(found.counts).items()
                    if name not in ('samples', 'lost_samples') and count]
         if (found.protocol and found.clock and found.clock.is_settled and (
                 warning := found.protocol.sample_rate_warning(self._settings,

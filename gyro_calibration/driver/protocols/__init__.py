@@ -25,10 +25,11 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
+from gyro_calibration.driver.protocols.protocol import (
+    Counts, Decoder, Protocol, Sample, Settings)
 from gyro_calibration.files import suggest_nearest
 
-__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings',
+__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Counts', 'Decoder', 'Protocol', 'Sample', 'Settings',
            'find_protocol', 'recognize_protocol']
 
 #: The formats by name.
