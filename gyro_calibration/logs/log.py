@@ -536,6 +536,14 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     return heading, bool(np.abs(np.diff(heading[known]) - np.diff(plainly)).max() > np.pi)
 
 
+def unwrap_reference(log: Log) -> Log:
+    """Return a log with output and time whose reference heading, if any, is unwrapped."""
+    time, output, heading = (np.asarray(each) for each in (
+        log.time, log.output, log.reference_heading))
+    return log if log.reference_heading is None else replace(
+        log, reference_heading=unwrap_heading(time, heading, time, output)[0])
+
+
 def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
                      output: Array) -> tuple[Array, float]:
     """Return the heading, (m,), by the gyro with sign and bias fitted, and its scale factor."""
