@@ -10,8 +10,6 @@
 
 """The results of a reproduction: published and computed numbers, and contradictions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 import math

@@ -14,8 +14,6 @@ Record a gyro, from its port or from topics, until Ctrl-C.
 example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -44,7 +42,7 @@ from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
 from gyro_calibration.logs.recording import read_recording, Topics
-from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message, METADATA_NAME
+from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message
 from tqdm import tqdm
 
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
@@ -214,7 +212,8 @@ class McapRecorder(_Recorder):
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
-        self.writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
+        self.writer = McapWriter(f'gyro_calibration {__version__}', notes)
+        self.variance = ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample as messages on the topics of the driver; the stamp is in ns."""
@@ -223,10 +222,8 @@ class McapRecorder(_Recorder):
             self.writer.add(Message(f'/{topic}', kind, stamp, data))
 
     def flush(self, is_due: bool = False) -> None:
-        if self.writer.pending_bytes:
-            head = b'' if self.size else self.writer.pack_header(
-                f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
-            self.append(head + self.writer.pack_chunk())
+        if piece := self.writer.pack_chunk():
+            self.append(piece)
 
     def finish(self) -> None:
         self.flush()

@@ -116,9 +116,6 @@ class _SampleCounter:
 
     def __init__(self, rate: float, modulus: int):
         self._rate, self._modulus = rate, modulus
-        self.reset()
-
-    def reset(self) -> None:
         self.mean_advance = 1.0  # the usual one
         #: Of how many samples the number may be wrong by a multiple; 0 by the time of the device.
         self.ambiguity = 1
@@ -169,7 +166,7 @@ class _LatenessTest:
         self.step, self._least = 0.0, math.inf
         # least lateness of arrivals that were not late, since the start of a window
         self._least_on_time, self._window_start = math.inf, -math.inf
-        self._first_number = self._last_arrival = self._last_silence = 0.0
+        self.first_number = self._last_arrival = self._last_silence = 0.0
 
     def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
                        period: float) -> bool:
@@ -185,17 +182,13 @@ class _LatenessTest:
         # are the period of samples whose rate fell.
         usual, self._last_silence = max(period, self._last_silence), silence
         if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * usual):
-            self.late_since, self._first_number, self._least = arrival, number, math.inf
+            self.late_since, self.first_number, self._least = arrival, number, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
         # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
         # to a period and falls to zero. So its step is tested, and itself after a longer time.
         self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
                                    else max(0.0, self._least_on_time))
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
-
-    def has_slowed(self, number: float, arrival: float, slope: float) -> bool:
-        assert self.late_since is not None
-        return (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
 
 
 class SampleClock:
@@ -209,7 +202,8 @@ class SampleClock:
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
-        self._counter = _SampleCounter(rate, modulus)
+        self._device = rate, modulus
+        self._counter = _SampleCounter(*self._device)
         self._lateness = _LatenessTest()
         self._line = _LowerLine(1.0 / rate)
         self._last_number, self._slew_offset = 0.0, 0.0
@@ -231,7 +225,7 @@ class SampleClock:
 
     def interrupt(self) -> None:
         """Start a new line, as after a loss of the port; no samples count as lost meanwhile."""
-        self._counter.reset()
+        self._counter = _SampleCounter(*self._device)
         self._restart_line()
 
     def stamp_samples(self, samples: Sequence[Sample], arrival: float) -> list[float]:
@@ -297,12 +291,14 @@ class SampleClock:
         elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, number, arrival,
                                                     period):
             lost = unit * math.floor(self._lateness.step / (unit * period) + 0.25)
-            if not lost or self._lateness.has_slowed(number, arrival, self._line.slope):
-                self._restart_line()
-            else:
-                assert self._lateness.late_since is not None
-                self._uncertain_since, self._lateness.late_since = self._lateness.late_since, None
+            begin, self._lateness.late_since = self._lateness.late_since, None
+            assert begin is not None
+            has_slowed = ((number - self._lateness.first_number) * self._line.slope
+                          < 0.5 * (arrival - begin))
+            if lost and not has_slowed:
+                self._uncertain_since = begin
                 return self._renumber(lost)
+            self._restart_line()
         return 0
 
     def _renumber(self, offset: int) -> int:

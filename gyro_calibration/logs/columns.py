@@ -117,7 +117,9 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
             found[part] = Column(header.index(column), units[unit], offset)
     asked = {column.position for column in found.values()}
     for index, name in enumerate(header):
-        quantity, factor = COLUMNS.get(_strip_axis(name, axis), ('', 0.0))
+        first, _, rest = name.partition(f'_{axis}_')
+        has_axis = rest and first in ('gyro', 'acceleration')  # as gyro_z_dps
+        quantity, factor = COLUMNS.get(f'{first}_{rest}' if has_axis else name, ('', 0.0))
         if not quantity or index in asked or quantity in by_user:
             continue
         if quantity in found:
@@ -129,12 +131,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                          'with gyro_dps, gyro_rad_s or gyro_counts, and # before the lines above '
                          'it, or other names, as by --columns time=NAME:s,gyro=NAME:deg/s')
     return found
-
-
-def _strip_axis(name: str, axis: str) -> str:
-    """Return a column name without the axis: gyro_dps for gyro_z_dps."""
-    first, _, rest = name.partition(f'_{axis}_')
-    return f'{first}_{rest}' if rest and first in ('gyro', 'acceleration') else name
 
 
 def find_delimiter(line: str) -> str:

@@ -15,8 +15,6 @@ It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``
 ``imu/data``, ``heading``, ``yaw_rate``, ``~/calibration_status`` and diagnostics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import math
 import os
@@ -461,10 +459,7 @@ class CompensationReport:
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
         warnings += filter(None, (
-            pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-            pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
-            pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
-            store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
+            pipeline.session.warning, *pipeline.faults.values(), pipeline.output_conflict, store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
             estimator.calibration_message, estimator.bias_message, store.table_hint))
         if warnings:
             return WARN, warnings[0]
