@@ -19,7 +19,7 @@ from dataclasses import asdict
 from typing import Any
 
 from gyro_calibration.calibration.motion_design import (
-    CalibrationForecast, can_follow, find_best_motion, plain_motion, Prediction, RobotLimits)
+    CalibrationForecast, can_follow, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress
@@ -99,7 +99,10 @@ def run(given: argparse.Namespace) -> Answer:
              f'{rate.max() / DEGREE:.1f} deg/s and headings of {angle.min():.0f} to '
              f'{angle.max():.0f} deg.',
              '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:',
-             *(_row(labels[name], row) for name, row in rows.items()),
+             *(f'  {labels[name] + ":":34} scale +- {100 * row.scale_deviation:.4f} %, '
+               f'bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
+               f'mean heading error {row.heading_error / DEGREE:.3f} deg'
+               for name, row in rows.items()),
              '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} '
              f'times as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
              f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
@@ -148,9 +151,3 @@ def write_motion(path: str, motion: Motion) -> None:
     lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
              *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]
     write_atomically(path, ('\n'.join(lines) + '\n').encode())
-
-
-def _row(name: str, row: Prediction) -> str:
-    return (f'  {name + ":":34} scale +- {100 * row.scale_deviation:.4f} %, '
-            f'bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
-            f'mean heading error {row.heading_error / DEGREE:.3f} deg')

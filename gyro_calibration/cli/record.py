@@ -48,11 +48,7 @@ from tqdm import tqdm
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
-#: Time, s, for which the header of a log waits for values that come seldom: with and without a
-#: temperature so far.
-_HEADER_WAITS = 1.0, 3.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -265,7 +261,8 @@ class CsvRecorder(_Recorder):
 
     def flush(self, is_due: bool = False) -> None:
         """Write the rows so far; the first ones after some seconds, when the columns are known."""
-        wait = _HEADER_WAITS['temperature_degc' not in self._held_values]
+        # s; the header waits for values that come seldom
+        wait = 1.0 if 'temperature_degc' in self._held_values else 3.0
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
                                   - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
@@ -430,7 +427,7 @@ class _TopicSession:
     def record(self, on_chunk: Callable[[], None]) -> None:
         def tick(node: Any) -> None:
             on_chunk()
-            if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
+            if self._is_waiting and time.monotonic() - self._start_time > 5.0:
                 self._is_waiting = False
                 if missing := node.missing_topics:
                     known = sorted(name for name, _ in node.get_topic_names_and_types())

@@ -123,7 +123,6 @@ def _describe_error(error: BaseException) -> str:
 
 MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
-_SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
 #: Longest silence of a board that restarts when its port is opened, and longest delay before a
 #: lost port is opened again, s.
 _RESTART_DURATION = 5.0
@@ -315,7 +314,7 @@ class Connection:
             if not received and now - last_request >= _LISTENING_DURATION:
                 port.write(protocol.startup)
                 last_request = now
-            timeout = max(_SILENCE_TIMEOUT, _SILENCE_PERIODS * clock.period)
+            timeout = max(_SILENCE_TIMEOUT, 3.0 * clock.period)
             # To open the port again would restart a board that still starts. The second sample
             # shows the period.
             deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)

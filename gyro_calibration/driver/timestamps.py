@@ -34,17 +34,14 @@ import time
 
 from gyro_calibration.driver.protocols import Sample
 
-_STEADY_CLOCK_ID = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
 _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock drifts visibly
 #: Least span of a line before its period shows lost samples, and time constant of the difference
 #: of two clocks, s.
 _SETTLING_DURATION = 2.0
-_SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line, so that no rate is off by the correction
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-_RECENT_DURATION = 10.0  # s; in which older stamps may come after a clock was set
 #: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz
 #: on: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
 _MIN_LATENESS = 0.5e-3
@@ -261,7 +258,7 @@ class SampleClock:
         line.add(number, max(arrival, lowest))
         elapsed, self._last_number = max(0.0, number - self._last_number) * line.slope, number
         slew = 0.0 if is_first else expected - line.value_at(number)
-        slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANT)
+        slew *= math.exp(-elapsed / 1.0)  # s, so that no rate is off by the correction
         self._slew_offset = min(slew, arrival - line.value_at(number))
         stamps = [line.value_at(each) + self._slew_offset for each in numbers]
 
@@ -315,7 +312,7 @@ class SampleClock:
 
 def read_steady_clock() -> float:
     """Return seconds of the steady clock, including suspension of the host if supported."""
-    return time.clock_gettime(_STEADY_CLOCK_ID)
+    return time.clock_gettime(getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC))
 
 
 def read_clock_pair(steady_clock: Callable[[], float],
@@ -334,13 +331,13 @@ class _ClockStepDetector:
 
     def __init__(self) -> None:
         self.count = 0  # of steps
-        self._steady_time = self._other_time = math.nan
+        self.steady_time = self.other_time = math.nan  # at the last update, s
 
     def update(self, steady_time: float, other_time: float) -> float:
         """Take the times of both clocks, s; return the step of the clock, 0 without one."""
-        interval = other_time - self._other_time
-        step = interval - (steady_time - self._steady_time)
-        self._steady_time, self._other_time = steady_time, other_time
+        interval = other_time - self.other_time
+        step = interval - (steady_time - self.steady_time)
+        self.steady_time, self.other_time = steady_time, other_time
         if not (abs(step) > _CLOCK_STEP_THRESHOLD or interval < -_CLOCK_STEP_THRESHOLD):
             return 0.0
         self.count += 1
@@ -352,13 +349,12 @@ class NodeTimeConverter:
 
     def __init__(self) -> None:
         self.steps = _ClockStepDetector()
-        self._difference = math.nan
-        self._steady_time, self._node_time, self._last_stamp = -math.inf, -math.inf, -math.inf
+        self._difference, self._last_stamp = math.nan, -math.inf
 
     def update(self, steady_time: float, node_time: float) -> float:
         """Take the times of both clocks, s; return the step of the node's clock."""
-        elapsed, was_set_back = steady_time - self._steady_time, node_time < self._node_time
-        self._steady_time, self._node_time = steady_time, node_time
+        elapsed = steady_time - self.steps.steady_time
+        was_set_back = node_time < self.steps.other_time
         step = self.steps.update(steady_time, node_time)
         error = node_time - steady_time - self._difference
         if not step and abs(error) <= _CLOCK_STEP_THRESHOLD:
@@ -388,7 +384,7 @@ class HostTimeConverter:
     def update(self, steady_time: float, date: float) -> float:
         """Take the times of both clocks, s; return the step of the date."""
         self._recent_steps, self._unshown_steps = (
-            [each for each in steps if steady_time - each[1] <= _RECENT_DURATION]
+            [each for each in steps if steady_time - each[1] <= 10.0]  # older stamps may come
             for steps in (self._recent_steps, self._unshown_steps))
         step = self.steps.update(steady_time, date)
         if step:

@@ -30,7 +30,6 @@ from typing import Any, TypeVar
 
 _Task = TypeVar('_Task')
 _Found = TypeVar('_Found')
-_WorkFunction = Callable[[_Task], _Found]
 
 
 class WorkerLost(Exception):
@@ -90,7 +89,7 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 
 
-def run_tasks(work: _WorkFunction[_Task, _Found], tasks: Iterable[_Task], workers: int,
+def run_tasks(work: Callable[[_Task], _Found], tasks: Iterable[_Task], workers: int,
               create: Callable[[int], Executor]) -> Iterator[tuple[_Task, _Found | WorkerLost]]:
     """
     Yield each task with its result when it is finished, or with `WorkerLost`.

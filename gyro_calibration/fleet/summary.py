@@ -359,10 +359,6 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
 
 # the page, and a table for other programs
 
-_COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
-            'samples', 'duration_s', 'sha256', 'page')
-
-
 def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
@@ -470,7 +466,9 @@ def log_table(records: Sequence[Mapping[str, Any]]) -> str:
     """Return the values of logs as CSV, one row a log, in SI."""
     rows = []
     for record in records:
-        rows.append({key: record.get(key) for key in _COLUMNS})
+        rows.append({key: record.get(key) for key in (
+            'log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
+            'samples', 'duration_s', 'sha256', 'page')})
         for name, value in (record.get('values', {}) | record.get('slow', {})).items():
             rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
     columns = dict.fromkeys(key for row in rows for key in row)

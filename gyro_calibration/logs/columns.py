@@ -54,7 +54,6 @@ AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as 
 RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
               'deg/h': DEGREE / 3600.0}
 _NO_UNIT = {'1': 1.0}
-_ANGLE_UNITS = {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
@@ -62,7 +61,8 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'counts': ('counts', _NO_UNIT),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
     'rate': ('reference_rate', RATE_UNITS),
-    'heading': ('reference_heading', _ANGLE_UNITS),
+    'heading': ('reference_heading', {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3,
+                                      'turn': 2.0 * math.pi}),
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
                                         'mg': 1e-3 * STANDARD_GRAVITY}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),

@@ -309,8 +309,8 @@ class _LogBuilder:
             other = int(np.count_nonzero(doubled & differs))
             if other > 1 + 0.01 * len(doubled):
                 raise LogError(f'{other} of {len(doubled)} samples of {gyro.name} have the stamp '
-                               'of another sample, so their times are unknown; give the sample rate '
-                               'with --rate')
+                               'of another sample, so their times are unknown; give the sample '
+                               'rate with --rate')
             self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another '
                                'one were left out')
             gyro.rows = gyro.rows[~doubled]

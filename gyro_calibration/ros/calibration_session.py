@@ -47,7 +47,6 @@ from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-_REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
@@ -110,7 +109,7 @@ class CalibrationRun:
     @property
     def extra_duration(self) -> float:
         """Return the duration of samples after the motion, s."""
-        return {REST: 0.0, TURNS: _REST_AFTER_TURNS}.get(
+        return {REST: 0.0, TURNS: 2.5}.get(
             self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property

@@ -459,7 +459,8 @@ class CompensationReport:
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
         warnings += filter(None, (
-            pipeline.session.warning, *pipeline.faults.values(), pipeline.output_conflict, store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
+            pipeline.session.warning, *pipeline.faults.values(), pipeline.output_conflict,
+            store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
             estimator.calibration_message, estimator.bias_message, store.table_hint))
         if warnings:
             return WARN, warnings[0]

@@ -89,7 +89,6 @@ PARAMETERS = (
                   'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
-_MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits for seconds
 _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
@@ -329,7 +328,8 @@ class Pipeline:
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
-        if not max(0, -self._stamp_offset) <= stamp < _MAX_ROS_TIME - max(0, self._stamp_offset):
+        end = NSEC_PER_SEC << 31  # `builtin_interfaces/Time` has 31 bits for seconds
+        if not max(0, -self._stamp_offset) <= stamp < end - max(0, self._stamp_offset):
             counts['refused_samples'] += 1
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')

@@ -43,8 +43,6 @@ ASSUMED_FORCE_NOISE = 0.1
 #: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
-_MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -115,13 +113,6 @@ def to_signed_count(value: float, bits: int = 16) -> int:
     return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
 
 
-#: Parses a frame to a reading, or None if it is not valid; may use earlier frames.
-_ParseFrame = Callable[[bytes], 'Reading | None']
-#: Makes the bytes that an emulated device sends of a value, in its unit, and the further values
-#: of a sample; may use earlier samples. The sequence counts from 0 and never wraps.
-_WriteFrame = Callable[[float, Sample], bytes]
-
-
 def stateless(convert: Callable[..., _OutputT]) -> Callable[[Settings], Callable[..., _OutputT]]:
     """Return the `Protocol.parser` or `writer` of a format with independent frames."""
     return lambda settings: lambda *given: convert(*given, settings)
@@ -165,8 +156,12 @@ class Protocol:
     #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    parser: Callable[[Settings], _ParseFrame]  # makes that of one connection
-    writer: Callable[[Settings], _WriteFrame]  # makes that of one device
+    #: Makes the parser of one connection: a frame to a reading, or None if it is not valid; it
+    #: may use earlier frames.
+    parser: Callable[[Settings], Callable[[bytes], Reading | None]]
+    #: Makes the writer of one device: a value in its unit and the further values of a sample,
+    #: whose sequence counts from 0 and never wraps, to bytes; it may use earlier samples.
+    writer: Callable[[Settings], Callable[[float, Sample], bytes]]
     invert: bool = False  # whether the device counts clockwise turns positive
     full_scale: float = math.radians(2000.0)  # rad/s
     largest_count: int | None = None  # times the sensitivity it is the full scale
@@ -219,7 +214,8 @@ class Protocol:
     def sample_rate_warning(self, settings: Settings, period: float) -> str:
         """Return a warning if angles come at another period, s, than that of the sample rate."""
         rate = self.nominal_rate(settings)
-        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MAX_RATE_DEVIATION:
+        # the clocks of gyros are 2 to 3 % off
+        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= 0.05:
             return ''
         return (f'the gyro sends {1.0 / period:.0f} samples per second, but angles are converted '
                 f'to rates by {rate:g}: set sample_rate')
