@@ -35,13 +35,13 @@ from gyro_calibration.driver.connection import (
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.protocols.protocol import ASSUMED_NOISE, TRISTATE
-from gyro_calibration.driver.timestamps import read_steady_clock
+from gyro_calibration.driver.timestamps import read_date_offset
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
-from gyro_calibration.logs.recording import read_recording, Topics
+from gyro_calibration.logs.recording import format_seconds, read_recording, Topics
 from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message
 from tqdm import tqdm
 
@@ -274,8 +274,8 @@ class CsvRecorder(_Recorder):
                 first |= values
             self._rows = [(stamp, {**first, **values}) for stamp, values in self._rows]
             self._columns, self._start_stamp = list(first), self._rows[0][0]
-            seconds, nanoseconds = divmod(self._start_stamp, NSEC_PER_SEC)
-            notes = {**self._notes(), 'time_s counts from': f'{seconds}.{nanoseconds:09d} s'}
+            notes = {**self._notes(),
+                     'time_s counts from': f'{format_seconds(self._start_stamp)} s'}
             text = ''.join(f'# {name}: {" ".join(note.split())}\n'
                            for name, note in notes.items())
             text += format_rows([['time_s', *self._columns]])
@@ -343,8 +343,7 @@ class _PortSession:
             baud=found.baud, axis=settings.axis, **scale)
 
     def record(self, on_chunk: Callable[[], None]) -> None:
-        # a constant, so that the stamps do not jump when the clock is set
-        offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
+        offset = read_date_offset()
         for chunk in self._connection.chunks(self._stop):
             if self._connection.protocol and isinstance(self.recorder, McapRecorder):
                 self.recorder.variance = self._connection.protocol.sample_variance(self._settings)

@@ -33,6 +33,7 @@ from statistics import median
 import time
 
 from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
 
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
@@ -313,6 +314,11 @@ class SampleClock:
 def read_steady_clock() -> float:
     """Return seconds of the steady clock, including suspension of the host if supported."""
     return time.clock_gettime(getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC))
+
+
+def read_date_offset() -> int:
+    """Return the date less the steady clock, ns; added to the latter it does not jump."""
+    return time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
 
 
 def read_clock_pair(steady_clock: Callable[[], float],

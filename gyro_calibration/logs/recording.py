@@ -228,7 +228,7 @@ class _LogBuilder:
         begin = gyro.stamps[0]
         time = (gyro.stamps - begin) / NSEC_PER_SEC
         self._notes.append(f'gyro: {gyro.name} ({gyro.kind}), {len(time)} samples, '
-                           f'time_s from {_format_seconds(begin)} s on')
+                           f'time_s from {format_seconds(begin)} s on')
         output = gyro.values('rate')
         lost = mask_invalid(output, 'output') | np.isnan(output)
         if lost.any():
@@ -297,7 +297,7 @@ class _LogBuilder:
             if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
                 place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
                 raise LogError(f'the stamps of {gyro.name} step back by '
-                               f'{_format_seconds(back[place])} s at sample {place + 1}, as after '
+                               f'{format_seconds(back[place])} s at sample {place + 1}, as after '
                                'setting a clock; split the recording there, or give the sample '
                                'rate with --rate')
             self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were '
@@ -384,7 +384,7 @@ class _LogBuilder:
         return found
 
 
-def _format_seconds(nanoseconds: np.int64) -> str:
+def format_seconds(nanoseconds: int | np.int64) -> str:
     return f'{int(nanoseconds) // NSEC_PER_SEC}.{int(nanoseconds) % NSEC_PER_SEC:09d}'
 
 

@@ -28,8 +28,8 @@ from geometry_msgs.msg import (
     PoseWithCovarianceStamped, Twist, TwistStamped, TwistWithCovarianceStamped)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.logs.cdr import (
-    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading,
-    UNMEASURED_COVARIANCE, UNMEASURED_VARIANCE, z_axis_covariance)
+    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading, UNMEASURED_VARIANCE,
+    z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
 from gyro_calibration.ros.inputs import Clock, Velocity
@@ -185,7 +185,7 @@ class CompensationNode(Node):
             acceleration.x = acceleration.y = acceleration.z = 0.0
             imu.linear_acceleration_covariance[:] = NOT_REPORTED_COVARIANCE
         elif covariance[0] != NOT_REPORTED and min(covariance[::4]) < 0.0:
-            imu.linear_acceleration_covariance[:] = UNMEASURED_COVARIANCE
+            imu.linear_acceleration_covariance[:] = z_axis_covariance(UNMEASURED_VARIANCE)
         half = 0.5 * corrected.heading
         turned = imu.orientation
         turned.x = turned.y = 0.0

@@ -124,7 +124,7 @@ class DriverNode(Node):
                     step = self._node_time.update(
                         *(read or (chunk.arrival, self._read_node_clock())))
                     if step and not self.get_parameter('use_sim_time').value:
-                        self._report.add_clock_step(step)
+                        self._report.add_clock_step(step, self._node_time.steps.count)
             self._report.add(chunk.samples)
             protocol, clock = self._connection.protocol, self._connection.clock
             assert protocol is not None and clock is not None  # they made the samples
@@ -172,7 +172,7 @@ class DriverReport:
                  clock: Callable[[], float]):
         self._connection, self._port, self._settings = connection, port, settings
         self._clock, self._last_counts, self._last_time = clock, Counts(), clock()
-        self._rate, self._step_count, self._clock_steps, self.event = 0.0, 0, '0', ''
+        self._rate, self._clock_steps, self.event = 0.0, '0', ''
         self._new_counts: dict[str, int] = {}
         self._temperature: float | None = None
         self._health: dict[str, float] = {}
@@ -185,10 +185,9 @@ class DriverReport:
             if sample.temperature is not None:
                 self._temperature = sample.temperature
 
-    def add_clock_step(self, step: float) -> None:
-        """Count a step of the clock of the stamps, s."""
-        self._step_count += 1
-        self._clock_steps = f'{self._step_count}, last by {step:+.1f} s'
+    def add_clock_step(self, step: float, count: int) -> None:
+        """Add a step of the clock of the stamps, s, which is one of a number."""
+        self._clock_steps = f'{count}, last by {step:+.1f} s'
         self.event = f'the clock of this computer was set by {step:+.1f} s; the stamps follow it'
 
     def clear(self) -> None:

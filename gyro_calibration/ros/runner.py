@@ -109,13 +109,12 @@ def declare_parameters(
         if on_change and any(each.name in known for each in given):
             on_change(read_values())
 
+    overrides = node._parameter_overrides
     for each in table:
-        # first with any type: rclpy refuses 100 for 100.0, with a message of several sentences
+        # not by rclpy, which refuses 100 for 100.0, with a message of several sentences
         default = (each.default if isinstance(each.default, (bool, int, float, str))
                    else list(each.default))
-        given = node.declare_parameter(each.name, default,
-                                       ParameterDescriptor(dynamic_typing=True)).value
-        node.undeclare_parameter(each.name)
+        given = overrides[each.name].value if each.name in overrides else default
         descriptor = ParameterDescriptor(
             description=each.description + (f' Unit: {each.unit}.' if each.unit else ''),
             read_only=not each.dynamic, additional_constraints=each.choices_text,

@@ -185,9 +185,9 @@ def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of(given, is_warn
 def test_steps_of_the_clock_are_counted():
     world = World(5.0)
     world.gyro('csv')
-    steps = iter([3600.0, -7200.0])
-    reports = reported(world, 'csv',
-                       monitored=lambda report, _: [report.add_clock_step(step) for step in steps])
+    steps = iter([(3600.0, 1), (-7200.0, 2)])
+    reports = reported(
+        world, 'csv', monitored=lambda report, _: [report.add_clock_step(*step) for step in steps])
     _, _, values = reports[-1]
     assert values['clock_steps'] == '2, last by -7200.0 s'
     assert values['last_event'].startswith('the clock of this computer was set by -7200.0 s')
