@@ -16,7 +16,7 @@ example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from datetime import datetime, timezone
 import gzip
 import io
@@ -189,14 +189,18 @@ class _Recorder:
         """Write what was added as a piece; a silence or the end makes it due."""
         raise NotImplementedError
 
-    def finish(self) -> None:
-        self.flush(is_due=True)
+    def end(self) -> bytes:
+        """Return what closes a file with pieces, also after one that failed."""
+        return b''
 
     def close(self) -> None:
-        """Finish and close the file; nothing is written after a piece that failed."""
+        """Write what remains, unless a piece failed, and close the file."""
         try:
             if not self.is_full:
-                self.finish()
+                self.flush(is_due=True)
+            if self.size:
+                with suppress(_DiskFull) if self.is_full else nullcontext():
+                    self.append(self.end())
         finally:
             self._file.close()
             if not self.size:
@@ -221,17 +225,9 @@ class McapRecorder(_Recorder):
         if piece := self.writer.pack_chunk():
             self.append(piece)
 
-    def finish(self) -> None:
-        self.flush()
-        if self.size:
-            self.append(self.writer.pack_summary())
-
-    def close(self) -> None:
-        """Close the file, on a full disk with an end that readers understand."""
-        if self.is_full and self.size:
-            with suppress(_DiskFull):  # a reader then takes the file for truncated
-                self.append(MCAP_END)
-        super().close()
+    def end(self) -> bytes:
+        """Return the summary, on a full disk a short end that readers understand."""
+        return MCAP_END if self.is_full else self.writer.pack_summary()
 
 
 class CsvRecorder(_Recorder):

@@ -213,8 +213,9 @@ class Run(PrintedResult):
         delay = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
         time, true = self.time, self.motion.heading_at(self.time - delay)
         return draw_headings(path, time, true - true[0], {
-            'before self-calibration': integrate(time, self.rate),
-            'after': integrate(time, (self.rate - fit.bias) / (1.0 + fit.scale_factor_error))})
+            'not calibrated': integrate(time, self.rate),
+            'calibrated': integrate(time, (self.rate - fit.bias) / (1.0 + fit.scale_factor_error))
+        }, is_apart=True)
 
 
 def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,
