@@ -89,7 +89,6 @@ class _TypeSummary:
     name: str  # or ''
     units: Sequence[str]  # names in natural order
     drives: Sequence[str]
-    dates: Sequence[str]
     records: Sequence[_LogRecord]  # of the logs
     values: Mapping[str, _ValueSummary]
     significance: float  # probability of a false alarm of each kind and value
@@ -115,8 +114,8 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
                 found[value] = _summarize_value(value, slow, logs[kind], FALSE_ALARM_RATE / tests)
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
-        units, drives, dates = (_names(logs[kind], key) for key in ('unit', 'drive', 'date'))
-        summaries.append(_TypeSummary(kind, units, drives, dates, logs[kind], found,
+        units, drives = (_names(logs[kind], key) for key in ('unit', 'drive'))
+        summaries.append(_TypeSummary(kind, units, drives, logs[kind], found,
                                       FALSE_ALARM_RATE / tests))
     return summaries
 

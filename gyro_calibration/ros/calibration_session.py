@@ -118,10 +118,6 @@ class CalibrationRun:
         return FINISH_TIMEOUT if math.isinf(self.duration) else self.duration + self.extra_duration
 
     @property
-    def progress(self) -> float:
-        return min(self.elapsed / self.max_duration, 1.0)
-
-    @property
     def status(self) -> str:
         return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
                 if math.isinf(self.duration)

@@ -208,7 +208,7 @@ class CompensationNode(Node):
         calibration = store.model.self_calibration
         values: dict[str, object] = {
             'calibrated': calibration is not None, 'running': run is not None,
-            **({'progress': f'{run.progress:.2f}'} if run else {}),
+            **({'progress': f'{min(run.elapsed / run.max_duration, 1.0):.2f}'} if run else {}),
             **(calibration.to_dict() if calibration else {})}
         level, message = OK, str(calibration)
         if run:

@@ -257,15 +257,12 @@ class TurnComparison:
 
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
+        self.is_contradictory = False
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
         self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
-
-    @property
-    def is_contradictory(self) -> bool:
-        return self._contradictions > 1
 
     @property
     def turn_at_rest(self) -> tuple[float, float, float]:
@@ -309,6 +306,7 @@ class TurnComparison:
                         and (source == ODOMETRY or self.ratio * rate > confused)
                         or source == ODOMETRY and self.ratio < -0.5)
             self._contradictions = is_wrong * (self._contradictions + 1)
+            self.is_contradictory = self._contradictions > 1
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
 
@@ -329,10 +327,7 @@ class AlternateTurns:
         self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
         # difference over sum in turns of a row, their last sense, and how often it changed
         self._share, self._sense, self._changes = math.nan, 0.0, 0
-
-    @property
-    def is_contradictory(self) -> bool:
-        return self._changes > 1
+        self.is_contradictory = False
 
     def add(self, time: float, rate: float) -> None:
         """Add a sample, s and rad/s."""
@@ -356,6 +351,7 @@ class AlternateTurns:
                 share = math.nan
             is_alike = abs(share - self._share) <= allowed * abs(share)
             self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
+            self.is_contradictory = self._changes > 1
             self._share, self._sense = self._share if is_alike else share, total
         elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
             return
