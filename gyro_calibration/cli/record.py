@@ -43,7 +43,6 @@ from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
 from gyro_calibration.logs.recording import format_seconds, read_recording, Topics
 from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message
-from tqdm import tqdm
 
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
@@ -101,12 +100,10 @@ def run(given: argparse.Namespace) -> Answer:
                 recorder.flush()
                 last_flush = time.monotonic()
                 samples, lost = session.counts()
-                bar.set_postfix_str(f'{lost} lost', refresh=False)
-                bar.update(samples - bar.n)
+                on_progress(None, f'{to_printable(given.out)}: {samples} samples, {lost} lost')
 
         try:
-            with tqdm(desc=to_printable(given.out), unit=' samples', leave=False,
-                      disable=None) as bar:
+            with verb.show_progress(to_printable(given.out)) as on_progress:
                 try:
                     session.record(on_chunk)
                 finally:

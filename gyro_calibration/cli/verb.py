@@ -71,9 +71,9 @@ def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]
 def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
     size = sum(os.path.getsize(file)
                for file in list_recording_files(path) if os.path.isfile(file)) or None
-    with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
-              leave=False, disable=None) as bar:
-        yield lambda place: bar.update(place - bar.n)
+    words = to_printable(path)
+    with show_progress(words) as on_progress:
+        yield lambda place: on_progress(place / size if size else None, words)
 
 
 class PrintedResult:
