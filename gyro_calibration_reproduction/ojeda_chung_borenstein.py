@@ -32,9 +32,9 @@ import numpy as np
 
 TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for '
          'mobile robot navigation, ICRA 2000')
-#: Table I: deg/s; % over all temperatures, p-p; % rms; deg/s; deg/s over all temperatures, p-p;
+#: Table I: deg/s; % over all temperatures, p-p; deg/s; deg/s over all temperatures, p-p;
 #: (deg/h)/√Hz; and from section 4, Hz.
-FULL_SCALE, SCALE_OVER_TEMPERATURE, NONLINEARITY, BIAS_STABILITY = 100.0, 2.0, 0.5, 0.002
+FULL_SCALE, SCALE_OVER_TEMPERATURE, BIAS_STABILITY = 100.0, 2.0, 0.002
 BIAS_OVER_TEMPERATURE, ANGLE_RANDOM_WALK, OUTPUT_RATE = 0.2, 5.0, 10.0
 #: Section 3: samples of a data set, orders p and q, degC.
 SAMPLES_PER_SET, RATE_ORDER, TEMPERATURE_ORDER, MIN_TEMPERATURE, MAX_TEMPERATURE = (

@@ -97,11 +97,10 @@ LOOK_ALIKES: Mapping[tuple[str, str], LookAlikes] = {
 
 
 def hide_look_alike(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *,
-                    multiple: float | None = None, noise: str = 'white',
                     duration: float = 900.0, sample_rate: float = 50.0) -> HiddenLog:
     """Hide one of a pair of `LOOK_ALIKES` where it cannot be distinguished, as `hide` does."""
     twins = LOOK_ALIKES[pair]
-    return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration,
+    return hide([hidden], twins.multiple, generator, noise='white', duration=duration,
                 sample_rate=sample_rate, figures=twins.figures,
                 conditions=twins.confounding_conditions, fixed_parts=twins.fixed_parts,
                 against_a_model=twins.needs_model)[0]
