@@ -43,6 +43,7 @@ from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
 from gyro_calibration.logs.recording import format_seconds, read_recording, Topics
 from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message
+from gyro_calibration.ros.inputs import handle_end_signals
 
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
@@ -130,12 +131,9 @@ def run(given: argparse.Namespace) -> Answer:
 @contextmanager
 def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
     """Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets."""
-    # A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where
-    # it is ignored already (nohup).
+    # a second signal changes nothing, since the file is being closed
     stop = threading.Event()
-    previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
-                         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-                         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN}
+    previous_handlers = handle_end_signals(lambda *_: stop.set())
     timer = threading.Timer(seconds or 0.0, stop.set)
     timer.daemon = True
     if seconds:

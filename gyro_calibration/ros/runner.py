@@ -28,7 +28,7 @@ import threading
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gyro_calibration.ros.inputs import NodeParameter, parameter_values
+from gyro_calibration.ros.inputs import handle_end_signals, NodeParameter, parameter_values
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 import rclpy
@@ -55,8 +55,6 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Longest time of the shutdown of a node, s; then it is killed.
 SHUTDOWN_TIMEOUT = 10.0
-#: Of a user, of a system that ends, and of a terminal or a connection that is lost.
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values by name
@@ -179,9 +177,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
     standard error.
     """
     stop = threading.Event()
-    for number in _SIGNALS:
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # not by nohup
-            signal.signal(number, lambda *_: stop.set())
+    handle_end_signals(lambda *_: stop.set())
     try:
         try:
             rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
@@ -203,8 +199,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
     finally:
         rclpy.try_shutdown()
         # A launch file sends SIGINT twice; the second would kill the interpreter at its exit.
-        for number in _SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
+        handle_end_signals(signal.SIG_IGN)
 
 
 def spin(node: Node, stop: threading.Event) -> None:
