@@ -21,8 +21,7 @@ from typing import Any
 from gyro_calibration.calibration.motion_design import (
     CalibrationForecast, can_follow, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
-from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress
+from gyro_calibration.cli.verb import Answer, non_negative_integer, positive_number, show_progress
 from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
@@ -50,7 +49,7 @@ _MAX_DURATION = 300.0  # s, of a motion that is planned
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
                         help='limits of the robot; config/limits.yaml is an example')
-    parser.add_argument('--seconds', type=verb.positive_number, default=20.0, metavar='S',
+    parser.add_argument('--seconds', type=positive_number, default=20.0, metavar='S',
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
@@ -59,9 +58,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
                         help='drive after the calibration whose heading error is predicted, one '
                         f'of {", ".join(NAMED_MOTIONS)} or a profile; default: robot')
-    parser.add_argument('--drive', type=verb.positive_number, metavar='S',
+    parser.add_argument('--drive', type=positive_number, metavar='S',
                         help='length of that drive, which is repeated; default: its own length')
-    parser.add_argument('--seed', type=verb.non_negative_integer, default=1,
+    parser.add_argument('--seed', type=non_negative_integer, default=1,
                         help='seed of the search; default: 1')
 
 

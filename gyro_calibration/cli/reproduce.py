@@ -16,8 +16,7 @@ example: gyro_calibration reproduce hong_park
 
 import argparse
 
-from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer
+from gyro_calibration.cli.verb import Answer, non_negative_integer, show_progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import render_page
 import numpy as np
@@ -26,7 +25,7 @@ import numpy as np
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
-    parser.add_argument('--seed', type=verb.non_negative_integer, default=0,
+    parser.add_argument('--seed', type=non_negative_integer, default=0,
                         help='seed of the noise; default: 0, as in '
                         'docs/explanation/reproduction.md')
 
@@ -36,7 +35,7 @@ def run(given: argparse.Namespace) -> Answer:
     names = [given.source] if given.source else list(SOURCES)
     found = {}
     for name in names:
-        with verb.show_progress(name):
+        with show_progress(name):
             found[name] = SOURCES[name](np.random.default_rng(given.seed))
     text = '\n\n'.join(render_page(reproduction) for reproduction in found.values())
     return Answer([text],
