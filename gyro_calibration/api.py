@@ -17,8 +17,6 @@ answer raise `DataRefused`, files that cannot be read `LogError` or `ModelError`
 are not possible `InputError`; all of them are a `ValueError` whose text says what to do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -29,7 +27,6 @@ from typing import Any
 
 from gyro_calibration.calibration.encoder import calibrate
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
-from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import plots
 from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures
@@ -37,23 +34,20 @@ from gyro_calibration.cli.compensate import (
     check_finite, CompensatedBlock, integrate_log, track_log)
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import Fitted
-from gyro_calibration.cli.self_calibrate import (
-    calibrate_run, CalibratedRun, describe_unused_rows, make_self_calibration)
+from gyro_calibration.cli.self_calibrate import calibrate_run, Run
 from gyro_calibration.cli.verb import PrintedResult
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.words import as_sentence, terminal_lines
+from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
-from gyro_calibration.heading.log_compensation import plausible_rows
-from gyro_calibration.logs import log as logs
-from gyro_calibration.logs.log import Array, DEGREE, Log, log_from_table, unwrap_heading, write_log
-from gyro_calibration.logs.recording import read_recording, Topics
-from gyro_calibration.logs.ros_bag import is_recording
+from gyro_calibration.logs.log import (
+    Array, DEGREE, Log, log_from_table, unwrap_reference, write_log)
+from gyro_calibration.logs.recording import read_file, Topics
 from gyro_calibration.model import model_file
 from gyro_calibration.model.effects import STATIC_EFFECTS
-from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import parse_model, write_model
 from gyro_calibration.model.motion import Motion, motion_by_name, motion_from_log
 from gyro_calibration.model.motion import simulate as simulate_motion
@@ -94,17 +88,13 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
         The log in SI.
 
     """
-    if not isinstance(source, (str, Path)):
-        log = log_from_table(source, columns, axis)
-    elif is_recording(source):
-        log = read_recording(source, Topics(topic, reference_topic, temperature_topic, axis), rate)
-    else:
-        log = logs.read_log(source, sensitivity, rate, columns, axis)
+    log = (read_file(source, Topics(topic, reference_topic, temperature_topic, axis), rate,
+                     sensitivity, columns) if isinstance(source, (str, Path))
+           else log_from_table(source, columns, axis))
     if not unwrap or log.reference_heading is None:
         return log
-    time, output = _require_time(log)
-    return replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
-                                                         output)[0])
+    _require_time(log)
+    return unwrap_reference(log)
 
 
 def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
@@ -222,27 +212,6 @@ def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
                     columns.get('heading_rad'), columns.get('heading_std_rad'), columns)
 
 
-@dataclass(frozen=True)
-class Run(PrintedResult):
-    """Scale factor error and bias by a self-calibration."""
-
-    model: GyroModel  # the given model with the new self-calibration
-    scale_factor_error: float  # s, 1
-    bias: float  # b, rad/s
-    scale_factor_error_std: float  # standard deviation of s
-    bias_std: float  # standard deviation of b, rad/s
-    fit: RunFit = field(repr=False)  # delay of the gyro, goodness of fit
-    remarks: tuple[str, ...]  # on rows of the log that were not used
-    _run: CalibratedRun = field(repr=False)
-
-    def __str__(self) -> str:
-        return ' '.join([as_sentence(str(self.model.self_calibration)), *self.remarks])
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Return a figure of the run and of its heading error before and after."""
-        return self._run.draw(path)
-
-
 def self_calibrate(log: Log, motion: _MotionLike | None = None, model: GyroModel | None = None, *,
                    method: str = 'likelihood') -> Run:
     """
@@ -266,13 +235,9 @@ def self_calibrate(log: Log, motion: _MotionLike | None = None, model: GyroModel
     begin = _require_time(log)[0][0]
     _require_choice('method', method, ('likelihood', 'heading', 'rate'))
     driven, reference_begin = _to_motion(log if motion is None else motion)
-    run = (calibrate_run(log, model, driven, reference_begin, method, ReferenceErrors())
-           if motion is None else
-           calibrate_run(log, model, driven, begin, method, default_reference_errors(driven)))
-    calibration = make_self_calibration(run.fit, method, log, run.is_used)
-    return Run(with_self_calibration(model, calibration), run.fit.scale_factor_error,
-               run.fit.bias, *calibration.standard_deviations, run.fit,
-               tuple(describe_unused_rows(log, plausible_rows(model, log))), run)
+    return (calibrate_run(log, model, driven, reference_begin, method, ReferenceErrors())
+            if motion is None else
+            calibrate_run(log, model, driven, begin, method, default_reference_errors(driven)))
 
 
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,

@@ -42,8 +42,6 @@ MAX_MAGNITUDE = 1e20
 MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
 #: Largest depth of nested lists, names and messages, which the stack of Python holds.
 MAX_DEPTH = 10
-#: Longest wait for a program to write to a pipe, ms.
-_PIPE_TIMEOUT_MS = 900
 
 #: File type, other than a regular file -> its name.
 _FILE_TYPE_NAMES = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
@@ -105,7 +103,7 @@ def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.Buffere
         if stat.S_ISFIFO(mode):
             waiting = select.poll()
             waiting.register(handle, select.POLLIN)
-            if not waiting.poll(_PIPE_TIMEOUT_MS):
+            if not waiting.poll(900):  # ms
                 with suppress(BlockingIOError):  # of a writer that has not written yet
                     os.read(handle, 1)
                     raise OSError(errno.EINVAL, 'it is a pipe without a writer', str(path))

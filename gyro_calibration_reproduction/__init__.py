@@ -15,9 +15,9 @@ This package is evidence and no part of the product: it imports gyro_calibration
 program does, and only the verbs `reproduce` and `demo` import it.
 
 There is one file for each source; `finding` holds the common records. Published numbers are in the
-units of their source. Each file has a function ``reproduce(generator, runs, progress)``: the
+units of their source. Each file has a function ``reproduce(generator, runs)``: the
 generator of the noise; the number of simulated drives or turntable runs (a twentieth of it for
-calibrations on a rate table); and a display of the progress.
+calibrations on a rate table).
 """
 
 from gyro_calibration_reproduction import bot_thoughts, hong_park, ojeda_chung_borenstein

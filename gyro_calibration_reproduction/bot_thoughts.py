@@ -14,8 +14,6 @@ Bot Thoughts (blog): gyro calibration on a turntable and on a turntable with an 
 Counts, deg/s and per cent are as in the source; rates are computed in SI and converted.
 """
 
-from __future__ import annotations
-
 import math
 
 from gyro_calibration.calibration.likelihood import fit_likelihood
@@ -25,7 +23,7 @@ from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import constant_rate_motion, Motion, motion_from_headings
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
-    Comparison, Contradiction, from_own_figures, Progress, Reproduction)
+    Comparison, Contradiction, from_own_figures, Reproduction)
 from gyro_calibration_reproduction.hong_park import solve_equation_7
 import numpy as np
 from scipy.stats import linregress
@@ -54,9 +52,8 @@ ASSUMED = ('The log of the encoder turntable is not published; 63 s of turning b
            'of 2 deg that begins anywhere in a step, 50 Hz, and a known scale.',)
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200,
-              progress: Progress = iter) -> Reproduction:
-    found = np.array([encoder_errors(generator) for _ in progress(range(runs))])
+def reproduce(generator: np.random.Generator, runs: int = 200) -> Reproduction:
+    found = np.array([encoder_errors(generator) for _ in range(runs)])
     return Reproduction(TITLE, ASSUMED, (*_compare_three_speeds(), *_compare_solver(found)),
                         (_slope_contradiction(), _strobe_contradiction(),
                          _method_contradiction(found)))

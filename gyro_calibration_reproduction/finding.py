@@ -10,16 +10,11 @@
 
 """The results of a reproduction: published and computed numbers, and contradictions."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 import math
 import textwrap
 from typing import Any
-
-#: Iterates over items, and may show the progress.
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)

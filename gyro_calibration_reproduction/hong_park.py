@@ -15,8 +15,6 @@ Source: "Minimal-drift heading measurement using a MEMS gyro for indoor mobile r
 Published numbers are in their units; numbers here are computed in SI and converted.
 """
 
-from __future__ import annotations
-
 import math
 
 from gyro_calibration.allan.noise_fit import fit_noise
@@ -29,7 +27,7 @@ from gyro_calibration.model.motion import (
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.finding import (
-    Comparison, Contradiction, from_own_figures, Progress, Reproduction)
+    Comparison, Contradiction, from_own_figures, Reproduction)
 import numpy as np
 
 TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile '
@@ -57,12 +55,11 @@ ASSUMED = (
 )
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200,
-              progress: Progress = iter) -> Reproduction:
+def reproduce(generator: np.random.Generator, runs: int = 200) -> Reproduction:
     errors, deviations = np.stack(
-        [drive_errors(generator) for _ in progress(range(runs))], axis=1)
-    efficiency = _efficiency(generator, runs, progress)
-    instrument = _compare_instrument(generator, max(2, runs // 20), progress)
+        [drive_errors(generator) for _ in range(runs)], axis=1)
+    efficiency = _efficiency(generator, runs)
+    instrument = _compare_instrument(generator, max(2, runs // 20))
     return Reproduction(TITLE, ASSUMED, (
         *instrument, *_compare_self_calibration(), *_compare_own_figures(),
         *_compare_table_1(errors, deviations)),
@@ -89,9 +86,8 @@ def measured_figures(generator: np.random.Generator) -> tuple[float, ...]:
             100.0 * scale, float(np.ptp(rest[:round(GYRO_SAMPLE_RATE)])) / DEGREE)
 
 
-def _compare_instrument(generator: np.random.Generator, runs: int,
-                        progress: Progress) -> list[Comparison]:
-    found = np.array([measured_figures(generator) for _ in progress(range(runs))])
+def _compare_instrument(generator: np.random.Generator, runs: int) -> list[Comparison]:
+    found = np.array([measured_figures(generator) for _ in range(runs)])
     rows = (('angle random walk by an Allan chart of an hour', 'deg/sqrt(h)', '2.5', 'fig. 2', ''),
             ('bias instability by an Allan chart of an hour', 'deg/h', '17.99', 'fig. 2', ''),
             ('scale factor error of 2.53 %, by 22 rates', '%', '2.53', 'fig. 3', ''),
@@ -353,10 +349,10 @@ def _noise_over_threshold(errors: Array) -> Contradiction:
 
 # the scatter of the estimators over the bound
 
-def _efficiency(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
+def _efficiency(generator: np.random.Generator, runs: int) -> Contradiction:
     """Return the scatter of eq. 7 and of the likelihood over the Cramér-Rao bound, white noise."""
     white, found = Noise(XV3500.noise.angle_random_walk), []
-    for _ in progress(range(runs)):
+    for _ in range(runs):
         time, rate = noisy_output(CALIBRATION_MOTION, white, generator)
         scale, offset = solve_equation_7(integrate(time, rate), time,
                                          CALIBRATION_MOTION.heading_at(time))

@@ -15,8 +15,6 @@ Source: "Precision calibration of fiber-optics gyroscopes for mobile robot navig
 Published numbers are in their units; numbers here are computed in SI and converted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import math
 
@@ -29,14 +27,14 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
-    Comparison, Contradiction, from_own_figures, Progress, Reproduction)
+    Comparison, Contradiction, from_own_figures, Reproduction)
 import numpy as np
 
 TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for '
          'mobile robot navigation, ICRA 2000')
-#: Table I: deg/s; % over all temperatures, p-p; % rms; deg/s; deg/s over all temperatures, p-p;
+#: Table I: deg/s; % over all temperatures, p-p; deg/s; deg/s over all temperatures, p-p;
 #: (deg/h)/√Hz; and from section 4, Hz.
-FULL_SCALE, SCALE_OVER_TEMPERATURE, NONLINEARITY, BIAS_STABILITY = 100.0, 2.0, 0.5, 0.002
+FULL_SCALE, SCALE_OVER_TEMPERATURE, BIAS_STABILITY = 100.0, 2.0, 0.002
 BIAS_OVER_TEMPERATURE, ANGLE_RANDOM_WALK, OUTPUT_RATE = 0.2, 5.0, 10.0
 #: Section 3: samples of a data set, orders p and q, degC.
 SAMPLES_PER_SET, RATE_ORDER, TEMPERATURE_ORDER, MIN_TEMPERATURE, MAX_TEMPERATURE = (
@@ -75,10 +73,9 @@ def rd2100(sine_constant: float = SINE_CONSTANT) -> GyroModel:
                                         BIAS_STABILITY * DEGREE))
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200,
-              progress: Progress = iter) -> Reproduction:
-    found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
-    regressor, sine = _regressor(generator), _sine(generator, len(found), progress)
+def reproduce(generator: np.random.Generator, runs: int = 200) -> Reproduction:
+    found = np.array([calibrate_and_turn(generator) for _ in range(max(2, runs // 20))])
+    regressor, sine = _regressor(generator), _sine(generator, len(found))
     return Reproduction(TITLE, ASSUMED, (*_compare_own_figures(), *_compare_instrument(),
                                          *_compare_results(found), *_compare_drifts(generator)),
                         (_index(), regressor, sine, _full_turn()))
@@ -296,9 +293,9 @@ def extrapolation_errors(sine_constant: float,
     return polynomial, sine
 
 
-def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
+def _sine(generator: np.random.Generator, runs: int) -> Contradiction:
     found = [[extrapolation_errors(sagnac, generator)
-              for sagnac in (SINE_CONSTANT, STRONG_SINE_CONSTANT)] for _ in progress(range(runs))]
+              for sagnac in (SINE_CONSTANT, STRONG_SINE_CONSTANT)] for _ in range(runs)]
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
     return Contradiction(
         {'k': SINE_CONSTANT, 'weak': weak, 'weak_sine': weak_sine,

@@ -398,6 +398,9 @@ class HeldNode:
             raise
 
     def _keep(self, publisher, message):
+        if isinstance(message, bytes):
+            from rclpy.serialization import deserialize_message
+            message = deserialize_message(message, publisher.msg_type)
         self.sent[publisher.topic_name].append(copy.deepcopy(message))
 
     def send(self, topic, message):

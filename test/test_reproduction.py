@@ -71,7 +71,7 @@ def test_the_page_holds_what_the_program_prints(source):
 
 @one_source
 def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys, monkeypatch):
-    few = {source: lambda generator, progress: SOURCES[source](generator, 2, progress)}
+    few = {source: lambda generator: SOURCES[source](generator, 2)}
     monkeypatch.setattr('gyro_calibration.cli.reproduce.SOURCES', few)
     answers = []
     for seed in (1, 1, 2):

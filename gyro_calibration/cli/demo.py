@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, field
 import math
@@ -40,12 +40,11 @@ from gyro_calibration.heading.integration import integrate, Threshold, Threshold
 from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import CALIBRATION_MOTION, constant_rate_motion
+from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.hong_park import TABLE_1
 import numpy as np
-from tqdm import tqdm
 
 try:
     from geometry_msgs.msg import Twist
@@ -177,8 +176,8 @@ class _DemoClient:
         self._thread = threading.Thread(target=spin)
         self._thread.start()
 
-    def call_service(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
-        """Call a service, wait again and again until it answers, and return its message."""
+    def call_service(self, name: str, timeout: float) -> None:
+        """Call a service, and wait until it has succeeded."""
         client = self._node.create_client(Trigger, name)
         if not client.wait_for_service(20.0):
             raise OSError(f'the service {name} did not appear within 20 s')
@@ -186,10 +185,9 @@ class _DemoClient:
         while not answer.done():
             if time.monotonic() > deadline:
                 raise OSError(f'{name} did not answer within {timeout:g} s')
-            wait()
+            time.sleep(0.01)
         if not answer.result().success:
             raise _CallRefused(f'{name}: {answer.result().message}')
-        return answer.result().message
 
     def is_ready(self) -> bool:
         return (bool(self.raw_rates and self.headings)
@@ -230,41 +228,32 @@ def _node_process(module: str, **parameters: object) -> Iterator[None]:
 
 def _calibrate_and_drive(client: _DemoClient) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
-    total = round(CALIBRATION_MOTION.duration + 4.0 + _DRIVE_MOTION.duration)
-    with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
-              disable=None) as bar:
-        bar.set_description('starting driver and compensation')
+    with verb.show_progress('starting driver and compensation') as on_progress:
         deadline = time.monotonic() + 60.0
         while not client.is_ready():
             if time.monotonic() > deadline:
                 raise OSError('driver and compensation were not ready within 60 s; stop other '
                               'programs, and run the demo again')
             time.sleep(0.02)
-        bar.set_description('calibrating on the motion profile')
+        on_progress(None, 'calibrating on the motion profile')
         for attempt in range(1, _MAX_ATTEMPTS + 1):
             try:
-                client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
+                client.call_service('compensation_node/calibrate', 60.0)
                 break
             except _CallRefused as refusal:  # this robot turns late on a busy machine
                 if attempt == _MAX_ATTEMPTS:
                     raise
-                bar.total += CALIBRATION_MOTION.duration + 4.0
-                bar.write(f'{refusal}; the run is repeated', file=sys.stderr)
-                _wait(bar, 2.0)  # until the robot stands
-        client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
-        bar.set_description('driving')
+                verb.print_message(f'{refusal}; the run is repeated')
+                time.sleep(2.0)  # until the robot stands
+        client.call_service('compensation_node/reset_heading', 10.0)
+        on_progress(None, 'driving')
         begin, started = time.time(), time.monotonic()
         while (elapsed := time.monotonic() - started) < _DRIVE_MOTION.duration:
             client.command_rate(float(_DRIVE_MOTION.rate_at(np.array(elapsed))))
-            _wait(bar, 0.02)
+            time.sleep(0.02)
         client.command_rate(0.0)
-        _wait(bar, 0.5)
+        time.sleep(0.5)
     return begin
-
-
-def _wait(bar: tqdm, seconds: float) -> None:
-    time.sleep(seconds)
-    bar.update(seconds)
 
 
 def _evaluate(out: Path, robot: _SimulatedRobot, client: _DemoClient, begin: float,

@@ -20,7 +20,6 @@ from itertools import count, islice, repeat
 import json
 import math
 import signal
-from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.simulate import add_motion_options, simulate_log
@@ -28,6 +27,7 @@ from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.logs.log import DataRefused
+from gyro_calibration.ros.inputs import handle_end_signals
 import numpy as np
 
 
@@ -78,7 +78,7 @@ def run(given: argparse.Namespace) -> None:
                for start in islice(starts, None if given.repeat else 1)
                for at, value, temperature in zip(times.tolist(), outputs, temperatures))
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
-    _handle_signals(lambda *_: emulator.stop())
+    handle_end_signals(lambda *_: emulator.stop())
     try:
         emulator.open()
         path = emulator.path if emulator.link is None else str(emulator.link)
@@ -88,9 +88,4 @@ def run(given: argparse.Namespace) -> None:
     finally:
         emulator.close()
         # launch sends a second signal, which must not interrupt a program that is about to end
-        _handle_signals(signal.SIG_IGN)
-
-
-def _handle_signals(handler: Any) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
+        handle_end_signals(signal.SIG_IGN)

@@ -17,8 +17,8 @@ example: gyro_calibration export --to sdf model.yaml --sample-rate 100
 import argparse
 from dataclasses import asdict
 
-from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer
+from gyro_calibration.cli.simulate import add_sampling_options
+from gyro_calibration.cli.verb import Answer, positive_number
 from gyro_calibration.files import InputError, write_atomically
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.simulator_export import export_model, simulator_parameters, SIMULATORS
@@ -29,11 +29,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--to', required=True, choices=SIMULATORS,
                         help='sdf: noise of an <imu> of Gazebo; isaac: noise of an observation '
                         'of Isaac Lab; mujoco: a <gyro> sensor of MuJoCo')
-    parser.add_argument('--sample-rate', type=verb.positive_number, default=100.0, metavar='HZ',
-                        help='sample rate of the simulated gyro; default: 100')
-    parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
-                        help='default: the reference temperature of the model')
-    parser.add_argument('--span', type=verb.positive_number, default=3600.0, metavar='S',
+    add_sampling_options(parser)
+    parser.add_argument('--span', type=positive_number, default=3600.0, metavar='S',
                         help='longest time over which the bias drifts as modelled; default: 3600')
     parser.add_argument('--out', metavar='FILE', help='default: the text is printed')
 

@@ -14,8 +14,6 @@ Calibrate from a rate table, a turntable, an encoder, or any log with a referenc
 example: gyro_calibration fit table.csv --out model.yaml
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -154,10 +152,11 @@ class Fitted(PrintedResult):
         if isinstance(found, SelectedEffects):
             return plots.draw_residuals(path, found.calibration)
         motion = found.reference
-        return plots.draw_reference(
-            path, motion.time, motion.heading - motion.heading[0], found.residual_before,
-            found.residual_after,
-            'course over ground' if found.method == 'course' else 'reference')
+        true = motion.heading - motion.heading[0]
+        return plots.draw_headings(
+            path, motion.time, true, {'not calibrated': true + found.residual_before,
+                                      'calibrated': true + found.residual_after},
+            'course over ground' if found.method == 'course' else 'reference', is_apart=True)
 
 
 def _dwell_data(selection: SelectedEffects) -> dict[str, Any]:

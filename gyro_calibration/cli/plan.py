@@ -19,10 +19,9 @@ from dataclasses import asdict
 from typing import Any
 
 from gyro_calibration.calibration.motion_design import (
-    CalibrationForecast, can_follow, find_best_motion, plain_motion, Prediction, RobotLimits)
+    CalibrationForecast, can_follow, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
-from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, show_progress
+from gyro_calibration.cli.verb import Answer, non_negative_integer, positive_number, show_progress
 from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
@@ -50,7 +49,7 @@ _MAX_DURATION = 300.0  # s, of a motion that is planned
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
                         help='limits of the robot; config/limits.yaml is an example')
-    parser.add_argument('--seconds', type=verb.positive_number, default=20.0, metavar='S',
+    parser.add_argument('--seconds', type=positive_number, default=20.0, metavar='S',
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
@@ -59,9 +58,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
                         help='drive after the calibration whose heading error is predicted, one '
                         f'of {", ".join(NAMED_MOTIONS)} or a profile; default: robot')
-    parser.add_argument('--drive', type=verb.positive_number, metavar='S',
+    parser.add_argument('--drive', type=positive_number, metavar='S',
                         help='length of that drive, which is repeated; default: its own length')
-    parser.add_argument('--seed', type=verb.non_negative_integer, default=1,
+    parser.add_argument('--seed', type=non_negative_integer, default=1,
                         help='seed of the search; default: 1')
 
 
@@ -99,7 +98,10 @@ def run(given: argparse.Namespace) -> Answer:
              f'{rate.max() / DEGREE:.1f} deg/s and headings of {angle.min():.0f} to '
              f'{angle.max():.0f} deg.',
              '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:',
-             *(_row(labels[name], row) for name, row in rows.items()),
+             *(f'  {labels[name] + ":":34} scale +- {100 * row.scale_deviation:.4f} %, '
+               f'bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
+               f'mean heading error {row.heading_error / DEGREE:.3f} deg'
+               for name, row in rows.items()),
              '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} '
              f'times as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
              f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
@@ -148,9 +150,3 @@ def write_motion(path: str, motion: Motion) -> None:
     lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
              *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]
     write_atomically(path, ('\n'.join(lines) + '\n').encode())
-
-
-def _row(name: str, row: Prediction) -> str:
-    return (f'  {name + ":":34} scale +- {100 * row.scale_deviation:.4f} %, '
-            f'bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
-            f'mean heading error {row.heading_error / DEGREE:.3f} deg')

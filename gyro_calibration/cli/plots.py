@@ -44,43 +44,34 @@ _DIVERGING_COLORMAP, _SEQUENTIAL_COLORMAP = 'RdBu_r', 'cividis'
 
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
-                  headings: Mapping[str, Array]) -> Any:
-    """Draw headings, rad, against a reference, and their errors (figure 10 of Hong and Park)."""
-    figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1.3))
-    above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='reference')
-    for number, (name, heading) in enumerate(headings.items()):
+                  headings: Mapping[str, Array], name: str = 'reference',
+                  is_apart: bool = False) -> Any:
+    """
+    Draw headings, rad, against a reference, and their errors (figure 10 of Hong and Park).
+
+    Apart, each error has a panel on its own scale.
+    """
+    count = len(headings) if is_apart else 1
+    figure, panels = _panels(1 + count, 1, (9, 5 + 2 * count), (1.3, *[1.7 / count] * count))
+    above, *below = panels[:, 0]
+    above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label=name)
+    for number, (label, heading) in enumerate(headings.items()):
         repeats, style = divmod(number, len(_LINE_STYLES))
-        line = {'linestyle': _LINE_STYLES[style], 'linewidth': 1.5 / (1 + 2 * repeats)}
-        above.plot(time, heading / DEGREE, **line)
-        below.plot(time, (heading - true) / DEGREE, **line, label=name)
-    above.set(ylabel='heading [deg]', title='Heading of the robot by its gyro')
-    above.legend(loc='upper right')
-    below.axhline(0.0, color='black', linewidth=0.5)
-    below.set(xlabel='time [s]', ylabel='heading error [deg]')
-    below.legend(loc='best')
-    return _save_figure(figure, path,
-                        'Below: the flatter a line and the nearer to zero, the better.')
-
-
-def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
-                   after: Array, name: str = 'reference') -> Any:
-    """Draw headings, rad, of a reference, and of a gyro less it before and after calibration."""
-    figure, ((above,), (middle,), (below,)) = _panels(3, 1, (9, 9), (1.3, 1, 1))
-    above.plot(time, reference / DEGREE, color='tab:blue', linewidth=3, alpha=0.5, label=name)
-    above.plot(time, (reference + before - before[0]) / DEGREE, color='black', linewidth=1,
-               linestyle='--', label='gyro, not calibrated')
+        line = {'linestyle': _LINE_STYLES[style], 'linewidth': 1.5 / (1 + 2 * repeats),
+                'color': f'C{number}'}
+        above.plot(time, heading / DEGREE, **line, label=label)
+        below[number % count].plot(time, (heading - true) / DEGREE, **line)
+        if is_apart:
+            size = rms(heading - true) / DEGREE
+            below[number].set_title(f'Gyro {label}, less the {name}: rms {size:.3g} deg')
     above.set(ylabel='heading [deg]', title=f'Heading by the {name} and by the gyro')
     above.legend(loc='best')
-    for axes, error, when in ((middle, before, 'not calibrated'), (below, after, 'calibrated')):
-        axes.plot(time, error / DEGREE, color='black', linewidth=1)
+    for axes in below:
         axes.axhline(0.0, color='black', linewidth=0.5)
-        axes.set(ylabel='difference [deg]',
-                 title=f'Gyro {when}, less the {name}: rms {rms(error) / DEGREE:.3g} deg')
-    below.set_xlabel('time [s]')
-    return _save_figure(figure, path,
-                        'The lower panels show the difference about its mean, each on its own '
-                        'scale. A slope is bias; what follows the turns is scale factor error; an '
-                        'even band is the resolution of the reference.')
+        axes.set_ylabel('difference [deg]')
+    axes.set_xlabel('time [s]')
+    return _save_figure(figure, path, 'A slope of a difference is bias; what follows the turns is '
+                        'scale factor error; an even band is the resolution of the reference.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,

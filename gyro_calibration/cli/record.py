@@ -14,11 +14,9 @@ Record a gyro, from its port or from topics, until Ctrl-C.
 example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from datetime import datetime, timezone
 import gzip
 import io
@@ -32,28 +30,25 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer
-from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
+from gyro_calibration.driver.connection import (
+    Connection, ConnectionState, MAX_BAUD, sample_messages)
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE, TRISTATE
-from gyro_calibration.driver.timestamps import read_steady_clock
+from gyro_calibration.driver.protocols.protocol import ASSUMED_NOISE, TRISTATE
+from gyro_calibration.driver.timestamps import read_date_offset
 from gyro_calibration.files import format_rows, InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
-from gyro_calibration.logs.recording import read_recording, Topics
-from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message, METADATA_NAME
-from tqdm import tqdm
+from gyro_calibration.logs.recording import format_seconds, read_recording, Topics
+from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message
+from gyro_calibration.ros.inputs import handle_end_signals
 
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
-#: Time, s, for which the header of a log waits for values that come seldom: with and without a
-#: temperature so far.
-_HEADER_WAITS = 1.0, 3.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -106,12 +101,10 @@ def run(given: argparse.Namespace) -> Answer:
                 recorder.flush()
                 last_flush = time.monotonic()
                 samples, lost = session.counts()
-                bar.set_postfix_str(f'{lost} lost', refresh=False)
-                bar.update(samples - bar.n)
+                on_progress(None, f'{to_printable(given.out)}: {samples} samples, {lost} lost')
 
         try:
-            with tqdm(desc=to_printable(given.out), unit=' samples', leave=False,
-                      disable=None) as bar:
+            with verb.show_progress(to_printable(given.out)) as on_progress:
                 try:
                     session.record(on_chunk)
                 finally:
@@ -138,12 +131,9 @@ def run(given: argparse.Namespace) -> Answer:
 @contextmanager
 def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
     """Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets."""
-    # A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where
-    # it is ignored already (nohup).
+    # a second signal changes nothing, since the file is being closed
     stop = threading.Event()
-    previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
-                         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-                         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN}
+    previous_handlers = handle_end_signals(lambda *_: stop.set())
     timer = threading.Timer(seconds or 0.0, stop.set)
     timer.daemon = True
     if seconds:
@@ -194,14 +184,18 @@ class _Recorder:
         """Write what was added as a piece; a silence or the end makes it due."""
         raise NotImplementedError
 
-    def finish(self) -> None:
-        self.flush(is_due=True)
+    def end(self) -> bytes:
+        """Return what closes a file with pieces, also after one that failed."""
+        return b''
 
     def close(self) -> None:
-        """Finish and close the file; nothing is written after a piece that failed."""
+        """Write what remains, unless a piece failed, and close the file."""
         try:
             if not self.is_full:
-                self.finish()
+                self.flush(is_due=True)
+            if self.size:
+                with suppress(_DiskFull) if self.is_full else nullcontext():
+                    self.append(self.end())
         finally:
             self._file.close()
             if not self.size:
@@ -213,39 +207,22 @@ class McapRecorder(_Recorder):
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
-        self.writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
+        self.writer = McapWriter(f'gyro_calibration {__version__}', notes)
+        self.variance = ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample as messages on the topics of the driver; the stamp is in ns."""
-        force, temperature = sample.specific_force, sample.temperature
-        of_force = (cdr.NOT_REPORTED_COVARIANCE
-                    if force is None else cdr.z_axis_covariance(ASSUMED_FORCE_NOISE ** 2))
-        messages = [] if temperature is None else [
-            ('/imu/temperature', cdr.TEMPERATURE, [temperature, 0.0])]
-        messages.append(
-            ('/imu/data_raw', cdr.IMU,
-             [0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE, 0.0, 0.0, sample.output,
-              *cdr.z_axis_covariance(self.variance), 0.0, 0.0, force or 0.0, *of_force]))
-        for topic, kind, numbers in messages:
-            self.writer.add(Message(topic, kind, stamp, cdr.serialize(stamp, 'gyro', numbers)))
+        for kind, data in sample_messages(sample, stamp, 'gyro', self.variance):
+            topic = _DEFAULT_TOPICS['gyro' if kind == cdr.IMU else 'temperature']
+            self.writer.add(Message(f'/{topic}', kind, stamp, data))
 
     def flush(self, is_due: bool = False) -> None:
-        if self.writer.pending_bytes:
-            head = b'' if self.size else self.writer.pack_header(
-                f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
-            self.append(head + self.writer.pack_chunk())
+        if piece := self.writer.pack_chunk():
+            self.append(piece)
 
-    def finish(self) -> None:
-        self.flush()
-        if self.size:
-            self.append(self.writer.pack_summary())
-
-    def close(self) -> None:
-        """Close the file, on a full disk with an end that readers understand."""
-        if self.is_full and self.size:
-            with suppress(_DiskFull):  # a reader then takes the file for truncated
-                self.append(MCAP_END)
-        super().close()
+    def end(self) -> bytes:
+        """Return the summary, on a full disk a short end that readers understand."""
+        return MCAP_END if self.is_full else self.writer.pack_summary()
 
 
 class CsvRecorder(_Recorder):
@@ -275,7 +252,8 @@ class CsvRecorder(_Recorder):
 
     def flush(self, is_due: bool = False) -> None:
         """Write the rows so far; the first ones after some seconds, when the columns are known."""
-        wait = _HEADER_WAITS['temperature_degc' not in self._held_values]
+        # s; the header waits for values that come seldom
+        wait = 1.0 if 'temperature_degc' in self._held_values else 3.0
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
                                   - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
@@ -287,8 +265,8 @@ class CsvRecorder(_Recorder):
                 first |= values
             self._rows = [(stamp, {**first, **values}) for stamp, values in self._rows]
             self._columns, self._start_stamp = list(first), self._rows[0][0]
-            seconds, nanoseconds = divmod(self._start_stamp, NSEC_PER_SEC)
-            notes = {**self._notes(), 'time_s counts from': f'{seconds}.{nanoseconds:09d} s'}
+            notes = {**self._notes(),
+                     'time_s counts from': f'{format_seconds(self._start_stamp)} s'}
             text = ''.join(f'# {name}: {" ".join(note.split())}\n'
                            for name, note in notes.items())
             text += format_rows([['time_s', *self._columns]])
@@ -338,7 +316,7 @@ class _PortSession:
         self.recorder = kind(given.out, self._file_notes)
 
     def counts(self) -> tuple[int, int]:
-        counts = self._connection.counts()
+        counts = self._connection.counts
         return counts.samples, counts.lost_samples
 
     def _file_notes(self) -> dict[str, str]:
@@ -356,8 +334,7 @@ class _PortSession:
             baud=found.baud, axis=settings.axis, **scale)
 
     def record(self, on_chunk: Callable[[], None]) -> None:
-        # a constant, so that the stamps do not jump when the clock is set
-        offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
+        offset = read_date_offset()
         for chunk in self._connection.chunks(self._stop):
             if self._connection.protocol and isinstance(self.recorder, McapRecorder):
                 self.recorder.variance = self._connection.protocol.sample_variance(self._settings)
@@ -383,7 +360,7 @@ class _PortSession:
     def conclude(self) -> tuple[dict[str, Any], list[str]]:
         found, recorder = self._connection, self.recorder
         remarks = [f'{count} {name.replace("_", " ")}.'
-                   for name, count in vars(found.counts()).items()
+                   for name, count in vars(found.counts).items()
                    if name not in ('samples', 'lost_samples') and count]
         if (found.protocol and found.clock and found.clock.is_settled and (
                 warning := found.protocol.sample_rate_warning(self._settings,
@@ -440,7 +417,7 @@ class _TopicSession:
     def record(self, on_chunk: Callable[[], None]) -> None:
         def tick(node: Any) -> None:
             on_chunk()
-            if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
+            if self._is_waiting and time.monotonic() - self._start_time > 5.0:
                 self._is_waiting = False
                 if missing := node.missing_topics:
                     known = sorted(name for name, _ in node.get_topic_names_and_types())

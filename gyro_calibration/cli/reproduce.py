@@ -15,20 +15,17 @@ example: gyro_calibration reproduce hong_park
 """
 
 import argparse
-from functools import partial
 
-from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer
+from gyro_calibration.cli.verb import Answer, non_negative_integer, show_progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import render_page
 import numpy as np
-from tqdm import tqdm
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
-    parser.add_argument('--seed', type=verb.non_negative_integer, default=0,
+    parser.add_argument('--seed', type=non_negative_integer, default=0,
                         help='seed of the noise; default: 0, as in '
                         'docs/explanation/reproduction.md')
 
@@ -36,8 +33,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     """Reproduce each source with a generator of its own, independent of the other sources."""
     names = [given.source] if given.source else list(SOURCES)
-    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=partial(
-        tqdm, desc=name, unit=' runs', leave=False, disable=None)) for name in names}
+    found = {}
+    for name in names:
+        with show_progress(name):
+            found[name] = SOURCES[name](np.random.default_rng(given.seed))
     text = '\n\n'.join(render_page(reproduction) for reproduction in found.values())
     return Answer([text],
                   {'seed': given.seed,

@@ -14,8 +14,10 @@ Find scale factor error and bias from about 20 s of known motion, or from whole 
 example: gyro_calibration self-calibrate run.csv --profile profile.csv --out model.yaml
 """
 
+from __future__ import annotations
+
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 import math
 from pathlib import Path
@@ -32,7 +34,7 @@ from gyro_calibration.calibration.self_calibration import (
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_headings
-from gyro_calibration.cli.verb import Answer, show_progress
+from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.words import as_sentence
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
@@ -98,23 +100,24 @@ def run(given: argparse.Namespace) -> Answer:
         raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
     data: dict[str, Any]
     if given.turns is None:
-        method, (fit, is_used, data, lines) = given.method, _calibrate_by_motion(given, model, log)
+        run, data, lines = _calibrate_by_motion(given, model, log)
+        calibration, is_used = run.model.self_calibration, run.is_used
     else:
-        method, is_used = 'turns', plausible
         rates = compensate_log(with_self_calibration(model, None), log)
         marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE
         found = calibrate_turns(np.asarray(log.time)[plausible], rates[plausible],
                                 None if given.turns == _NEAREST else given.turns,
                                 noise=model.noise, mark_deviation=marking,
                                 output=output[plausible])
-        fit, (before, after) = found.fit, found.rest_durations
+        (before, after), is_used = found.rest_durations, plausible
+        calibration = make_self_calibration(found.fit, 'turns', log, plausible)
         data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': [before, after],
                 'marking_rad': marking}
         direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
         lines = [f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
                  f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
                  f'{marking / DEGREE:g} deg.']
-    calibration = make_self_calibration(fit, method, log, is_used)
+    assert calibration is not None
     if given.out:
         write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
     first = as_sentence(f'{calibration}, from {is_used.sum()} samples')
@@ -133,9 +136,9 @@ def describe_unused_rows(log: Log, plausible: Mask) -> list[str]:
         (known & ~plausible, 'an implausible rate or temperature')) if rows.any()]
 
 
-def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> tuple[
-        ScaleBiasFit, Mask, dict[str, Any], list[str]]:
-    """Return the fit, the rows of the log that were used, data and lines of the answer."""
+def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel,
+                         log: Log) -> tuple[Run, dict[str, Any], list[str]]:
+    """Return the run, data and lines of the answer."""
     try:
         motion, begin = ((read_motion(given.profile), np.asarray(log.time)[0]) if given.profile
                          else motion_from_log(log))
@@ -151,7 +154,7 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
     with show_progress('fit of scale factor error, bias and delay'):
         run = calibrate_run(log, model, motion, begin, given.method, reference)
     if given.picture:
-        run.draw(given.picture)
+        run.plot(given.picture)
     lines, fit, check = list[str](), run.fit, run.rest_check
     if given.method == 'likelihood':
         lines.append(f'Delay of the gyro behind the {motion.name}: {fit.time_offset:.4f} '
@@ -172,7 +175,7 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
     if remark := describe_implausible_scale(
             fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
         lines.append(as_sentence(remark))
-    return fit, run.is_used, {
+    return run, {
         'time_offset_s': fit.time_offset,
         'time_offset_standard_deviation_s': fit.time_offset_deviation,
         'start_heading_rad': fit.start_heading,
@@ -185,28 +188,38 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
 
 
 @dataclass(frozen=True)
-class CalibratedRun:
-    """A run on a known motion, fitted and checked by the rest after it."""
+class Run(PrintedResult):
+    """A self-calibration by a known motion, checked by the rest after it."""
 
-    fit: ScaleBiasFit  # with the rest, where there is one
+    model: GyroModel  # the given model with the new self-calibration
+    scale_factor_error: float
+    bias: float  # rad/s
+    scale_factor_error_std: float
+    bias_std: float  # rad/s
+    fit: ScaleBiasFit = field(repr=False)  # with the delay of the gyro and the goodness of fit
+    remarks: tuple[str, ...]  # on the rows of the log that were not used
     rest_check: RestCheck | None
-    is_used: Mask  # which rows of the log
-    time: Array  # of these rows, on the clock of the motion, s
-    rate: Array  # of these rows, rad/s
-    motion: Motion  # that was driven
+    is_used: Mask = field(repr=False)  # which rows of the log
+    time: Array = field(repr=False)  # of these rows, on the clock of the motion, s
+    rate: Array = field(repr=False)  # of these rows, rad/s
+    motion: Motion = field(repr=False)  # that was driven
 
-    def draw(self, path: str | Path | None) -> Any:
-        """Draw the run with its errors before and after, and return the figure."""
+    def __str__(self) -> str:
+        return ' '.join([as_sentence(str(self.model.self_calibration)), *self.remarks])
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the run and of its heading error before and after."""
         fit = self.fit
         delay = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
         time, true = self.time, self.motion.heading_at(self.time - delay)
         return draw_headings(path, time, true - true[0], {
-            'before self-calibration': integrate(time, self.rate),
-            'after': integrate(time, (self.rate - fit.bias) / (1.0 + fit.scale_factor_error))})
+            'not calibrated': integrate(time, self.rate),
+            'calibrated': integrate(time, (self.rate - fit.bias) / (1.0 + fit.scale_factor_error))
+        }, is_apart=True)
 
 
 def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,
-                  reference: ReferenceErrors) -> CalibratedRun:
+                  reference: ReferenceErrors) -> Run:
     """Calibrate by the motion that began at a time of the log, s, and by the rest after it."""
     time, known = np.asarray(log.time) - begin, plausible_rows(model, log)
     output, within = np.asarray(log.output), (time >= -1.0) & (time <= motion.duration + 1.0)
@@ -227,7 +240,10 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
              else check_rest(time[known][rest], rate[known][rest], fit, model.noise))
     fit = (check.fit if check is not None else
            check_end(time[known], rate[known], fit, motion, model.noise))
-    return CalibratedRun(fit, check, run, time[run], rate[run], motion)
+    calibration = make_self_calibration(fit, method, log, run)
+    return Run(with_self_calibration(model, calibration), fit.scale_factor_error, fit.bias,
+               *calibration.standard_deviations, fit, tuple(describe_unused_rows(log, known)),
+               check, run, time[run], rate[run], motion)
 
 
 def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,

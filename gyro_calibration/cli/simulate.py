@@ -34,12 +34,16 @@ _MAX_SAMPLES = 20_000_000
 def add_motion_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--motion', metavar='FILE|NAME',
                         help=f'a motion profile, or one of {", ".join(NAMED_MOTIONS)}', **options)
-    parser.add_argument('--sample-rate', type=verb.positive_number, default=100.0, metavar='HZ',
-                        help='default: 100')
-    parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
-                        help='default: the reference temperature of the model')
     parser.add_argument('--seed', type=verb.non_negative_integer,
                         help='seed of the noise; default: random')
+    add_sampling_options(parser)
+
+
+def add_sampling_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--sample-rate', type=verb.positive_number, default=100.0, metavar='HZ',
+                        help='sample rate of the simulated gyro; default: 100')
+    parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
+                        help='default: the reference temperature of the model')
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -37,8 +37,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
-_Bins = list[tuple[float, float, Mask]]  # limits of each bin, and which errors lie in it
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
@@ -98,14 +96,28 @@ def run(given: argparse.Namespace) -> Answer:
     rates = sorted((each for each in both if each[2].any()), key=lambda each: each[0])
     temperatures = [] if turns.temperature is None else [
         each for each in equal_bins(turns.temperature, 8) if each[2].any()]
-    ratios = [before / after if after > 0.0 else None
-              for before, after in zip(_sizes(errors.static), _sizes(errors.modelled))]
-    return Answer(_lines(given, errors, rates, temperatures, remarks), {
-        'turns': len(turns), 'slowest_rad_s': slowest,
-        **_error_data(errors, np.ones(len(turns), dtype=bool)),
+    sizes = _error_sizes(errors, np.ones(len(turns), dtype=bool))
+    pairs = list(zip(*(each.values() for each in sizes.values())))
+    ratios = [before / after if after > 0.0 else None for before, after in pairs]
+    by_rate, by_temperature = (
+        [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
+          **_error_sizes(errors, mask)} for low, high, mask in bins]
+        for unit, bins in (('rad_s', rates), ('degc', temperatures)))
+    rms_phrase, largest_phrase = (
+        (f'{before / DEGREE:.3g} deg ({100.0 * before / math.tau:.2g} %)',
+         f'{after / DEGREE:.3g} deg ({100.0 * after / math.tau:.2g} %)',
+         f'a factor of {f"{before / after:.2g}" if after > 0.0 else "infinity"}')
+        for before, after in pairs)
+    lines = ['Error of a turn of 360 deg: largest {} with the static bias only, {} with the '
+             'model, {}; '.format(*largest_phrase) + 'rms {} and {}, {}.'.format(*rms_phrase),
+             f'{len(turns)} turns, {given.slowest:g} deg/s and faster, '
+             f'of {len(np.unique(turns.sweep))} sweeps in {given.log}.',
+             *map(as_sentence, remarks), *_table('rate [deg/s]', DEGREE, by_rate),
+             *_table('temperature [degC]', 1.0, by_temperature)]
+    return Answer(lines, {
+        'turns': len(turns), 'slowest_rad_s': slowest, **sizes,
         'ratio_rms': ratios[0], 'ratio_largest': ratios[1],
-        'by_rate': _bin_data('rad_s', errors, rates),
-        'by_temperature': _bin_data('degc', errors, temperatures),
+        'by_rate': by_rate, 'by_temperature': by_temperature,
         'rate_rad_s': turns.rate.tolist(), 'temperature_degc': None
         if turns.temperature is None else turns.temperature.tolist(),
         'static_rad_per_turn': errors.static.tolist(),
@@ -147,46 +159,22 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
         'beyond_range': beyond}
 
 
-def _lines(given: argparse.Namespace, errors: TurnErrors, rates: _Bins, temperatures: _Bins,
-           remarks: list[str]) -> Iterator[str]:
-    rms_phrase, largest_phrase = (
-        (f'{before / DEGREE:.3g} deg ({100.0 * before / math.tau:.2g} %)',
-         f'{after / DEGREE:.3g} deg ({100.0 * after / math.tau:.2g} %)',
-         f'a factor of {f"{before / after:.2g}" if after > 0.0 else "infinity"}')
-        for before, after in zip(_sizes(errors.static), _sizes(errors.modelled)))
-    yield ('Error of a turn of 360 deg: largest {} with the static bias only, {} with the model, '
-           '{}; '.format(*largest_phrase) + 'rms {} and {}, {}.'.format(*rms_phrase))
-    yield (f'{len(errors.turns)} turns, {given.slowest:g} deg/s and faster, '
-           f'of {len(np.unique(errors.turns.sweep))} sweeps in {given.log}.')
-    yield from map(as_sentence, remarks)
-    yield from _table('rate [deg/s]', errors, [(low / DEGREE, high / DEGREE, mask)
-                                               for low, high, mask in rates])
-    yield from _table('temperature [degC]', errors, temperatures)
-
-
-def _sizes(errors: Array) -> tuple[float, float]:
-    return rms(errors), float(np.abs(errors).max())
-
-
-def _table(title: str, errors: TurnErrors, bins: _Bins) -> Iterator[str]:
-    if not bins:
+def _table(title: str, unit: float, rows: list[dict[str, Any]]) -> Iterator[str]:
+    if not rows:
         return
     yield ''
     yield f'{"":26}  {"static bias only":^32}  {"with the model":^32}'.rstrip()
     yield (f'{title:20} {"turns":>5}' + 2 * f'  {"rms":^15}  {"largest":^15}').rstrip()
     yield f'{"":26}' + 4 * f'  {"deg":>7} {"%":>7}'
-    for low, high, mask in bins:
-        label = f'{low:.4g} to {high:.4g}'
-        yield f'{label:20} {np.count_nonzero(mask):5d}' + ''.join(
+    for row in rows:
+        low, high, count, *errors = row.values()
+        label = f'{low / unit:.4g} to {high / unit:.4g}'
+        yield f'{label:20} {count:5d}' + ''.join(
             f'  {value / DEGREE:7.3f} {100.0 * value / math.tau:7.3f}'
-            for each in (errors.static, errors.modelled) for value in _sizes(each[mask]))
+            for each in errors for value in each.values())
 
 
-def _error_data(errors: TurnErrors, mask: Mask) -> dict[str, dict[str, float]]:
-    return {name: dict(zip(('rms_rad_per_turn', 'largest_rad_per_turn'), _sizes(each[mask])))
+def _error_sizes(errors: TurnErrors, mask: Mask) -> dict[str, dict[str, float]]:
+    return {name: {'rms_rad_per_turn': rms(each[mask]),
+                   'largest_rad_per_turn': float(np.abs(each[mask]).max())}
             for name, each in (('static', errors.static), ('modelled', errors.modelled))}
-
-
-def _bin_data(unit: str, errors: TurnErrors, bins: _Bins) -> list[dict[str, Any]]:
-    return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
-             **_error_data(errors, mask)} for low, high, mask in bins]

@@ -28,12 +28,10 @@ from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
 from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
-    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, read_log, read_log_blocks, select_rows,
-    unwrap_heading)
-from gyro_calibration.logs.recording import read_recording, Topics
+    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, read_log_blocks, select_rows, unwrap_reference)
+from gyro_calibration.logs.recording import read_file, Topics
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
-import numpy as np
 from tqdm import tqdm
 
 PROGRESS_DELAY = 2.0  # time before progress is shown, s
@@ -73,9 +71,9 @@ def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]
 def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
     size = sum(os.path.getsize(file)
                for file in list_recording_files(path) if os.path.isfile(file)) or None
-    with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
-              leave=False, disable=None) as bar:
-        yield lambda place: bar.update(place - bar.n)
+    words = to_printable(path)
+    with show_progress(words) as on_progress:
+        yield lambda place: on_progress(place / size if size else None, words)
 
 
 class PrintedResult:
@@ -188,18 +186,13 @@ def _picture_file(text: str) -> str:
 def read(given: argparse.Namespace) -> Log:
     """Read the log of a verb by its options; it has an output."""
     with _show_bytes_read(given.log) as on_progress:
-        if is_recording(given.log):
-            topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
-                            given.axis)
-            log = read_recording(given.log, topics, given.rate, on_progress, print_message)
-        else:
-            log = read_log(given.log, given.sensitivity, given.rate, given.names, given.axis,
-                           on_progress)
+        topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
+        log = read_file(given.log, topics, given.rate, given.sensitivity, given.names, on_progress,
+                        print_message)
     log = _orient_output(given, log)
     if given.unwrap and log.reference_heading is not None:
-        time = require_time(given, log)
-        log = replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
-                                                            np.asarray(log.output))[0])
+        require_time(given, log)
+        log = unwrap_reference(log)
     return next(cut_to_range(given, [log]))
 
 

@@ -17,7 +17,7 @@ the caller.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import errno
 import glob
 import math
@@ -30,8 +30,10 @@ import threading
 from typing import NamedTuple
 
 from gyro_calibration.driver.protocols import (
-    AUTO, BAUDS, Decoder, find_protocol, Protocol, recognize_protocol, Sample, Settings)
+    AUTO, BAUDS, Counts, find_protocol, Protocol, recognize_protocol, Sample, Settings)
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
 from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
+from gyro_calibration.logs import cdr
 import serial
 
 _REMEDIES = {
@@ -121,7 +123,6 @@ def _describe_error(error: BaseException) -> str:
 
 MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
-_SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
 #: Longest silence of a board that restarts when its port is opened, and longest delay before a
 #: lost port is opened again, s.
 _RESTART_DURATION = 5.0
@@ -148,18 +149,6 @@ class ConnectionState:
     name: str
     problem: str = ''  # one sentence while failed
     retry_delay: float = 0.0  # s; while failed: time until the port is opened again
-
-
-@dataclass(frozen=True)
-class ConnectionCounts:
-    """Counts since the start."""
-
-    samples: int = 0
-    lost_samples: int = 0
-    refused_samples: int = 0  # not finite, or beyond full scale
-    refused_temperatures: int = 0  # not finite, or beyond the range of any sensor
-    device_faults: int = 0  # samples that the gyro marks as invalid
-    discarded_bytes: int = 0  # outside of frames
 
 
 def resolve_port(port: str) -> str:
@@ -203,11 +192,10 @@ class Connection:
         self.state = ConnectionState('opening')
         self.protocol: Protocol | None = None  # until it is known
         self.clock: SampleClock | None = None
-        self._decoder: Decoder | None = None
+        self.counts = Counts()  # of the thread that reads
         self._port: SerialPort | None = None
         self._last_stamp = -math.inf
-        self._previous_counts, self._samples, self._reopen_delay, self._read_bytes = (
-            ConnectionCounts(), 0, _ATTEMPT_INTERVAL, 0)
+        self._reopen_delay, self._read_bytes = _ATTEMPT_INTERVAL, 0
         self.baud, self.last_error = 0, ''
         self.path = ''  # the device of the port when it was last opened, links resolved
         self.open_count, self.waited_duration = 0, 0.0  # s
@@ -219,17 +207,6 @@ class Connection:
             except ValueError as error:
                 raise ValueError(f'{error}, or {AUTO} to find it by listening') from None
             self._set_protocol(known, baud or known.baud)
-
-    def counts(self) -> ConnectionCounts:
-        """Return the counts since the start; may be called from any thread."""
-        past, decoder, clock = self._previous_counts, self._decoder, self.clock
-        if decoder is None or clock is None:
-            return replace(past, samples=self._samples)
-        return ConnectionCounts(self._samples, past.lost_samples + clock.lost_count,
-                                past.refused_samples + decoder.refused_samples,
-                                past.refused_temperatures + decoder.refused_temperatures,
-                                past.device_faults + decoder.device_faults,
-                                past.discarded_bytes + decoder.discarded_bytes)
 
     def chunks(self, stop: threading.Event) -> Iterator[_Chunk]:
         """Give samples as they arrive, until the event is set; the port is then closed."""
@@ -249,7 +226,7 @@ class Connection:
             self._close()
 
     def _set_protocol(self, protocol: Protocol, baud: int) -> None:
-        self._decoder = protocol.decoder(self._settings)
+        protocol.check_settings(self._settings)
         self.clock = SampleClock(protocol.nominal_rate(self._settings), protocol.modulus,
                                  self._last_stamp)
         self.protocol, self.baud = protocol, baud
@@ -306,43 +283,45 @@ class Connection:
         self.open_count += 1
         if self.protocol is None:
             self._listen(port, stop)
-        protocol, decoder, clock = self.protocol, self._decoder, self.clock
-        if protocol is None or decoder is None or clock is None:  # stopped while listening
+        protocol, clock, counts = self.protocol, self.clock, self.counts
+        if protocol is None or clock is None:  # stopped while listening
             return
         port.write(protocol.startup)
-        decoder.reset()
+        decoder = protocol.decoder(self._settings, counts)
         clock.interrupt()
         received, begin = 0, self._read_clock()
-        last_request, counts = begin, list[tuple[int, int, int]]()
+        last_request, seen = begin, list[tuple[int, int, int]]()
         while not stop.is_set():
             data = port.read()
             now = self._read_clock()
             samples = decoder.feed(data)
             self._read_bytes += len(data)
             if samples:
+                lost = clock.lost_count
                 stamps = clock.stamp_samples(samples, now)
-                if self._samples:
+                counts.lost_samples += clock.lost_count - lost
+                if counts.samples:
                     longest = max(map(sub, stamps, [self._last_stamp, *stamps]))
                     if longest > max(self.longest_gap, 1.5 * clock.period):
                         self.longest_gap = longest
-                self._samples, self._last_stamp = self._samples + len(samples), stamps[-1]
+                counts.samples, self._last_stamp = counts.samples + len(samples), stamps[-1]
                 if self.state.name != 'reading':
                     self._reopen_delay = _ATTEMPT_INTERVAL
                     self._set_state('reading')
                 yield _Chunk(samples, stamps, now)
-                received, begin, counts = received + len(samples), now, []
+                received, begin, seen = received + len(samples), now, []
                 continue
             if not received and now - last_request >= _LISTENING_DURATION:
                 port.write(protocol.startup)
                 last_request = now
-            timeout = max(_SILENCE_TIMEOUT, _SILENCE_PERIODS * clock.period)
+            timeout = max(_SILENCE_TIMEOUT, 3.0 * clock.period)
             # To open the port again would restart a board that still starts. The second sample
             # shows the period.
             deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)
-            if now >= min(begin + 0.5 * timeout * (len(counts) + 1), deadline):
-                counts.append((self._read_bytes, decoder.device_faults, decoder.refused_samples))
-                if len(counts) > 1:
-                    problem = self._explain_silence(counts[-2], counts[-1], timeout)
+            if now >= min(begin + 0.5 * timeout * (len(seen) + 1), deadline):
+                seen.append((self._read_bytes, counts.device_faults, counts.refused_samples))
+                if len(seen) > 1:
+                    problem = self._explain_silence(seen[-2], seen[-1], timeout)
                     self._report_or_raise(problem, deadline)
 
     def _explain_silence(self, before: tuple[int, int, int], after: tuple[int, int, int],
@@ -363,9 +342,7 @@ class Connection:
         problem = (f'bytes come on {port}, but no sample of {self.protocol.name} for {limit:g} s: '
                    'check protocol, baud and columns')
         if self._is_auto:
-            # keep the counts, and listen again
-            self._previous_counts, self._decoder, self.clock, self.protocol = (
-                self.counts(), None, None, None)
+            self.clock = self.protocol = None  # listen again
             raise PortError(problem)
         return problem
 
@@ -381,6 +358,25 @@ class Connection:
     def _close(self) -> None:
         if self._port is not None:
             self._port.close()
+
+
+def sample_messages(sample: Sample, stamp: int, frame: str,
+                    variance: float) -> list[tuple[str, bytes]]:
+    """
+    Return message types and serialized messages of a sample: its temperature if known, its rate.
+
+    The stamp is in ns, the variance of the rate in (rad/s)².
+    """
+    force = sample.specific_force
+    imu = (0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE,
+           0.0, 0.0, sample.output, *cdr.z_axis_covariance(variance),
+           0.0, 0.0, force or 0.0, *(cdr.NOT_REPORTED_COVARIANCE if force is None
+                                     else cdr.z_axis_covariance(ASSUMED_FORCE_NOISE ** 2)))
+    messages = [(cdr.IMU, cdr.serialize(stamp, frame, imu))]
+    if sample.temperature is not None:
+        messages.insert(0, (cdr.TEMPERATURE,
+                            cdr.serialize(stamp, frame, (sample.temperature, 0.0))))
+    return messages
 
 
 class SampleMean(NamedTuple):

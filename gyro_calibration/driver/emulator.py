@@ -30,8 +30,6 @@ import tty
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 
 _POLL_INTERVAL = 0.05  # s; interval of checks for a reader or a stop
-_SETTLING_DELAY = 0.2  # s; delay after a reader has opened the port, which then discards its input
-_LINGER_DURATION = 1.0  # s; delay before closing, which discards data that were not read
 
 
 class Emulator:
@@ -89,7 +87,7 @@ class Emulator:
         if self._wait_for_reader:
             while not self.has_reader() and not self._stop.wait(_POLL_INTERVAL):
                 pass
-            self._stop.wait(_SETTLING_DELAY)
+            self._stop.wait(0.2)  # s; a reader that has opened the port discards its input
         self._send(self._protocol.preamble)
         encode, start, begin = self._protocol.encoder(self._settings), time.monotonic(), None
         for number, sample in enumerate(self._samples):
@@ -102,7 +100,7 @@ class Emulator:
             self._send(encode(sample if sample.sequence is not None
                               else replace(sample, sequence=number)))
         if self.has_reader():
-            self._stop.wait(_LINGER_DURATION)
+            self._stop.wait(1.0)  # s, since closing discards data that were not read
 
     def has_reader(self) -> bool:
         """Return whether a program has the port open; discard its output."""

@@ -33,18 +33,16 @@ from statistics import median
 import time
 
 from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
 
-_STEADY_CLOCK_ID = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
 _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock drifts visibly
 #: Least span of a line before its period shows lost samples, and time constant of the difference
 #: of two clocks, s.
 _SETTLING_DURATION = 2.0
-_SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line, so that no rate is off by the correction
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-_RECENT_DURATION = 10.0  # s; in which older stamps may come after a clock was set
 #: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz
 #: on: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
 _MIN_LATENESS = 0.5e-3
@@ -116,9 +114,6 @@ class _SampleCounter:
 
     def __init__(self, rate: float, modulus: int):
         self._rate, self._modulus = rate, modulus
-        self.reset()
-
-    def reset(self) -> None:
         self.mean_advance = 1.0  # the usual one
         #: Of how many samples the number may be wrong by a multiple; 0 by the time of the device.
         self.ambiguity = 1
@@ -169,7 +164,7 @@ class _LatenessTest:
         self.step, self._least = 0.0, math.inf
         # least lateness of arrivals that were not late, since the start of a window
         self._least_on_time, self._window_start = math.inf, -math.inf
-        self._first_number = self._last_arrival = self._last_silence = 0.0
+        self.first_number = self._last_arrival = self._last_silence = 0.0
 
     def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
                        period: float) -> bool:
@@ -185,17 +180,13 @@ class _LatenessTest:
         # are the period of samples whose rate fell.
         usual, self._last_silence = max(period, self._last_silence), silence
         if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * usual):
-            self.late_since, self._first_number, self._least = arrival, number, math.inf
+            self.late_since, self.first_number, self._least = arrival, number, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
         # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
         # to a period and falls to zero. So its step is tested, and itself after a longer time.
         self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
                                    else max(0.0, self._least_on_time))
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
-
-    def has_slowed(self, number: float, arrival: float, slope: float) -> bool:
-        assert self.late_since is not None
-        return (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
 
 
 class SampleClock:
@@ -209,7 +200,8 @@ class SampleClock:
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
-        self._counter = _SampleCounter(rate, modulus)
+        self._device = rate, modulus
+        self._counter = _SampleCounter(*self._device)
         self._lateness = _LatenessTest()
         self._line = _LowerLine(1.0 / rate)
         self._last_number, self._slew_offset = 0.0, 0.0
@@ -231,7 +223,7 @@ class SampleClock:
 
     def interrupt(self) -> None:
         """Start a new line, as after a loss of the port; no samples count as lost meanwhile."""
-        self._counter.reset()
+        self._counter = _SampleCounter(*self._device)
         self._restart_line()
 
     def stamp_samples(self, samples: Sequence[Sample], arrival: float) -> list[float]:
@@ -267,7 +259,7 @@ class SampleClock:
         line.add(number, max(arrival, lowest))
         elapsed, self._last_number = max(0.0, number - self._last_number) * line.slope, number
         slew = 0.0 if is_first else expected - line.value_at(number)
-        slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANT)
+        slew *= math.exp(-elapsed / 1.0)  # s, so that no rate is off by the correction
         self._slew_offset = min(slew, arrival - line.value_at(number))
         stamps = [line.value_at(each) + self._slew_offset for each in numbers]
 
@@ -297,12 +289,14 @@ class SampleClock:
         elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, number, arrival,
                                                     period):
             lost = unit * math.floor(self._lateness.step / (unit * period) + 0.25)
-            if not lost or self._lateness.has_slowed(number, arrival, self._line.slope):
-                self._restart_line()
-            else:
-                assert self._lateness.late_since is not None
-                self._uncertain_since, self._lateness.late_since = self._lateness.late_since, None
+            begin, self._lateness.late_since = self._lateness.late_since, None
+            assert begin is not None
+            has_slowed = ((number - self._lateness.first_number) * self._line.slope
+                          < 0.5 * (arrival - begin))
+            if lost and not has_slowed:
+                self._uncertain_since = begin
                 return self._renumber(lost)
+            self._restart_line()
         return 0
 
     def _renumber(self, offset: int) -> int:
@@ -319,7 +313,12 @@ class SampleClock:
 
 def read_steady_clock() -> float:
     """Return seconds of the steady clock, including suspension of the host if supported."""
-    return time.clock_gettime(_STEADY_CLOCK_ID)
+    return time.clock_gettime(getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC))
+
+
+def read_date_offset() -> int:
+    """Return the date less the steady clock, ns; added to the latter it does not jump."""
+    return time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
 
 
 def read_clock_pair(steady_clock: Callable[[], float],
@@ -338,13 +337,13 @@ class _ClockStepDetector:
 
     def __init__(self) -> None:
         self.count = 0  # of steps
-        self._steady_time = self._other_time = math.nan
+        self.steady_time = self.other_time = math.nan  # at the last update, s
 
     def update(self, steady_time: float, other_time: float) -> float:
         """Take the times of both clocks, s; return the step of the clock, 0 without one."""
-        interval = other_time - self._other_time
-        step = interval - (steady_time - self._steady_time)
-        self._steady_time, self._other_time = steady_time, other_time
+        interval = other_time - self.other_time
+        step = interval - (steady_time - self.steady_time)
+        self.steady_time, self.other_time = steady_time, other_time
         if not (abs(step) > _CLOCK_STEP_THRESHOLD or interval < -_CLOCK_STEP_THRESHOLD):
             return 0.0
         self.count += 1
@@ -356,13 +355,12 @@ class NodeTimeConverter:
 
     def __init__(self) -> None:
         self.steps = _ClockStepDetector()
-        self._difference = math.nan
-        self._steady_time, self._node_time, self._last_stamp = -math.inf, -math.inf, -math.inf
+        self._difference, self._last_stamp = math.nan, -math.inf
 
     def update(self, steady_time: float, node_time: float) -> float:
         """Take the times of both clocks, s; return the step of the node's clock."""
-        elapsed, was_set_back = steady_time - self._steady_time, node_time < self._node_time
-        self._steady_time, self._node_time = steady_time, node_time
+        elapsed = steady_time - self.steps.steady_time
+        was_set_back = node_time < self.steps.other_time
         step = self.steps.update(steady_time, node_time)
         error = node_time - steady_time - self._difference
         if not step and abs(error) <= _CLOCK_STEP_THRESHOLD:
@@ -392,7 +390,7 @@ class HostTimeConverter:
     def update(self, steady_time: float, date: float) -> float:
         """Take the times of both clocks, s; return the step of the date."""
         self._recent_steps, self._unshown_steps = (
-            [each for each in steps if steady_time - each[1] <= _RECENT_DURATION]
+            [each for each in steps if steady_time - each[1] <= 10.0]  # older stamps may come
             for steps in (self._recent_steps, self._unshown_steps))
         step = self.steps.update(steady_time, date)
         if step:

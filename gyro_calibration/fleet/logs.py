@@ -50,10 +50,10 @@ from gyro_calibration.files import (
     write_atomically)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import find_delimiter
-from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES, read_log
+from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES
 from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
-from gyro_calibration.logs.recording import read_recording
-from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
+from gyro_calibration.logs.recording import read_file
+from gyro_calibration.logs.ros_bag import list_recording_files
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
@@ -399,8 +399,7 @@ def _format_reason(error: Exception, path: str) -> str:
 
 def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
     path = task.entry.log
-    log = (read_recording(path, rate=task.sample_rate) if is_recording(path)
-           else read_log(path, rate=task.sample_rate))
+    log = read_file(path, rate=task.sample_rate)
     method, model, offset = _calibrate_log(log, task.technology)
     # by parameter where it is named as its effect
     values = {parameter.name if parameter.name == effect else f'{effect}.{parameter.name}':

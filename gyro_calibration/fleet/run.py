@@ -16,8 +16,6 @@ of tasks. A worker that is killed breaks its pool: the submitted tasks are then 
 one, the one that kills its worker again is reported, and the others continue.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor, Executor, FIRST_COMPLETED, Future, ProcessPoolExecutor, wait)
@@ -32,7 +30,6 @@ from typing import Any, TypeVar
 
 _Task = TypeVar('_Task')
 _Found = TypeVar('_Found')
-_WorkFunction = Callable[[_Task], _Found]
 
 
 class WorkerLost(Exception):
@@ -92,7 +89,7 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 
 
-def run_tasks(work: _WorkFunction[_Task, _Found], tasks: Iterable[_Task], workers: int,
+def run_tasks(work: Callable[[_Task], _Found], tasks: Iterable[_Task], workers: int,
               create: Callable[[int], Executor]) -> Iterator[tuple[_Task, _Found | WorkerLost]]:
     """
     Yield each task with its result when it is finished, or with `WorkerLost`.

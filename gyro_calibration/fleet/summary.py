@@ -89,7 +89,6 @@ class _TypeSummary:
     name: str  # or ''
     units: Sequence[str]  # names in natural order
     drives: Sequence[str]
-    dates: Sequence[str]
     records: Sequence[_LogRecord]  # of the logs
     values: Mapping[str, _ValueSummary]
     significance: float  # probability of a false alarm of each kind and value
@@ -115,8 +114,8 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
                 found[value] = _summarize_value(value, slow, logs[kind], FALSE_ALARM_RATE / tests)
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
-        units, drives, dates = (_names(logs[kind], key) for key in ('unit', 'drive', 'date'))
-        summaries.append(_TypeSummary(kind, units, drives, dates, logs[kind], found,
+        units, drives = (_names(logs[kind], key) for key in ('unit', 'drive'))
+        summaries.append(_TypeSummary(kind, units, drives, logs[kind], found,
                                       FALSE_ALARM_RATE / tests))
     return summaries
 
@@ -359,10 +358,6 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
 
 # the page, and a table for other programs
 
-_COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
-            'samples', 'duration_s', 'sha256', 'page')
-
-
 def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
@@ -470,7 +465,9 @@ def log_table(records: Sequence[Mapping[str, Any]]) -> str:
     """Return the values of logs as CSV, one row a log, in SI."""
     rows = []
     for record in records:
-        rows.append({key: record.get(key) for key in _COLUMNS})
+        rows.append({key: record.get(key) for key in (
+            'log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
+            'samples', 'duration_s', 'sha256', 'page')})
         for name, value in (record.get('values', {}) | record.get('slow', {})).items():
             rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
     columns = dict.fromkeys(key for row in rows for key in row)

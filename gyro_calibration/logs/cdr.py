@@ -45,9 +45,7 @@ def z_axis_covariance(variance: float) -> tuple[float, ...]:
     return (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, variance)
 
 
-#: Covariance of a quantity that the message does not report, and of one that is not measured.
 NOT_REPORTED_COVARIANCE = (NOT_REPORTED, *8 * (0.0,))
-UNMEASURED_COVARIANCE = z_axis_covariance(UNMEASURED_VARIANCE)
 
 #: Largest number of fields, and length of a definition in characters.
 _MAX_FIELDS, _MAX_DEFINITION_LENGTH = 5000, 100_000

@@ -54,7 +54,6 @@ AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as 
 RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
               'deg/h': DEGREE / 3600.0}
 _NO_UNIT = {'1': 1.0}
-_ANGLE_UNITS = {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
@@ -62,7 +61,8 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'counts': ('counts', _NO_UNIT),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
     'rate': ('reference_rate', RATE_UNITS),
-    'heading': ('reference_heading', _ANGLE_UNITS),
+    'heading': ('reference_heading', {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3,
+                                      'turn': 2.0 * math.pi}),
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
                                         'mg': 1e-3 * STANDARD_GRAVITY}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
@@ -117,7 +117,9 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
             found[part] = Column(header.index(column), units[unit], offset)
     asked = {column.position for column in found.values()}
     for index, name in enumerate(header):
-        quantity, factor = COLUMNS.get(_strip_axis(name, axis), ('', 0.0))
+        first, _, rest = name.partition(f'_{axis}_')
+        has_axis = rest and first in ('gyro', 'acceleration')  # as gyro_z_dps
+        quantity, factor = COLUMNS.get(f'{first}_{rest}' if has_axis else name, ('', 0.0))
         if not quantity or index in asked or quantity in by_user:
             continue
         if quantity in found:
@@ -129,12 +131,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                          'with gyro_dps, gyro_rad_s or gyro_counts, and # before the lines above '
                          'it, or other names, as by --columns time=NAME:s,gyro=NAME:deg/s')
     return found
-
-
-def _strip_axis(name: str, axis: str) -> str:
-    """Return a column name without the axis: gyro_dps for gyro_z_dps."""
-    first, _, rest = name.partition(f'_{axis}_')
-    return f'{first}_{rest}' if rest and first in ('gyro', 'acceleration') else name
 
 
 def find_delimiter(line: str) -> str:

@@ -15,8 +15,6 @@ A log is a CSV file, one row a sample or, without time, one row a dwell of a rat
 names each column with its unit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv
@@ -40,6 +38,7 @@ from gyro_calibration.logs.columns import (
     ROTATIONS)
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.floating]
@@ -479,7 +478,7 @@ def _replace_attitude(arrays: dict[str, Array], axis: str) -> None:
     output = arrays.get('output', np.full(len(known), np.nan))
     if (measured := np.isfinite(output)).any():
         output = np.interp(time, time[measured], output[measured])
-    angle = np.append(0.0, np.cumsum(0.5 * np.diff(time) * (output[1:] + output[:-1])))
+    angle = cumulative_trapezoid(output, time, initial=0.0)
     time, by_gyro = time[known], np.diff(angle[known])
     apart, attitude = np.diff(time), Rotation.from_quat(quaternions[known][:, [1, 2, 3, 0]])
     step = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
@@ -536,10 +535,18 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     return heading, bool(np.abs(np.diff(heading[known]) - np.diff(plainly)).max() > np.pi)
 
 
+def unwrap_reference(log: Log) -> Log:
+    """Return a log with output and time whose reference heading, if any, is unwrapped."""
+    time, output, heading = (np.asarray(each) for each in (
+        log.time, log.output, log.reference_heading))
+    return log if log.reference_heading is None else replace(
+        log, reference_heading=unwrap_heading(time, heading, time, output)[0])
+
+
 def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
                      output: Array) -> tuple[Array, float]:
     """Return the heading, (m,), by the gyro with sign and bias fitted, and its scale factor."""
-    angle = np.concatenate([[0.0], np.cumsum(0.5 * (output[1:] + output[:-1]) * np.diff(time))])
+    angle = cumulative_trapezoid(output, time, initial=0.0)
     turned, steps = np.interp(reference_time, time, angle), np.diff(reference_time)
     # as rates, since over a gap the unwrapped change may be wrong by any number of turns
     rate, gyro_rate = np.diff(heading) / steps, np.diff(turned) / steps

@@ -19,21 +19,22 @@ and all other corrections.
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 import os.path
 from pathlib import Path
+import struct
 from typing import Any
 
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
-from gyro_calibration.logs.log import Array, Log, LogError, Mask, mask_invalid, unwrap_heading
-from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
+from gyro_calibration.logs.log import (
+    Array, Log, LogError, mask_invalid, read_log, unwrap_heading)
+from gyro_calibration.logs.ros_bag import (
+    Contents, is_recording, Message, OnProgress, read_messages)
 import numpy as np
 from numpy.typing import NDArray
-
-_Nanoseconds = NDArray[np.int64]
 
 _REFERENCE_TYPES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
 #: Role of a topic -> the option that names it, its possible message types, and the quantities of
@@ -71,83 +72,81 @@ def _is_same_topic(topic: str, other: str | None) -> bool:
     return topic.strip('/') == (other or '').strip('/')
 
 
-class _TopicBuffer:
-    """Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities."""
+class _Topic:
+    """
+    Messages of one topic.
 
-    def __init__(self, topic: str, kind: str, definition: str, axis: str):
-        self.topic, self.kind, self.damaged_count = topic, kind, 0
+    `rows` has stamp and time of receipt, ns, and the known quantities by name.
+    """
+
+    def __init__(self, name: str, kind: str, definition: str, axis: str):
+        self.name, self.kind, self.damaged_count = name, kind, 0
         self.frames = set[str]()  # the first two in the headers
         self._layout = cdr.parse_layout(definition, axis)
-        self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
+        self._struct = struct.Struct(f'=qq{len(self._layout.quantities)}d')
+        self._data = bytearray()
+        self.rows: Any = None  # in order of receipt, or of stamps
 
     def __len__(self) -> int:
-        return len(self._stamps)
+        return len(self._data) // self._struct.size
 
     def add(self, message: Message) -> None:
         try:
             stamp, numbers = cdr.parse(message.data, self._layout)
-            self._received.append(message.received)
-        except (MessageError, OverflowError):
+            self._data += self._struct.pack(stamp, message.received, *(
+                numbers[place] for place in self._layout.quantities.values()))
+        except (MessageError, struct.error):
             self.damaged_count += 1
             return
         if len(self.frames) < 2:
             self.frames.add(cdr.parse_frame(message.data))
-        self._stamps.append(stamp)
-        self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
-    def sort_by_arrival(self) -> _TopicSeries:
-        received = np.frombuffer(self._received, np.int64)
-        numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
-        series = _TopicSeries(self.topic, self.kind, np.frombuffer(self._stamps, np.int64),
-                              received, numbers, tuple(self._layout.quantities))
-        # no copy where they are in order already
-        return (series if (received[1:] >= received[:-1]).all()
-                else series.select(np.argsort(received, kind='stable')))
+    def in_order_of_receipt(self) -> _Topic:
+        """Return a copy with its own rows."""
+        found = copy(self)
+        rows = np.frombuffer(self._data, [('stamp', 'i8'), ('received', 'i8'), *(
+            (quantity, 'f8') for quantity in self._layout.quantities)])
+        found.rows = rows[np.argsort(rows['received'], kind='stable')]
+        return found
 
-
-@dataclass(frozen=True)
-class _TopicSeries:
-    """Stamps and times of receipt of a topic, ns, shape (n,), and numbers, shape (n, m)."""
-
-    topic: str
-    kind: str
-    stamps: _Nanoseconds
-    received: _Nanoseconds
-    numbers: Array
-    quantities: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.stamps)
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        return self.rows['stamp']
 
     def values(self, quantity: str) -> Array:
         """Return the values of a quantity, shape (n,); zeros where there is none."""
-        if quantity not in self.quantities:
-            return np.zeros(len(self))
-        return self.numbers[:, self.quantities.index(quantity)]
+        return (self.rows[quantity].copy() if quantity in self._layout.quantities
+                else np.zeros(len(self.rows)))
 
     def is_reported(self, quantity: str) -> bool:
         """Return whether the messages have a quantity and do not declare it unknown."""
-        return quantity in self.quantities and not (
+        return quantity in self._layout.quantities and not (
             self.values(f'{quantity} variance') == cdr.NOT_REPORTED).all()
 
     @property
     def has_stamps(self) -> bool:
         """Return whether the headers have stamps; else they are zero or all the same."""
-        return bool(self.stamps.any()) and (len(self) < 2 or int(np.ptp(self.stamps)) > 0)
+        return bool(self.stamps.any()) and (len(self.stamps) < 2 or int(np.ptp(self.stamps)) > 0)
 
-    def select(self, which: Mask | NDArray[np.intp]) -> _TopicSeries:
-        return replace(self, stamps=self.stamps[which], received=self.received[which],
-                       numbers=self.numbers[which])
+    def use_times(self, use_stamps: bool) -> None:
+        """Leave out rows without a stamp, or use times of receipt as stamps."""
+        if use_stamps:
+            self.rows = self.rows[self.stamps != 0]
+        else:
+            self.rows['stamp'] = self.rows['received']
 
-    def with_unique_stamps(self) -> _TopicSeries:
-        """Return the series sorted by stamps, without duplicates."""
-        return self.select(np.unique(self.stamps, return_index=True)[1])
+    def sort_by_stamps(self) -> None:
+        """Sort the rows by stamps, and leave out duplicates."""
+        self.rows = self.rows[np.unique(self.stamps, return_index=True)[1]]
 
-    def with_times(self, use_stamps: bool) -> _TopicSeries:
-        """Return the series with stamps, or times of receipt, as its stamps."""
-        if not use_stamps:
-            return replace(self, stamps=self.received)
-        return self if self.stamps.all() else self.select(self.stamps != 0)
+
+def read_file(path: str | Path, topics: Topics = Topics(), rate: float | None = None,
+              sensitivity: float | None = None, columns: Mapping[str, str] = {},
+              on_progress: OnProgress = lambda place: None,
+              on_note: Callable[[str], object] = lambda note: None) -> Log:
+    """Read a recording or a log file, as `read_recording` or `log.read_log`, by its name."""
+    return (read_recording(path, topics, rate, on_progress, on_note) if is_recording(path)
+            else read_log(path, sensitivity, rate, columns, topics.axis, on_progress))
 
 
 def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | None = None,
@@ -160,15 +159,15 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     each note on selections and corrections. Raise `LogError` for a recording that cannot be read,
     or has no gyro or several; it names the topics.
     """
-    contents, series = Contents(), dict[str, _TopicBuffer]()
+    contents, found = Contents(), dict[str, _Topic]()
     for message in read_messages(path, contents, on_progress):
-        if message.topic not in series:
+        if message.topic not in found:
             axis = 'z' if _is_same_topic(message.topic, topics.reference) else topics.axis
-            series[message.topic] = _TopicBuffer(
+            found[message.topic] = _Topic(
                 message.topic, message.kind, contents.definitions[message.kind], axis)
-        series[message.topic].add(message)
+        found[message.topic].add(message)
     try:
-        log = _LogBuilder(Path(path).name, topics, contents, series).build(rate)
+        log = _LogBuilder(Path(path).name, topics, contents, found).build(rate)
     except LogError as error:
         raise LogError(f'{path}: {error}') from None
     for note in log.notes:
@@ -179,16 +178,15 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
 class _LogBuilder:
     """Makes a log of the messages of a recording, with notes on selections and corrections."""
 
-    def __init__(self, name: str, topics: Topics, contents: Contents,
-                 series: dict[str, _TopicBuffer]):
-        self._topics, self._contents, self._series = topics, contents, series
+    def __init__(self, name: str, topics: Topics, contents: Contents, found: dict[str, _Topic]):
+        self._topics, self._contents, self._found = topics, contents, found
         self._notes = [f'ROS 2 recording {name}']
 
     def build(self, rate: float | None) -> Log:
         found = [topic for topic in self._topics_of_type({cdr.IMU})
                  if not _is_same_topic(topic, self._topics.reference)]
         if self._topics.gyro:
-            found = [self._find_topic(self._topics.gyro, 'gyro')]
+            found = [self._find_topic(self._topics.gyro, 'gyro').name]
         elif len(found) > 1:
             raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
         elif not found:
@@ -201,35 +199,37 @@ class _LogBuilder:
                       else 'record the topic of the gyro')
             raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; '
                            f'{remedy}')
-        gyro = self._topic_series(found[0])
+        gyro = self._read(self._found[found[0]])
         if not gyro.is_reported('rate'):
-            raise LogError(f'{gyro.topic} declares that it reports no angular velocity; name '
+            raise LogError(f'{gyro.name} declares that it reports no angular velocity; name '
                            'another by --topic')
-        thermometer = None
+        temperature = None
         if self._topics.temperature is not None:
-            thermometer = self._find_topic(self._topics.temperature, 'temperature')
+            temperature = self._find_topic(self._topics.temperature, 'temperature')
         elif found := self._topics_of_type({cdr.TEMPERATURE}):
             if len(found) > 1:
                 self._notes.append(f'of the temperatures {_join_names(found)}, the one whose name '
                                    'is nearest to the topic of the gyro is used')
-            thermometer = max(found, key=lambda topic: len(os.path.commonprefix(
-                [topic.strip('/'), gyro.topic.strip('/')])))
-        temperature = self._topic_series(thermometer) if thermometer else None
+            temperature = self._found[max(found, key=lambda topic: len(os.path.commonprefix(
+                [topic.strip('/'), gyro.name.strip('/')])))]
+        temperature = temperature and self._read(temperature)
         reference = None
         if self._topics.reference is not None:
-            reference = self._topic_series(self._find_topic(self._topics.reference, 'reference'))
+            reference = self._read(self._find_topic(self._topics.reference, 'reference'))
         elif possible := self._topics_of_type(set(_REFERENCE_TYPES) - {cdr.IMU}):
             self._notes.append('no reference was asked for; --reference-topic may be '
                                f'{_join_names(possible)}')
-        use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
+        use_stamps = all(each.has_stamps for each in (gyro, reference) if each is not None)
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were '
                                'received')
-        gyro = self._order_samples(gyro.with_times(use_stamps), rate)
-        time = (gyro.stamps - gyro.stamps[0]) / NSEC_PER_SEC
-        self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, '
-                           f'time_s from {_format_seconds(gyro.stamps[0])} s on')
-        output = gyro.values('rate').copy()
+        gyro.use_times(use_stamps)
+        self._order_samples(gyro, rate)
+        begin = gyro.stamps[0]
+        time = (gyro.stamps - begin) / NSEC_PER_SEC
+        self._notes.append(f'gyro: {gyro.name} ({gyro.kind}), {len(time)} samples, '
+                           f'time_s from {format_seconds(begin)} s on')
+        output = gyro.values('rate')
         lost = mask_invalid(output, 'output') | np.isnan(output)
         if lost.any():
             self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
@@ -241,17 +241,20 @@ class _LogBuilder:
             if mask_invalid(force, 'specific_force').any():
                 self._notes.append('the specific force is not finite everywhere and was left out')
             else:
-                arrays['specific_force'] = force.copy()
+                arrays['specific_force'] = force
         if temperature is not None:
-            times = temperature.with_times(use_stamps and temperature.has_stamps)
-            arrays['temperature'] = self._interpolate_temperature(times, gyro.stamps[0], time)
+            temperature.use_times(use_stamps and temperature.has_stamps)
+            arrays['temperature'] = self._interpolate_temperature(temperature, begin, time)
         if reference is not None:
-            arrays |= self._interpolate_reference(reference.with_times(use_stamps), gyro, time,
-                                                  output)
-        return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
+            if reference.name == gyro.name:
+                raise LogError(f'{gyro.name} cannot be its own reference; name another by '
+                               '--reference-topic')
+            reference.use_times(use_stamps)
+            arrays |= self._interpolate_reference(reference, begin, time, output)
+        return Log(time=time if rate is None else np.arange(len(time)) / rate, **arrays,
                    notes=(*self._notes, *self._contents.notes))
 
-    def _find_topic(self, wanted: str, role: str) -> str:
+    def _find_topic(self, wanted: str, role: str) -> _Topic:
         topic = next((topic for topic in self._contents.topics if _is_same_topic(topic, wanted)),
                      None)
         if topic is None:
@@ -262,97 +265,92 @@ class _LogBuilder:
         found = cdr.parse_layout(definition).quantities if definition else {}
         if not _ROLES[role][2] & set(found) and (wrong := topic_type_fault(role, topic, kind)):
             raise LogError(wrong)
-        if topic not in self._series or not len(self._series[topic]):
+        if not len(self._found.get(topic, ())):
             raise LogError(f'{topic} has no message that can be read; record again')
-        return topic
+        return self._found[topic]
 
     def _topics_of_type(self, kinds: set[str]) -> list[str]:
-        return sorted(topic for topic, series in self._series.items()
-                      if series.kind in kinds and len(series))
+        return sorted(name for name, topic in self._found.items()
+                      if topic.kind in kinds and len(topic))
 
     def _list_topics(self) -> str:
         topics = [f'{topic} ({kind})' for topic, kind in sorted(self._contents.topics.items())]
         return f'; there are {_join_names(topics)}' if topics else ', which holds no topic at all'
 
-    def _topic_series(self, topic: str) -> _TopicSeries:
-        series = self._series[topic]
-        if series.damaged_count:
-            self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
-                               'were left out')
-        if len(series.frames) > 1:
-            raise LogError(f'messages of the frames {_join_names(sorted(series.frames))} are on '
-                           f'{topic}, as of several sensors: record each on a topic of its own, '
-                           'or split the recording where the frame changes')
-        return series.sort_by_arrival()
+    def _read(self, topic: _Topic) -> _Topic:
+        if topic.damaged_count:
+            self._notes.append(f'{topic.damaged_count} messages of {topic.name} could not be read '
+                               'and were left out')
+        if len(topic.frames) > 1:
+            raise LogError(f'messages of the frames {_join_names(sorted(topic.frames))} are on '
+                           f'{topic.name}, as of several sensors: record each on a topic of its '
+                           'own, or split the recording where the frame changes')
+        return topic.in_order_of_receipt()
 
-    def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:
+    def _order_samples(self, gyro: _Topic, rate: float | None) -> None:
         """Sort samples by their stamps, leave out duplicates, and refuse unusable times."""
         latest = np.maximum.accumulate(gyro.stamps)
         back = latest - gyro.stamps
         if rate is not None:
-            gyro = replace(gyro, stamps=latest)
+            gyro.rows['stamp'] = latest
         elif back.any():
             if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
                 place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
-                raise LogError(f'the stamps of {gyro.topic} step back by '
-                               f'{_format_seconds(back[place])} s at sample {place + 1}, as after '
+                raise LogError(f'the stamps of {gyro.name} step back by '
+                               f'{format_seconds(back[place])} s at sample {place + 1}, as after '
                                'setting a clock; split the recording there, or give the sample '
                                'rate with --rate')
             self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were '
                                'sorted')
-            gyro = gyro.select(np.argsort(gyro.stamps, kind='stable'))
+            gyro.rows = gyro.rows[np.argsort(gyro.stamps, kind='stable')]
         doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
         if rate is None and doubled.any():
             differs = np.diff(gyro.values('rate'), prepend=np.nan) != 0.0
             other = int(np.count_nonzero(doubled & differs))
-            if other > 1 + 0.01 * len(gyro):
-                raise LogError(f'{other} of {len(gyro)} samples of {gyro.topic} have the stamp of '
-                               'another sample, so their times are unknown; give the sample rate '
-                               'with --rate')
+            if other > 1 + 0.01 * len(doubled):
+                raise LogError(f'{other} of {len(doubled)} samples of {gyro.name} have the stamp '
+                               'of another sample, so their times are unknown; give the sample '
+                               'rate with --rate')
             self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another '
                                'one were left out')
-            gyro = gyro.select(~doubled)
-        if len(gyro) < 2:
-            raise LogError(f'{gyro.topic} has {len(gyro)} samples with a time; a log has at '
-                           'least two: record more')
-        return gyro
+            gyro.rows = gyro.rows[~doubled]
+        if (count := len(gyro.rows)) < 2:
+            raise LogError(f'{gyro.name} has {count} samples with a time; a log has at least two: '
+                           'record more')
 
-    def _interpolate_temperature(self, series: _TopicSeries, begin: np.int64,
+    def _interpolate_temperature(self, topic: _Topic, begin: np.int64,
                                  time: Array) -> Array | None:
         """Return the temperature between readings; before and after them it is constant."""
-        valid = ~mask_invalid(series.values('temperature'), 'temperature')
-        series = series.select(valid).with_unique_stamps()
-        at = (series.stamps - begin) / NSEC_PER_SEC
+        topic.rows = topic.rows[~mask_invalid(topic.values('temperature'), 'temperature')]
+        topic.sort_by_stamps()
+        at = (topic.stamps - begin) / NSEC_PER_SEC
         if (not len(at) or at[0] > time[-1] + _MAX_TEMPERATURE_GAP
                 or at[-1] < -_MAX_TEMPERATURE_GAP):
-            self._notes.append(f'temperature: {series.topic} has none at the times of the gyro, '
+            self._notes.append(f'temperature: {topic.name} has none at the times of the gyro, '
                                'and was left out')
             return None
-        self._notes.append(f'temperature: {series.topic} ({series.kind}), {len(at)} readings')
+        self._notes.append(f'temperature: {topic.name} ({topic.kind}), {len(at)} readings')
         inside = at[(at >= 0.0) & (at <= time[-1])]
         longest = float(np.diff(np.concatenate([[0.0], inside, time[-1:]])).max())
         if longest > _MAX_TEMPERATURE_GAP:
             self._notes.append(f'no temperature came for up to {longest:.0f} s; '
                                'it was interpolated, or held at the ends')
-        return np.interp(time, at, series.values('temperature'))
+        return np.interp(time, at, topic.values('temperature'))
 
-    def _interpolate_reference(self, series: _TopicSeries, gyro: _TopicSeries, time: Array,
+    def _interpolate_reference(self, topic: _Topic, begin: np.int64, time: Array,
                                output: Array) -> dict[str, Any]:
         """Return heading and rate of a reference at the samples of the gyro; nan where lost."""
-        if series.topic == gyro.topic:
-            raise LogError(f'{gyro.topic} cannot be its own reference; name another by '
-                           '--reference-topic')
-        series = series.with_unique_stamps()
-        at = (series.stamps - gyro.stamps[0]) / NSEC_PER_SEC
-        rate = series.values('rate') if series.is_reported('rate') else None
+        topic.sort_by_stamps()
+        at = (topic.stamps - begin) / NSEC_PER_SEC
+        rate = topic.values('rate') if topic.is_reported('rate') else None
         if rate is not None:
             rate = np.where(np.isfinite(rate), rate, np.nan)
         heading = None
-        x, y, z, w = (series.values(f'orientation.{each}') for each in 'xyzw')
-        variance = series.values('orientation variance')
+        x, y, z, w = (topic.values(f'orientation.{each}') for each in 'xyzw')
+        variance = topic.values('orientation variance')
         # declared unknown by an Imu, or left at its default
-        if series.is_reported('orientation.w') and not (
-                'orientation variance' in series.quantities and (
+        if topic.is_reported('orientation.w') and not (
+                topic.is_reported('orientation variance') and (
                     (variance == cdr.NOT_REPORTED).all()
                     or not (x.any() or y.any() or z.any() or variance.any())
                     and (w == 1.0).all())):
@@ -378,15 +376,15 @@ class _LogBuilder:
                      | (time == known[place + 1]))
             found[name] = np.where(inside & close, np.interp(time, known, values), np.nan)
         if not any(np.isfinite(values).any() for values in found.values()):
-            raise LogError(f'{series.topic} has no heading and no rate at the times of the gyro; '
+            raise LogError(f'{topic.name} has no heading and no rate at the times of the gyro; '
                            'name another reference, or check that both clocks agree')
         lost = np.isnan(next(iter(found.values()))).mean()
-        self._notes.append(f'reference: {series.topic} ({series.kind}), {len(at)} values, '
+        self._notes.append(f'reference: {topic.name} ({topic.kind}), {len(at)} values, '
                            f'lost for {100 * lost:.1f} % of the samples')
         return found
 
 
-def _format_seconds(nanoseconds: np.int64) -> str:
+def format_seconds(nanoseconds: int | np.int64) -> str:
     return f'{int(nanoseconds) // NSEC_PER_SEC}.{int(nanoseconds) % NSEC_PER_SEC:09d}'
 
 

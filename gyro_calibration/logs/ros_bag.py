@@ -26,7 +26,7 @@ from enum import IntEnum
 from functools import partial
 import importlib
 import io
-from itertools import repeat
+from itertools import chain, repeat
 import os
 from pathlib import Path
 import re
@@ -319,7 +319,9 @@ def _pack_sized(data: bytes | str) -> bytes:
 class McapWriter:
     """Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk."""
 
-    def __init__(self) -> None:
+    def __init__(self, library: str = '', notes: Callable[[], Mapping[str, str]] = dict):
+        """Take the name of the program, and the notes, which are called for with the header."""
+        self._library, self._notes = library, notes
         self._offset = 0
         self._records = bytearray()
         self._schemas: dict[str, tuple[int, bytes]] = {}
@@ -330,19 +332,15 @@ class McapWriter:
         self._chunk_indexes: list[bytes] = []
         self._metadata_index = b''
 
-    @property
-    def pending_bytes(self) -> int:
-        return len(self._records)
-
-    def pack_header(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
-        """Return the beginning of a file: header with the program, and a metadata record."""
-        head = _MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'), _pack_sized(library))
-        pairs = b''.join(_pack_sized(key) + _pack_sized(value) for key, value in notes.items())
-        metadata = _pack_record(_RecordCode.METADATA, _pack_sized(name), _pack_sized(pairs))
+    def _pack_header(self) -> bytes:
+        """Return the beginning of a file: header with the program, and the notes."""
+        head = _MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'),
+                                     _pack_sized(self._library))
+        name = _pack_sized(METADATA_NAME)
+        pairs = b''.join(map(_pack_sized, chain.from_iterable(self._notes().items())))
+        metadata = _pack_record(_RecordCode.METADATA, name, _pack_sized(pairs))
         self._metadata_index = _pack_record(_RecordCode.METADATA_INDEX,
-                                            struct.pack('<QQ', len(head), len(metadata)),
-                                            _pack_sized(name))
-        self._offset = len(head + metadata)
+                                            struct.pack('<QQ', len(head), len(metadata)), name)
         return head + metadata
 
     def add(self, message: Message) -> None:
@@ -366,9 +364,15 @@ class McapWriter:
         self._records += _pack_record(_RecordCode.MESSAGE, head, message.data)
 
     def pack_chunk(self) -> bytes:
-        """Return the messages since the last chunk as a chunk with index; b'' without any."""
+        """
+        Return the messages since the last chunk as a chunk with index; b'' without any.
+
+        The first one follows the header.
+        """
         if not self._indexes:
             return b''
+        header = b'' if self._offset else self._pack_header()
+        self._offset += len(header)
         times = [time for index in self._indexes.values() for time, _ in index]
         self._spans.append((min(times), max(times)))
         records = bytes(self._records)
@@ -390,7 +394,7 @@ class McapWriter:
         self._records.clear()
         self._indexes.clear()
         self._offset += len(chunk + indexes)
-        return chunk + indexes
+        return header + chunk + indexes
 
     def pack_summary(self) -> bytes:
         """Return the end of a file: the summary with the index of all chunks."""

@@ -26,8 +26,6 @@ Integers = NDArray[np.integer]
 
 #: Ratio to the usual interval of a short one, as in a burst or after a late sample.
 SHORT_RATIO = 0.5
-#: Share of short intervals in a log above which its stamps are taken to come in bursts.
-_MIN_BURST_SHARE = 0.02
 
 #: Least number of windows in a record. None crosses a gap of more than this part of the record,
 #: and longer windows do not show a motion.
@@ -81,7 +79,7 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
     usual = (float(steps[whole & (steps < 1.5 * usual)].mean())
              if alike and float(whole.mean()) > 0.9 else interval)
-    bursts = float((steps < SHORT_RATIO * usual).mean()) > _MIN_BURST_SHARE
+    bursts = float((steps < SHORT_RATIO * usual).mean()) > 0.02
 
     # The number of lost samples is that of the intervals by which the stamps remain late. Samples
     # that were delayed at a host arrive in one burst of any size; the time to catch up begins

@@ -20,8 +20,6 @@ A foreign command is one of another node: own commands come back on `cmd_vel` in
 sending, and every other command is foreign, also an additional zero.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -49,7 +47,6 @@ from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-_REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
@@ -112,17 +109,13 @@ class CalibrationRun:
     @property
     def extra_duration(self) -> float:
         """Return the duration of samples after the motion, s."""
-        return {REST: 0.0, TURNS: _REST_AFTER_TURNS}.get(
+        return {REST: 0.0, TURNS: 2.5}.get(
             self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property
     def max_duration(self) -> float:
         """Return the longest duration of the run, s."""
         return FINISH_TIMEOUT if math.isinf(self.duration) else self.duration + self.extra_duration
-
-    @property
-    def progress(self) -> float:
-        return min(self.elapsed / self.max_duration, 1.0)
 
     @property
     def status(self) -> str:

@@ -15,8 +15,6 @@ It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``
 ``imu/data``, ``heading``, ``yaw_rate``, ``~/calibration_status`` and diagnostics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import math
 import os
@@ -30,8 +28,8 @@ from geometry_msgs.msg import (
     PoseWithCovarianceStamped, Twist, TwistStamped, TwistWithCovarianceStamped)
 from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.logs.cdr import (
-    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading,
-    UNMEASURED_COVARIANCE, UNMEASURED_VARIANCE, z_axis_covariance)
+    NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading, serialize,
+    UNMEASURED_VARIANCE, z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
 from gyro_calibration.ros.inputs import Clock, Velocity
@@ -49,6 +47,10 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
+
+
+#: Covariance of a pose or a twist of which only the last of six parts is measured, without it.
+_UNMEASURED_AXES = (*5 * (UNMEASURED_VARIANCE, *6 * (0.0,)),)
 
 
 class _NodeClock:
@@ -93,12 +95,6 @@ class CompensationNode(Node):
         self._yaw_rate = publish_on(self, TwistWithCovarianceStamped, 'yaw_rate')
         self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
         self._has_subscribers = {self._heading: False, self._yaw_rate: False}
-        self._pose_message = PoseWithCovarianceStamped()
-        self._pose_message.header.frame_id = values.heading_frame
-        self._rate_message = TwistWithCovarianceStamped()
-        for place in range(5):
-            self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
-            self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
         subscribe_to(self, Temperature, 'imu/temperature',
                      lambda message: self._pipeline.add_temperature(
                          _stamp_ns(message.header), message.temperature))
@@ -167,50 +163,43 @@ class CompensationNode(Node):
 
     def _publish(self, imu: Imu, corrected: CorrectedSample) -> None:
         """Publish the received message with its z corrected, and the heading."""
-        sec, nanosec = divmod(corrected.stamp, NSEC_PER_SEC)
-        imu.header.stamp.sec, imu.header.stamp.nanosec = sec, nanosec
-        imu.angular_velocity.z = corrected.rate
+        x, y = imu.angular_velocity.x, imu.angular_velocity.y
         xx, xy, _, yx, yy, *_ = imu.angular_velocity_covariance.tolist()
-        acceleration = imu.linear_acceleration
-        if not math.isfinite(imu.angular_velocity.x + imu.angular_velocity.y + xx + xy + yx + yy):
-            imu.angular_velocity.x = imu.angular_velocity.y = xy = yx = 0.0
+        if not math.isfinite(x + y + xx + xy + yx + yy):
+            x = y = xy = yx = 0.0
             xx = yy = UNMEASURED_VARIANCE
         elif xx < 0.0 or yy < 0.0:
             xx = yy = UNMEASURED_VARIANCE
             xy = yx = 0.0
         elif not (xx or yy):  # all zeros: not known
             xx = yy = self._pipeline.values.assumed_bias ** 2
-        imu.angular_velocity_covariance[:] = (xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0,
-                                              corrected.rate_variance)
-        covariance = imu.linear_acceleration_covariance.tolist()
-        if not math.isfinite(acceleration.x + acceleration.y + acceleration.z + sum(covariance)):
-            acceleration.x = acceleration.y = acceleration.z = 0.0
-            imu.linear_acceleration_covariance[:] = NOT_REPORTED_COVARIANCE
-        elif covariance[0] != NOT_REPORTED and min(covariance[::4]) < 0.0:
-            imu.linear_acceleration_covariance[:] = UNMEASURED_COVARIANCE
+        acceleration = imu.linear_acceleration
+        force = acceleration.x, acceleration.y, acceleration.z
+        of_force = imu.linear_acceleration_covariance.tolist()
+        if not math.isfinite(sum(force) + sum(of_force)):
+            force, of_force = (0.0, 0.0, 0.0), NOT_REPORTED_COVARIANCE
+        elif of_force[0] != NOT_REPORTED and min(of_force[::4]) < 0.0:
+            of_force = z_axis_covariance(UNMEASURED_VARIANCE)
         half = 0.5 * corrected.heading
-        turned = imu.orientation
-        turned.x = turned.y = 0.0
-        turned.z, turned.w = math.sin(half), math.cos(half)
-        imu.orientation_covariance[:] = z_axis_covariance(corrected.heading_variance)
-        self._imu.publish(imu)
+        turned = 0.0, 0.0, math.sin(half), math.cos(half)
+        stamp, frame, variance = corrected.stamp, imu.header.frame_id, corrected.heading_variance
+        self._imu.publish(serialize(stamp, frame, (
+            *turned, *z_axis_covariance(variance), x, y, corrected.rate,
+            xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0, corrected.rate_variance, *force, *of_force)))
         if self._has_subscribers[self._heading]:
-            pose = self._pose_message
-            pose.header.stamp, pose.pose.pose.orientation = imu.header.stamp, turned
-            pose.pose.covariance[35] = corrected.heading_variance
-            self._heading.publish(pose)
+            self._heading.publish(serialize(stamp, self._pipeline.values.heading_frame, (
+                0.0, 0.0, 0.0, *turned, *_UNMEASURED_AXES, variance)))
         if self._has_subscribers[self._yaw_rate]:
-            rate = self._rate_message
-            rate.header, rate.twist.twist.angular.z = imu.header, corrected.rate
-            rate.twist.covariance[35] = corrected.rate_variance
-            self._yaw_rate.publish(rate)
+            self._yaw_rate.publish(serialize(stamp, frame, (
+                0.0, 0.0, 0.0, 0.0, 0.0, corrected.rate, *_UNMEASURED_AXES,
+                corrected.rate_variance)))
 
     def _publish_status(self) -> None:
         store, run = self._pipeline.store, self._pipeline.session.run
         calibration = store.model.self_calibration
         values: dict[str, object] = {
             'calibrated': calibration is not None, 'running': run is not None,
-            **({'progress': f'{run.progress:.2f}'} if run else {}),
+            **({'progress': f'{min(run.elapsed / run.max_duration, 1.0):.2f}'} if run else {}),
             **(calibration.to_dict() if calibration else {})}
         level, message = OK, str(calibration)
         if run:
@@ -461,9 +450,7 @@ class CompensationReport:
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
         warnings += filter(None, (
-            pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
-            pipeline.alternation_fault, pipeline.turn_fault, pipeline.stamp_fault,
-            pipeline.odometry_fault, pipeline.standstill_fault, pipeline.output_conflict,
+            pipeline.session.warning, *pipeline.faults.values(), pipeline.output_conflict,
             store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
             estimator.calibration_message, estimator.bias_message, store.table_hint))
         if warnings:

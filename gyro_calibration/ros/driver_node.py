@@ -15,21 +15,21 @@ One thread reads, decodes, stamps and publishes; the executor only reports once 
 thread ends by a fault of the program, the node ends too, so that a launch file can restart it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 import sys
 import threading
 import time
 from types import SimpleNamespace
 
 from gyro_calibration.driver.connection import (
-    Connection, ConnectionCounts, ConnectionState, Decimator, MAX_BAUD, SampleMean)
-from gyro_calibration.driver.protocols import AUTO, Sample, Settings
-from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, TRISTATE
+    Connection, ConnectionState, Decimator, MAX_BAUD, sample_messages, SampleMean)
+from gyro_calibration.driver.protocols import AUTO, Counts, Sample, Settings
+from gyro_calibration.driver.protocols.protocol import TRISTATE
 from gyro_calibration.driver.timestamps import (
     NodeTimeConverter, read_clock_pair, read_steady_clock)
-from gyro_calibration.logs.cdr import NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, z_axis_covariance
+from gyro_calibration.logs import cdr
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.ros.inputs import NodeParameter
 from gyro_calibration.ros.runner import (
     call_every, declare_parameters, Diagnostics, ERROR, OK, publish_on, Report, run_node, WARN)
@@ -87,9 +87,10 @@ class DriverNode(Node):
         self._connection = Connection(
             values.port, values.protocol, values.baud, self._settings, self._on_change)
         self._decimation = Decimator(values.samples_per_message)
-        self._messages = SampleMessages(values.frame_id)
-        self._imu = publish_on(self, Imu, 'imu/data_raw')
-        self._temperature = publish_on(self, Temperature, 'imu/temperature')
+        self._frame, self._variance = values.frame_id, 0.0  # of the rate of a sample, (rad/s)²
+        self._publishers_by_type = {
+            cdr.IMU: publish_on(self, Imu, 'imu/data_raw'),
+            cdr.TEMPERATURE: publish_on(self, Temperature, 'imu/temperature')}
         self._node_time, self._last_clock_poll, self._last_problem = NodeTimeConverter(), 0.0, ''
         self._report = DriverReport(self._connection, values.port, self._settings,
                                     read_steady_clock)
@@ -123,21 +124,22 @@ class DriverNode(Node):
                     step = self._node_time.update(
                         *(read or (chunk.arrival, self._read_node_clock())))
                     if step and not self.get_parameter('use_sim_time').value:
-                        self._report.add_clock_step(step)
+                        self._report.add_clock_step(step, self._node_time.steps.count)
             self._report.add(chunk.samples)
             protocol, clock = self._connection.protocol, self._connection.clock
             assert protocol is not None and clock is not None  # they made the samples
-            self._messages.variance = protocol.sample_variance(self._settings)
+            self._variance = protocol.sample_variance(self._settings)
             stamps = [self._node_time.convert(stamp) for stamp in chunk.stamps]
             self._publish(self._decimation.add(chunk.samples, stamps, clock.period))
         self._publish(self._decimation.flush())
 
     def _publish(self, means: Iterable[SampleMean]) -> None:
         for mean in means:
-            self._messages.fill(mean)
-            if mean.sample.temperature is not None:
-                self._temperature.publish(self._messages.temperature)
-            self._imu.publish(self._messages.imu)
+            second, part = divmod(mean.stamp, 1.0)  # one product would lose 0.1 us
+            stamp = int(second) * NSEC_PER_SEC + round(part * NSEC_PER_SEC)
+            for kind, data in sample_messages(mean.sample, stamp, self._frame,
+                                              self._variance / mean.sample_count):
+                self._publishers_by_type[kind].publish(data)
 
     def _read_node_clock(self) -> float:
         """Return the time of the node, s; the system time before a simulation starts."""
@@ -169,8 +171,8 @@ class DriverReport:
     def __init__(self, connection: Connection, port: str, settings: Settings,
                  clock: Callable[[], float]):
         self._connection, self._port, self._settings = connection, port, settings
-        self._clock, self._last_counts, self._last_time = clock, ConnectionCounts(), clock()
-        self._rate, self._step_count, self._clock_steps, self.event = 0.0, 0, '0', ''
+        self._clock, self._last_counts, self._last_time = clock, Counts(), clock()
+        self._rate, self._clock_steps, self.event = 0.0, '0', ''
         self._new_counts: dict[str, int] = {}
         self._temperature: float | None = None
         self._health: dict[str, float] = {}
@@ -183,10 +185,9 @@ class DriverReport:
             if sample.temperature is not None:
                 self._temperature = sample.temperature
 
-    def add_clock_step(self, step: float) -> None:
-        """Count a step of the clock of the stamps, s."""
-        self._step_count += 1
-        self._clock_steps = f'{self._step_count}, last by {step:+.1f} s'
+    def add_clock_step(self, step: float, count: int) -> None:
+        """Add a step of the clock of the stamps, s, which is one of a number."""
+        self._clock_steps = f'{count}, last by {step:+.1f} s'
         self.event = f'the clock of this computer was set by {step:+.1f} s; the stamps follow it'
 
     def clear(self) -> None:
@@ -194,7 +195,7 @@ class DriverReport:
         self._temperature, self._health = None, {}
 
     def make(self) -> Report:
-        counts, now, connection = self._connection.counts(), self._clock(), self._connection
+        counts, now, connection = replace(self._connection.counts), self._clock(), self._connection
         elapsed = now - self._last_time
         if elapsed >= 0.5:
             self._new_counts = {name: count - getattr(self._last_counts, name)
@@ -239,36 +240,6 @@ class DriverReport:
             **{name: f'{value:.4g}' for name, value in self._health.items()},
             'last_event': self.event,
         }
-
-
-class SampleMessages:
-    """Reusable messages of samples; `variance` is that of the rate of one sample, (rad/s)²."""
-
-    def __init__(self, frame_id: str):
-        self.imu, self.temperature, self.variance = Imu(), Temperature(), 0.0
-        self.imu.header.frame_id = self.temperature.header.frame_id = frame_id
-        self.imu.orientation_covariance[:] = NOT_REPORTED_COVARIANCE
-        self.imu.angular_velocity_covariance[:] = z_axis_covariance(0.0)
-        self._has_force: bool | None = None
-
-    def fill(self, mean: SampleMean) -> None:
-        """Set both messages to a sample, or a mean of several."""
-        imu, sample = self.imu, mean.sample
-        second, part = divmod(mean.stamp, 1.0)  # one product would lose 0.1 us
-        sec, nanosec = divmod(int(second) * NSEC_PER_SEC + round(part * NSEC_PER_SEC),
-                              NSEC_PER_SEC)
-        for header in (imu.header, self.temperature.header):
-            header.stamp.sec, header.stamp.nanosec = sec, nanosec
-        imu.angular_velocity.z = sample.output
-        imu.angular_velocity_covariance[8] = self.variance / mean.sample_count
-        if sample.temperature is not None:
-            self.temperature.temperature = sample.temperature
-        force = sample.specific_force
-        imu.linear_acceleration.z = force or 0.0
-        if (force is not None) is not self._has_force:
-            self._has_force = force is not None
-            imu.linear_acceleration_covariance[:] = z_axis_covariance(
-                ASSUMED_FORCE_NOISE ** 2) if self._has_force else NOT_REPORTED_COVARIANCE
 
 
 def settings_from_parameters(values: SimpleNamespace) -> Settings:

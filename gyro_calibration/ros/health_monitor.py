@@ -17,8 +17,6 @@ model, and the mean rate against zero. The levels of both tests follow from a st
 alarms.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 import math
@@ -216,16 +214,13 @@ class HealthMonitor:
         self._noise, self.standstill_rate = noise, standstill_rate
         # Four tests: noise and bias, upwards and downwards.
         self._level = 0.25 * false_alarm_rate * REST_DURATION / 3600.0
+        self.is_enabled = noise.angle_random_walk > 0.0 and self._level > 0.0
         self._samples: list[tuple[float, float, float]] = []
         self._rests: list[_RestResult] = []
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
         self.last_rest: _RestResult | None = None
         self.examined_count, self.has_noise_at_rest = 0, False
-
-    @property
-    def is_enabled(self) -> bool:
-        return self._noise.angle_random_walk > 0.0 and self._level > 0.0
 
     def restart(self) -> None:
         """Discard the samples so far, as after a gap."""

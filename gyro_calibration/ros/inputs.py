@@ -9,23 +9,30 @@
 # under the License.
 
 """
-What a node takes from outside, without rclpy: parameters, clocks, and the motion of the wheels.
+What a node takes from outside, without rclpy: signals, parameters, clocks, motion of the wheels.
 
 Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
 ROS time, which may be paused. The motion is that of odometry and commands of the last second.
 """
-
-from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 import math
 import reprlib
+import signal
 from types import SimpleNamespace
-from typing import Protocol
+from typing import Any, Protocol
 
 from gyro_calibration.calibration.self_calibration import RunLimits
+
+
+def handle_end_signals(handler: Any) -> dict[int, Any]:
+    """Handle Ctrl-C, SIGTERM and, but for nohup, a lost terminal; return the handlers before."""
+    return {number: signal.signal(number, handler)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN}
+
 
 _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
                                 str: 'text', list: 'a list of strings'}
@@ -259,15 +266,12 @@ class TurnComparison:
 
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
+        self.is_contradictory = False
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
         self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
-
-    @property
-    def is_contradictory(self) -> bool:
-        return self._contradictions > 1
 
     @property
     def turn_at_rest(self) -> tuple[float, float, float]:
@@ -311,6 +315,7 @@ class TurnComparison:
                         and (source == ODOMETRY or self.ratio * rate > confused)
                         or source == ODOMETRY and self.ratio < -0.5)
             self._contradictions = is_wrong * (self._contradictions + 1)
+            self.is_contradictory = self._contradictions > 1
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
 
@@ -331,10 +336,7 @@ class AlternateTurns:
         self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
         # difference over sum in turns of a row, their last sense, and how often it changed
         self._share, self._sense, self._changes = math.nan, 0.0, 0
-
-    @property
-    def is_contradictory(self) -> bool:
-        return self._changes > 1
+        self.is_contradictory = False
 
     def add(self, time: float, rate: float) -> None:
         """Add a sample, s and rad/s."""
@@ -358,6 +360,7 @@ class AlternateTurns:
                 share = math.nan
             is_alike = abs(share - self._share) <= allowed * abs(share)
             self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
+            self.is_contradictory = self._changes > 1
             self._share, self._sense = self._share if is_alike else share, total
         elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
             return

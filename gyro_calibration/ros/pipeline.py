@@ -20,8 +20,6 @@ one part is at most half of it. Two such intervals while the graph lists several
 proof. The graph alone is not, since it lists a killed driver for up to 20 s.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -91,7 +89,6 @@ PARAMETERS = (
                   'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
-_MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits for seconds
 _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
@@ -247,11 +244,11 @@ class Pipeline:
             self._heading_at_rest = heading
         # A late message is not used, and a contradictory one does not show standstill.
         if (not self._last_time - time > MAX_VELOCITY_AGE
-                and (velocity.is_moving or not self.odometry_fault)):
+                and (velocity.is_moving or not self._is_odometry_contradictory)):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
             self._compare_turns(ODOMETRY, time, rate,
-                                not velocity.is_moving and not self.odometry_fault)
+                                not velocity.is_moving and not self._is_odometry_contradictory)
             self.session.add_odometry(time, heading, rate)
 
     def _compare_turns(self, source: str, time: float, rate: float, stands: bool = False) -> None:
@@ -278,38 +275,39 @@ class Pipeline:
         return self.estimator.heading_before_resets + self.estimator.tracker.heading
 
     @property
-    def stamp_fault(self) -> str:
-        turned = self._stamp_delay.unknown_turn
-        return (f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
-                'imu/data_raw advanced faster or slower for a time than before: check that the '
-                'driver stamps by a clock and loses no samples, then reset the heading'
-                if turned > MIN_TURN_ANGLE else '')
+    def _is_odometry_contradictory(self) -> bool:
+        return self._clock.steady() - self._contradiction_time <= 600.0  # s
 
     @property
-    def odometry_fault(self) -> str:
-        if self._clock.steady() - self._contradiction_time > 600.0:  # s
-            return ''
-        return ('odom turns by its headings while its rate is zero: check its twist, without '
-                'which it does not show that the robot stands')
-
-    @property
-    def turn_fault(self) -> str:
-        turns = self._turns
-        return (f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check the '
-                f'unit and the sense of rotation of the gyro, and those of {turns.source}'
-                if turns.is_contradictory else '')
-
-    @property
-    def alternation_fault(self) -> str:
-        return ('every other sample on imu/data_raw shows another turn, as with two gyros on one '
-                'topic: give each gyro a topic of its own'
-                if self._alternate_turns.is_contradictory else '')
-
-    @property
-    def standstill_fault(self) -> str:
-        return (f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
-                'the robot stands: unless others turn it, call calibrate_bias, or check odom'
-                if self._false_turn[1] else '')
+    def faults(self) -> dict[str, str]:
+        """Return the faults of clocks, frames and turns, each a sentence or '', by name."""
+        turned, turns = self._stamp_delay.unknown_turn, self._turns
+        found = {
+            'clock': (self.clock_fault, self.clock_fault),
+            'frame': (self._frame != self._first_frame, to_printable(
+                f"the samples on imu/data_raw have the frame '{self._frame!s:.99}', and had "
+                f"'{self._first_frame!s:.99}': the calibration may be that of another gyro; "
+                'restart this node, and calibrate another gyro')),
+            'alternation': (self._alternate_turns.is_contradictory,
+                            'every other sample on imu/data_raw shows another turn, as with two '
+                            'gyros on one topic: give each gyro a topic of its own'),
+            'turn': (turns.is_contradictory,
+                     f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check '
+                     'the unit and the sense of rotation of the gyro, and those of '
+                     f'{turns.source}'),
+            'stamp': (turned > MIN_TURN_ANGLE,
+                      f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
+                      'imu/data_raw advanced faster or slower for a time than before: check that '
+                      'the driver stamps by a clock and loses no samples, then reset the heading'),
+            'odometry': (self._is_odometry_contradictory,
+                         'odom turns by its headings while its rate is zero: check its twist, '
+                         'without which it does not show that the robot stands'),
+            'standstill': (self._false_turn[1],
+                           f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom '
+                           'shows that the robot stands: unless others turn it, call '
+                           'calibrate_bias, or check odom')}
+        return {name: sentence if is_present else ''
+                for name, (is_present, sentence) in found.items()}
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel, also one of this node."""
@@ -330,7 +328,8 @@ class Pipeline:
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
-        if not max(0, -self._stamp_offset) <= stamp < _MAX_ROS_TIME - max(0, self._stamp_offset):
+        end = NSEC_PER_SEC << 31  # `builtin_interfaces/Time` has 31 bits for seconds
+        if not max(0, -self._stamp_offset) <= stamp < end - max(0, self._stamp_offset):
             counts['refused_samples'] += 1
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')
@@ -386,15 +385,6 @@ class Pipeline:
                                          run is not None and run.kind == REST)
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
-
-    @property
-    def frame_fault(self) -> str:
-        if self._frame == self._first_frame:
-            return ''
-        return to_printable(
-            f"the samples on imu/data_raw have the frame '{self._frame:.99}', and had "
-            f"'{self._first_frame:.99}': the calibration may be that of another gyro; restart "
-            'this node, and calibrate another gyro')
 
     def _detect_several_gyros(self, stamp: int, frame: str, now: float, silence: float) -> None:
         """Detect stamps that jump back, frames that alternate, and samples that interleave."""
@@ -546,8 +536,9 @@ class Pipeline:
         now = self._clock.steady()
         if self.ros_time.paused_duration > FAULT_DURATION:
             return ROS_TIME_PAUSED
+        faults = self.faults
         if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
-                or self.clock_fault or self.frame_fault or self.alternation_fault):
+                or faults['clock'] or faults['frame'] or faults['alternation']):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
@@ -584,7 +575,8 @@ class Pipeline:
         if added > 0.01 * tracker.variance:  # else the deviation changes by less than 0.5 %
             tracker.add_unknown_turn(math.sqrt(added))
             self._stamp_turn = unknown
-        if self.clock_fault or self.frame_fault or self.turn_fault or self.alternation_fault:
+        faults = self.faults
+        if any(faults[name] for name in ('clock', 'frame', 'turn', 'alternation')):
             tracker.add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):

@@ -15,15 +15,13 @@ A subscription requests the offered QoS: best effort publishers are received, an
 lose nothing. Publishers may start late, stop, and start again with another QoS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import importlib
 import os
 import threading
 import time
 
-from gyro_calibration.driver.timestamps import read_steady_clock
+from gyro_calibration.driver.timestamps import read_date_offset, read_steady_clock
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.recording import topic_type_fault
@@ -55,7 +53,7 @@ class RecorderNode(Node):
         self.message_count = 0
         self._on_message = on_message
         self._taken: dict[str, Subscription] = {}  # topics
-        self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
+        self._clock_offset = read_date_offset()
         self.poll()
         call_every(self, 0.3, self.poll)
 

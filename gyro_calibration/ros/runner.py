@@ -19,8 +19,6 @@ destroyed. The handlers of rclpy invalidate the context while a callback still p
 ends some runs in a traceback.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 import faulthandler
@@ -30,7 +28,7 @@ import threading
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gyro_calibration.ros.inputs import NodeParameter, parameter_values
+from gyro_calibration.ros.inputs import handle_end_signals, NodeParameter, parameter_values
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 import rclpy
@@ -57,8 +55,6 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Longest time of the shutdown of a node, s; then it is killed.
 SHUTDOWN_TIMEOUT = 10.0
-#: Of a user, of a system that ends, and of a terminal or a connection that is lost.
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values by name
@@ -111,13 +107,12 @@ def declare_parameters(
         if on_change and any(each.name in known for each in given):
             on_change(read_values())
 
+    overrides = node._parameter_overrides
     for each in table:
-        # first with any type: rclpy refuses 100 for 100.0, with a message of several sentences
+        # not by rclpy, which refuses 100 for 100.0, with a message of several sentences
         default = (each.default if isinstance(each.default, (bool, int, float, str))
                    else list(each.default))
-        given = node.declare_parameter(each.name, default,
-                                       ParameterDescriptor(dynamic_typing=True)).value
-        node.undeclare_parameter(each.name)
+        given = overrides[each.name].value if each.name in overrides else default
         descriptor = ParameterDescriptor(
             description=each.description + (f' Unit: {each.unit}.' if each.unit else ''),
             read_only=not each.dynamic, additional_constraints=each.choices_text,
@@ -182,9 +177,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
     standard error.
     """
     stop = threading.Event()
-    for number in _SIGNALS:
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # not by nohup
-            signal.signal(number, lambda *_: stop.set())
+    handle_end_signals(lambda *_: stop.set())
     try:
         try:
             rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
@@ -206,8 +199,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
     finally:
         rclpy.try_shutdown()
         # A launch file sends SIGINT twice; the second would kill the interpreter at its exit.
-        for number in _SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
+        handle_end_signals(signal.SIG_IGN)
 
 
 def spin(node: Node, stop: threading.Event) -> None:

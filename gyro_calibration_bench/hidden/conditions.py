@@ -22,8 +22,6 @@ between, `heldrate` and `linesrate` rates; `lost` is a heading that is repeated 
 up to 2 s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
@@ -99,11 +97,10 @@ LOOK_ALIKES: Mapping[tuple[str, str], LookAlikes] = {
 
 
 def hide_look_alike(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *,
-                    multiple: float | None = None, noise: str = 'white',
                     duration: float = 900.0, sample_rate: float = 50.0) -> HiddenLog:
     """Hide one of a pair of `LOOK_ALIKES` where it cannot be distinguished, as `hide` does."""
     twins = LOOK_ALIKES[pair]
-    return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration,
+    return hide([hidden], twins.multiple, generator, noise='white', duration=duration,
                 sample_rate=sample_rate, figures=twins.figures,
                 conditions=twins.confounding_conditions, fixed_parts=twins.fixed_parts,
                 against_a_model=twins.needs_model)[0]

@@ -18,8 +18,6 @@ on the finished output ('output'), on the reference ('reference'), on single sam
 on the unit ('unit'), on the noise ('noise').
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
@@ -81,11 +79,10 @@ def _draw_phase(sessions: list[Session], generator: np.random.Generator) -> Shap
     return {'phase': generator.uniform(-math.pi, math.pi)}
 
 
-def _time_constant_drawer(low: float,
-                          high: float) -> Callable[[list[Session], np.random.Generator], Shapes]:
+def _time_constant_drawer(high: float) -> Callable[[list[Session], np.random.Generator], Shapes]:
     def draw(sessions: list[Session], generator: np.random.Generator) -> Shapes:
         duration = sessions[0].time[-1]
-        return {'time_constant': _log_uniform(generator, low * duration, high * duration)}
+        return {'time_constant': _log_uniform(generator, 0.03 * duration, high * duration)}
     return draw
 
 
@@ -104,10 +101,10 @@ def temperature_rate(session: Session) -> np.ndarray:
     return np.gradient(session.temperature, session.interval)
 
 
-def thermal_branch(session: Session, threshold: float = 5e-4) -> np.ndarray:
-    """Return +1 while heating, -1 while cooling; below the threshold, K/s, the last; 0 before."""
+def thermal_branch(session: Session) -> np.ndarray:
+    """Return +1 while heating, -1 while cooling; below 5e-4 K/s the last; 0 before."""
     speed = temperature_rate(session)
-    known = np.where(np.abs(speed) > threshold, np.arange(len(speed)), -1)
+    known = np.where(np.abs(speed) > 5e-4, np.arange(len(speed)), -1)
     last = np.maximum.accumulate(known)
     return np.where(last < 0, 0.0, np.sign(speed[np.maximum(last, 0)]))
 
@@ -184,12 +181,12 @@ FORMS: Mapping[str, EffectForm] = {
         lambda session, w, shapes: temperature_rate(session), 'rad/s/(K/s)'),
     'thermal_lag': EffectForm(
         lambda session, w, shapes: lag(session.temperature, session.interval, shapes[
-            'time_constant']) - session.temperature, 'rad/s/K', _time_constant_drawer(0.03, 0.3)),
+            'time_constant']) - session.temperature, 'rad/s/K', _time_constant_drawer(0.3)),
     'thermal_hysteresis': EffectForm(
         lambda session, w, shapes: thermal_branch(session), 'rad/s'),
     'warm_up': EffectForm(
         lambda session, w, shapes: np.exp(-session.time / shapes['time_constant']), 'rad/s',
-        _time_constant_drawer(0.03, 0.35)),
+        _time_constant_drawer(0.35)),
     'rate_ramp': EffectForm(lambda session, w, shapes: session.time, 'rad/s²'),
     'bias_step': EffectForm(
         lambda session, w, shapes: (session.time >= shapes['step_time']).astype(float), 'rad/s',

@@ -10,8 +10,6 @@
 
 """Random conditions of a gyro during a recording: motion, temperature, supply, tilt, vibration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

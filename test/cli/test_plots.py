@@ -16,7 +16,7 @@ from functools import cache
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import compute_turn_errors, fit_effects, MIN_TURN_RATE
 from gyro_calibration.cli.plots import (
-    draw_headings, draw_reference, draw_residuals, draw_turn_errors)
+    draw_headings, draw_residuals, draw_turn_errors)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 import numpy as np
@@ -64,7 +64,10 @@ def draw_drive(path):
 
 def draw_encoder(path):
     time = np.linspace(0.0, 10.0, 50)
-    return draw_reference(path, time, 3.0 * np.sin(time), 0.01 * time, 1e-4 * np.sin(5.0 * time))
+    true = 3.0 * np.sin(time)
+    return draw_headings(path, time, true, {
+        'not calibrated': true + 0.01 * time, 'calibrated': true + 1e-4 * np.sin(5.0 * time)},
+        'course over ground', is_apart=True)
 
 
 PICTURES = {

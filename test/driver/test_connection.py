@@ -192,7 +192,7 @@ def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     reading = Reading(world, 'csv')
     # tried at 8, 8.1, 8.3, 8.7, 9.5
     assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)
-    assert reading.connection.counts().lost_samples == 0
+    assert reading.connection.counts.lost_samples == 0
 
 
 def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps():
@@ -202,7 +202,7 @@ def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps()
     world = World(8.0)
     world.send(iter(sent), rate=1000.0)
     reading = Reading(world, 'kvh_1750')
-    counts = reading.connection.counts()
+    counts = reading.connection.counts
     numbers = np.round([1e4 * sample.output for sample in reading.samples])
     assert counts.lost_samples == numbers[-1] - numbers[0] + 1 - counts.samples > 100
     assert all(chunk.stamps[-1] <= chunk.arrival for chunk in reading.chunks)

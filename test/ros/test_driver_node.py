@@ -22,16 +22,18 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from gyro_calibration.driver.connection import Connection, SampleMean
+from gyro_calibration.driver.connection import Connection, sample_messages, SampleMean
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
+from gyro_calibration.logs import cdr
 from gyro_calibration.ros.compensation_node import CompensationNode
 from gyro_calibration.ros.driver_node import (
-    DriverNode, DriverReport, PARAMETERS, SampleMessages, settings_from_parameters)
+    DriverNode, DriverReport, PARAMETERS, settings_from_parameters)
 from gyro_calibration.ros.inputs import parameter_values
 from gyro_calibration.ros.runner import ERROR, OK, WARN
 from rclpy.clock import ClockType
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
 
 KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
@@ -59,33 +61,40 @@ def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
 
 # Messages
 
-def filled(sample, size=1):
-    messages = SampleMessages('my_gyro')
-    messages.variance = 1e-4
-    messages.fill(SampleMean(1_700_000_000.25, sample, size))
-    return messages
+def received(sample, kind=Imu, variance=1e-4):
+    """Return a message of a sample as a subscriber receives it."""
+    kinds = {Imu: cdr.IMU, Temperature: cdr.TEMPERATURE}
+    messages = dict(sample_messages(sample, 1_700_000_000_250_000_000, 'my_gyro', variance))
+    return deserialize_message(messages[kinds[kind]], kind)
 
 
 def test_a_message_holds_the_rate_about_z_and_marks_what_is_not_measured():
     """REP-145: element 0 is -1 for a quantity that is not reported; x and y get no weight."""
-    imu = filled(Sample(0.5)).imu
+    imu = received(Sample(0.5))
     assert (imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z) == (
         0.0, 0.0, 0.5)
-    assert imu.orientation_covariance[0] == imu.linear_acceleration_covariance[0] == -1.0
+    assert list(imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
+    assert imu.orientation_covariance[0] == -1.0 and imu.linear_acceleration.z == 0.0
     assert list(imu.angular_velocity_covariance) == [1e6, 0, 0, 0, 1e6, 0, 0, 0, 1e-4]
     assert (imu.header.frame_id, imu.header.stamp.sec, imu.header.stamp.nanosec) == (
         'my_gyro', 1_700_000_000, 250_000_000)
-    # ten samples have a tenth of the variance; the variance of a temperature is not known
-    messages = filled(Sample(0.5, -12.25, specific_force=9.81), 10)
-    assert messages.imu.angular_velocity_covariance[8] == pytest.approx(1e-5)
-    assert messages.temperature.header == messages.imu.header
-    assert (messages.temperature.temperature, messages.temperature.variance) == (-12.25, 0.0)
-    assert messages.imu.linear_acceleration.z == 9.81
-    assert list(messages.imu.linear_acceleration_covariance) == pytest.approx(
+    # the variance of a temperature is not known
+    sample = Sample(0.5, -12.25, specific_force=9.81)
+    imu, temperature = received(sample), received(sample, Temperature)
+    assert temperature.header == imu.header
+    assert (temperature.temperature, temperature.variance) == (-12.25, 0.0)
+    assert imu.linear_acceleration.z == 9.81
+    assert list(imu.linear_acceleration_covariance) == pytest.approx(
         [1e6, 0, 0, 0, 1e6, 0, 0, 0, 0.01])
-    messages.fill(SampleMean(0.0, Sample(0.5), 1))
-    assert messages.imu.linear_acceleration.z == 0.0
-    assert list(messages.imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
+
+
+def test_the_mean_of_ten_samples_has_a_tenth_of_the_variance_of_one(hold_node):
+    held = hold_node(DriverNode, {'port': '/nonexistent/gyro'})
+    held.node._variance = 1e-4
+    held.node._publish([SampleMean(1_700_000_000.25, Sample(0.5), 10)])
+    imu = held.sent['/imu/data_raw'][-1]
+    assert imu.angular_velocity_covariance[8] == pytest.approx(1e-5)
+    assert imu.header.stamp.nanosec == 250_000_000
 
 
 # Diagnostics
@@ -176,9 +185,9 @@ def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of(given, is_warn
 def test_steps_of_the_clock_are_counted():
     world = World(5.0)
     world.gyro('csv')
-    steps = iter([3600.0, -7200.0])
-    reports = reported(world, 'csv',
-                       monitored=lambda report, _: [report.add_clock_step(step) for step in steps])
+    steps = iter([(3600.0, 1), (-7200.0, 2)])
+    reports = reported(
+        world, 'csv', monitored=lambda report, _: [report.add_clock_step(*step) for step in steps])
     _, _, values = reports[-1]
     assert values['clock_steps'] == '2, last by -7200.0 s'
     assert values['last_event'].startswith('the clock of this computer was set by -7200.0 s')
@@ -269,9 +278,9 @@ def test_a_mistyped_parameter_is_named_and_the_end_of_its_terminal_ends_a_node_a
 BROKEN = """
 import sys
 from gyro_calibration.ros import driver_node
-def fill(self, mean):
+def fail(*_):
     raise ZeroDivisionError('as if there were a fault in the program')
-driver_node.SampleMessages.fill = fill
+driver_node.sample_messages = fail
 sys.exit(driver_node.main())
 """
 

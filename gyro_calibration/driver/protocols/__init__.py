@@ -20,15 +20,14 @@ records. No port, no ROS and no clock is used here.
 [Sample(output=-0.00027459265121626786, ...)]
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 
-from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
+from gyro_calibration.driver.protocols.protocol import (
+    Counts, Decoder, Protocol, Sample, Settings)
 from gyro_calibration.files import suggest_nearest
 
-__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings',
+__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Counts', 'Decoder', 'Protocol', 'Sample', 'Settings',
            'find_protocol', 'recognize_protocol']
 
 #: The formats by name.
@@ -40,11 +39,7 @@ AUTO = 'auto'  # name that stands for recognition by listening
 #: Bits per second, in order of the attempts: first the defaults of gyros, then others.
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 
-_MAX_BYTES = 8192  # number of last bytes that are used, which limits the cost
 _MIN_FRAMES = 3  # least number of frames; fewer may be chance
-_MIN_EXPLAINED_SHARE = 0.5  # least share of the bytes in frames; a line may damage the rest
-_MIN_IDENTICAL_SHARE = 0.95  # least share where all frames are equal: zeros may pass a weak check
-_AMBIGUITY_RATIO = 0.8  # the result is ambiguous if another format has this times the best share
 
 
 def find_protocol(name: str) -> Protocol:
@@ -62,7 +57,7 @@ def recognize_protocol(data: bytes, settings: Settings) -> Protocol | None:
     The settings may be incomplete for the recognized format. `csv` is recognized by the number of
     their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
     """
-    data, scores = data[-_MAX_BYTES:], []
+    data, scores = data[-8192:], []
     for protocol in PROTOCOLS.values():  # the share of the bytes in frames, and these frames
         splitter, parse = protocol.splitter(), protocol.parser(settings)
         found = splitter.feed(data)
@@ -74,6 +69,7 @@ def recognize_protocol(data: bytes, settings: Settings) -> Protocol | None:
             explained = sum(map(len, good)) / (received - begun)
         scores.append((explained, good, protocol))
     (share, frames, best), (next_share, *_) = sorted(scores, key=lambda each: -each[0])[:2]
-    least = _MIN_EXPLAINED_SHARE if len(set(frames)) >= _MIN_FRAMES else _MIN_IDENTICAL_SHARE
+    # a line may damage half of the bytes; of equal frames, as zeros may pass a weak check, 5 %
+    least = 0.5 if len(set(frames)) >= _MIN_FRAMES else 0.95
     return best if (len(frames) >= _MIN_FRAMES and share >= least
-                    and next_share < _AMBIGUITY_RATIO * share) else None
+                    and next_share < 0.8 * share) else None

@@ -48,7 +48,6 @@ from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')
-_ALL_VALID = 0x77
 _REVERSED_BITS = bytes(int(f'{byte:08b}'[::-1], 2) for byte in range(256))
 
 
@@ -69,7 +68,7 @@ def _parse(frame: bytes, settings: Settings) -> Reading:
 
 def _write(value: float, sample: Sample, settings: Settings) -> bytes:
     axis = 'xyz'.index(settings.axis)
-    rotation, acceleration, status = [0.0] * 3, [0.0] * 3, _ALL_VALID
+    rotation, acceleration, status = [0.0] * 3, [0.0] * 3, 0x77  # all valid
     rotation[axis] = value
     if sample.specific_force is None:
         status &= ~(1 << 4 + axis)

@@ -43,8 +43,6 @@ ASSUMED_FORCE_NOISE = 0.1
 #: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
-_MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -60,6 +58,18 @@ class Sample:
     specific_force: float | None = None  # m/s², along the input axis
     #: Further values, by names with units: ``supply_v``, ``source_current_a``.
     health: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Counts:
+    """Counts of a connection since its start."""
+
+    samples: int = 0
+    lost_samples: int = 0
+    refused_samples: int = 0  # not finite, or beyond full scale
+    refused_temperatures: int = 0  # not finite, or beyond the range of any sensor
+    device_faults: int = 0  # samples that the gyro marks as invalid
+    discarded_bytes: int = 0  # outside of frames
 
 
 @dataclass(frozen=True)
@@ -103,13 +113,6 @@ def to_signed_count(value: float, bits: int = 16) -> int:
     return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
 
 
-#: Parses a frame to a reading, or None if it is not valid; may use earlier frames.
-_ParseFrame = Callable[[bytes], 'Reading | None']
-#: Makes the bytes that an emulated device sends of a value, in its unit, and the further values
-#: of a sample; may use earlier samples. The sequence counts from 0 and never wraps.
-_WriteFrame = Callable[[float, Sample], bytes]
-
-
 def stateless(convert: Callable[..., _OutputT]) -> Callable[[Settings], Callable[..., _OutputT]]:
     """Return the `Protocol.parser` or `writer` of a format with independent frames."""
     return lambda settings: lambda *given: convert(*given, settings)
@@ -132,11 +135,6 @@ class Splitter:
         """Return the frames that these bytes complete."""
         raise NotImplementedError
 
-    def reset(self) -> None:
-        """Discard an incomplete frame: the next bytes do not continue it."""
-        self._discard(len(self._tail))
-        self._tail, self._skipped_bytes = b'', 0
-
     def _discard(self, count: int) -> None:
         self.discarded_bytes += count
         self._skipped_bytes += count
@@ -158,8 +156,12 @@ class Protocol:
     #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    parser: Callable[[Settings], _ParseFrame]  # makes that of one connection
-    writer: Callable[[Settings], _WriteFrame]  # makes that of one device
+    #: Makes the parser of one connection: a frame to a reading, or None if it is not valid; it
+    #: may use earlier frames.
+    parser: Callable[[Settings], Callable[[bytes], Reading | None]]
+    #: Makes the writer of one device: a value in its unit and the further values of a sample,
+    #: whose sequence counts from 0 and never wraps, to bytes; it may use earlier samples.
+    writer: Callable[[Settings], Callable[[float, Sample], bytes]]
     invert: bool = False  # whether the device counts clockwise turns positive
     full_scale: float = math.radians(2000.0)  # rad/s
     largest_count: int | None = None  # times the sensitivity it is the full scale
@@ -182,9 +184,9 @@ class Protocol:
                              'rad/s of one count, which its data sheet gives')
         self.check(settings)
 
-    def decoder(self, settings: Settings | None = None) -> Decoder:
-        """Return a decoder for one connection, or raise as `check_settings` does."""
-        return Decoder(self, settings or Settings())
+    def decoder(self, settings: Settings | None = None, counts: Counts | None = None) -> Decoder:
+        """Return a decoder for one opening of a port, or raise as `check_settings` does."""
+        return Decoder(self, settings or Settings(), counts or Counts())
 
     def encoder(self, settings: Settings | None = None) -> Callable[[Sample], bytes]:
         """Return ``encode(sample)``: the bytes of a device, which saturates at full scale."""
@@ -212,7 +214,8 @@ class Protocol:
     def sample_rate_warning(self, settings: Settings, period: float) -> str:
         """Return a warning if angles come at another period, s, than that of the sample rate."""
         rate = self.nominal_rate(settings)
-        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MAX_RATE_DEVIATION:
+        # the clocks of gyros are 2 to 3 % off
+        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= 0.05:
             return ''
         return (f'the gyro sends {1.0 / period:.0f} samples per second, but angles are converted '
                 f'to rates by {rate:g}: set sample_rate')
@@ -246,42 +249,40 @@ class Decoder:
 
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
-    The counts are those of `ConnectionCounts`.
+    What is refused and discarded is added to the counts.
     """
 
-    def __init__(self, protocol: Protocol, settings: Settings):
+    def __init__(self, protocol: Protocol, settings: Settings, counts: Counts):
         protocol.check_settings(settings)
         self._splitter = protocol.splitter()
         self._parser = partial(protocol.parser, settings)
         self._parse = self._parser()
         self._factor = protocol.unit_scale(settings)
         self._limit = protocol.effective_full_scale(settings)
-        self._refused_bytes, self._has_sample = 0, False
-        self._skipped_bytes, self._refused_frames = 0, 0
-        self.device_faults = self.refused_samples = self.refused_temperatures = 0
-
-    @property
-    def discarded_bytes(self) -> int:
-        return self._splitter.discarded_bytes + self._refused_bytes
+        self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, False
+        self.counts = counts
 
     def feed(self, data: bytes) -> list[Sample]:
         """Return the samples that these bytes complete, the oldest first."""
-        samples, (coldest, hottest) = [], PLAUSIBLE_TEMPERATURES
-        for frame in self._splitter.feed(data):
+        samples, (coldest, hottest), counts = [], PLAUSIBLE_TEMPERATURES, self.counts
+        discarded = self._splitter.discarded_bytes
+        frames = self._splitter.feed(data)
+        counts.discarded_bytes += self._splitter.discarded_bytes - discarded
+        for frame in frames:
             if frame.skipped_bytes:
                 self._parse = self._parser()  # the previous frame is not adjacent
                 self._skipped_bytes += frame.skipped_bytes
             reading = self._parse(frame.data)
             if reading is None:
-                self._refused_bytes += len(frame.data)
+                counts.discarded_bytes += len(frame.data)
                 self._skipped_bytes += len(frame.data)
                 continue
             if reading.value is None:
                 continue
             output = reading.value * self._factor
             if not (reading.valid and abs(output) <= self._limit):
-                self.device_faults += not reading.valid
-                self.refused_samples += reading.valid
+                counts.device_faults += not reading.valid
+                counts.refused_samples += reading.valid
                 self._refused_frames += 1
                 continue
             missing = (self._refused_frames + round(self._skipped_bytes / len(frame.data))
@@ -289,17 +290,11 @@ class Decoder:
             self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True
             temperature = reading.temperature
             if temperature is not None and not coldest <= temperature <= hottest:
-                self.refused_temperatures += 1
+                counts.refused_temperatures += 1
                 temperature = None
             samples.append(Sample(output, temperature, reading.time, reading.sequence, missing,
                                   reading.specific_force, reading.health))
         return samples
-
-    def reset(self) -> None:
-        """Discard an incomplete frame, as after a loss of the port; the counts are kept."""
-        self._splitter.reset()
-        self._parse = self._parser()
-        self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, False
 
 
 #: A finite number in text: `float` also takes nan, inf and 1_0.
@@ -338,10 +333,6 @@ class LineSplitter(Splitter):
             self._discard(len(tail))
             self._tail, self._is_too_long = b'', True
         return whole
-
-    def reset(self) -> None:
-        super().reset()
-        self._has_line_start = self._is_too_long = False
 
 
 class FrameSplitter(Splitter):

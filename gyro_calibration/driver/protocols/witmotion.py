@@ -36,7 +36,6 @@ from gyro_calibration.logs.columns import STANDARD_GRAVITY
 
 _FORCE_PER_COUNT = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
 _ACCELERATION, _RATE = 0x51, 0x52
-_NUMBERS = struct.Struct('<2x4h')
 
 
 class _Parser:
@@ -47,7 +46,7 @@ class _Parser:
         self._force: float | None = None
 
     def __call__(self, frame: bytes) -> Reading:
-        numbers = _NUMBERS.unpack_from(frame)
+        numbers = struct.unpack_from('<2x4h', frame)
         if frame[1] == _ACCELERATION:
             self._force = numbers[self._axis] * _FORCE_PER_COUNT
         if frame[1] != _RATE:
