@@ -23,9 +23,10 @@ from dataclasses import replace
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
-from gyro_calibration.diagnosis.causes import NOISE_NAMES
+from gyro_calibration.diagnosis.causes import add_remedies, NOISE_NAMES
 from gyro_calibration.diagnosis.data_quality import DataQuality
-from gyro_calibration.diagnosis.findings import Change, Curve, Finding, Gain
+from gyro_calibration.diagnosis.findings import (
+    Change, Curve, Diagnosis, Finding, Gain, NOT_OFFERED)
 from gyro_calibration.diagnosis.regression import fit_causes, is_single_event, RegressionFit
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import restrict_search, Search, search_causes
@@ -80,10 +81,7 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     figures = figures if given.noise.angle_random_walk else noise
     bounds = {name: ends for name, ends in given.noise_bounds.items()
               if getattr(figures, name) == getattr(given.noise, name)}
-    used = {term.effect.name for term in new.terms if term not in given.terms}
-    notes = ambiguity_notes([each for each in findings if each.effect in used])
-    return replace(new, noise=figures, noise_bounds=bounds,
-                   origin={**notes, **previous_origins(given)})
+    return replace(new, noise=figures, noise_bounds=bounds, origin=previous_origins(given))
 
 
 def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> GyroModel:
@@ -128,11 +126,19 @@ def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
         temperature_range=widen_range(model.temperature_range, temperatures, has_ranges))
 
 
-def ambiguity_notes(findings: Sequence[Finding]) -> dict[str, object]:
-    """Return the note on ambiguous findings for a model file."""
+def complete_diagnosis(found: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with its findings in order, each with a remedy, and the model's notes."""
+    findings = add_remedies(
+        sorted(found.findings, key=lambda each: (each.status != 'established', each.p_value)),
+        found.heading_shares, found.model)
+    new = {term.effect.name for term in found.model.terms if term not in found.before.terms}
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
-            for each in findings if each.ambiguous_with]
-    return {'ambiguous': sets} if sets else {}
+            for each in findings if each.ambiguous_with and each.effect in new]
+    model = (replace(found.model, origin={'ambiguous': sets, **found.model.origin}) if sets
+             else found.model)
+    is_worse = found.gain is not None and found.gain.is_worse
+    return replace(found, findings=tuple(findings), model=model,
+                   remarks=(*found.remarks, *[NOT_OFFERED] * is_worse))
 
 
 def previous_origins(model: GyroModel) -> dict[str, object]:

@@ -285,10 +285,19 @@ class RegressionFit:
         """Return the scale factor error relative to the simulation, 1."""
         return self._column_value(-1, 0)
 
+    def coefficient_estimates(self, cause_index: int) -> tuple[Array, Array]:
+        """Return the values of the columns of a cause, and covariance; 0 for those left out."""
+        owners = [(cause_index, number) for number in range(self.column_counts[cause_index])]
+        ranks = np.array([self.column_owners.index(each) if each in self.column_owners else -1
+                          for each in owners], dtype=np.intp)
+        values, covariance = self.estimates
+        return np.append(values, 0.0)[ranks], np.pad(covariance, (0, 1))[np.ix_(ranks, ranks)]
+
     def coefficients(self, cause_index: int) -> list[Value]:
         """Return the values of the columns of a cause."""
-        return [self._column_value(cause_index, number)
-                for number in range(self.column_counts[cause_index])]
+        values, covariance = self.coefficient_estimates(cause_index)
+        deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return list(map(Value, values.tolist(), deviations.tolist()))
 
     def shapes(self, cause_index: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""

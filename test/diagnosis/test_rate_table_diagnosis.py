@@ -104,7 +104,7 @@ def test_a_parabola_over_temperature_stays_where_its_slope_is_withdrawn():
     slope = STATIC_EFFECTS['bias_temperature']
     assert {slope, STATIC_EFFECTS['bias_temperature_quadratic']} <= set(found.fit.effects)
     withdrawn = diagnosis._name_causes(dwells, None, [slope])
-    assert STATIC_EFFECTS['bias_temperature_quadratic'] in withdrawn.causes
+    assert STATIC_EFFECTS['bias_temperature_quadratic'] in withdrawn.without
 
 
 # sets, and what separates them
