@@ -33,7 +33,7 @@ from gyro_calibration.diagnosis.causes import (
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, complete_diagnosis, drop_samples, extend_model, heading_contributions,
-    heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
+    heading_curve, heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
     unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
     Diagnosis, Estimate, Finding, Gate, MIN_PROBABILITY, OnProgress, Reference, TIME_LIMIT_REMARK,
@@ -49,8 +49,7 @@ from gyro_calibration.diagnosis.regression import (
     SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
-    allan_curves, find_changed_figures, fit_noise_parameters, heading_error_curve, model_residuals,
-    residual_curves)
+    allan_curves, find_changed_figures, fit_noise_parameters, model_residuals, residual_curves)
 from gyro_calibration.diagnosis.search import (
     complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
     refine_shape, Search, search_causes, Selection, start_search)
@@ -246,7 +245,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      (*_unexplained_structures(search, found, selection.unnamed),
                       *searched.unexplained), noise, simulated, gain, before, after,
                      _untestable_causes(search, logs, searched.hidden),
-                     residual_curves(left, shown), heading_error_curve(left, shown),
+                     residual_curves(left, shown), heading_curve(
+                         *heading_contributions(shown, 0, None if changed else plain)),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, model),
                       *searched.remarks, *[TIME_LIMIT_REMARK] * bool(time_is_up)), rate,

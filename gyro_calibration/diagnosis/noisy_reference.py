@@ -40,7 +40,7 @@ from gyro_calibration.diagnosis.causes import (
     untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    add_terms, gain_from_squares, heading_curve, heading_error_shares, HEADING_WINDOW,
+    add_terms, gain_from_errors, heading_curve, heading_error_shares, HEADING_WINDOW,
     MAX_WINDOW_SHARE, previous_origins, window_changes)
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress, Reference,
@@ -311,7 +311,7 @@ def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
     if delay_finding is None:
         return after
     size = delay_finding.parameters['time_offset']
-    return add_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
+    return add_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))], [0],
                      np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
 
 
@@ -321,26 +321,22 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log,
     own = 1.0 + sum(
         term.values[0] for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in fit.values[:2])
-    terms, rows = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
-    slopes = [1.0, 1.0]
+    terms, indices = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
+    slopes = np.ones(len(fit.values))
     for cause in fit.causes:
         if cause.cause in CATALOGUE.keys() - {*left_out}:
             places = fit.value_slice(cause)
             shapes, values = cause.shapes, fit.values[places].tolist()
-            # shapes, as the last row, have no variance
             of_term = [*(-1 for _ in shapes), *range(places.start, places.stop)]
             if cause.cause == SINE_RESPONSE.name:
                 # the shape instead of the amplitude
-                shape, slope = _shape_of_sine(cause, values[0])
+                shape, slopes[places] = _shape_of_sine(cause, values[0])
                 shapes, values, of_term = (shape,), [1.0], [places.start, -1]
-                slopes += [slope, 0.0]
             terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
-            rows += of_term
-            slopes += [1.0] * (len(rows) - len(slopes))
-    covariance = (np.pad(fit.normal_covariance, (0, 1))[np.ix_(rows, rows)]
-                  * np.outer(slopes, slopes))
+            indices += of_term
     assert log.output is not None
-    new = add_terms(base_model, terms, covariance, [log.output[np.isfinite(log.output)]],
+    new = add_terms(base_model, terms, indices, fit.normal_covariance * np.outer(slopes, slopes),
+                    [log.output[np.isfinite(log.output)]],
                     [] if log.temperature is None else [log.temperature])
     return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
 
@@ -387,8 +383,7 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
               'plain': (design_matrix(spans, ()), noisy.design),
               'extended': (design_matrix(extended.spans, extended.causes),
                            whiten_regression(extended, extended.causes, plain).design)}
-    squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
-    counts: list[tuple[int, int]] = []
+    errors = []
     for part in range(parts):
         held = np.flatnonzero(number == part)
         # whitened observations across the borders of the part are left out
@@ -396,17 +391,16 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
         if len(held) < 4 or len(kept) < 8:
             return None
         rows = np.append(kept, len(spans.observed) + np.arange(prior))
+        stamps, of_part = time[held[0]:held[-1] + 2], {}
         for name, (columns, white) in models.items():
             values = np.linalg.lstsq(white[rows], noisy.observed[rows], rcond=None)[0]
             left = (spans.observed - columns @ values[:columns.shape[1]])[held]
-            stamps = time[held[0]:held[-1] + 2]
-            turned = window_changes(left, stamps, window)
-            squares[name].append((float(np.sum((left / np.diff(stamps)) ** 2)),
-                                  float(np.sum(turned ** 2))))
-        counts.append((len(left), len(turned)))
-    return gain_from_squares(f'each of {parts} parts of the log in turn, the others being '
-                             'fitted', squares,
-                             counts, 'given', window) if np.all(counts) else None
+            of_part[name] = left / np.diff(stamps), window_changes(left, stamps, window)
+        if not len(of_part['given'][1]):
+            return None
+        errors.append(of_part)
+    return gain_from_errors(f'each of {parts} parts of the log in turn, the others being fitted',
+                            errors, 'given', window)
 
 
 # for people

@@ -165,7 +165,6 @@ class RegressionFit:
     # and 0 for the scale factor error
     column_owners: tuple[tuple[int, int], ...]
     column_counts: tuple[int, ...]  # number of columns with free values of each cause
-    lacks_columns: bool  # whether some columns depend on others, and are left out
     # information, scores: of the columns under each noise, shapes (g, q, q) and (g, q)
     information: Array
     scores: Array
@@ -459,7 +458,7 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
     likelihood = -0.5 * ((len(left) - len(rows) + 1) * np.log(squares) + determinants)
     return RegressionFit(problem, distorted, causes, rows,
                          tuple(owners[place] for place in kept[:-1]), tuple(widths),
-                         len(rows) <= len(owners), information, scores, squares, likelihood)
+                         information, scores, squares, likelihood)
 
 
 @lru_cache(maxsize=32)

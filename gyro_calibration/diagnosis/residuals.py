@@ -346,14 +346,6 @@ def _amplitude_spectrum(before: Sequence[Array], after: RegressionFit) -> Curve:
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual)
 
 
-def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Curve:
-    """Return the heading error over the first log, by its residual before and after extension."""
-    each = after.problem.replays[0]
-    lines = [np.cumsum(each.resample(left[0])) * each.point_interval
-             for left in (before, after.unbiased_residuals)]
-    return Curve('time', 's', np.arange(each.point_count) * each.point_interval, *lines)
-
-
 def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> Curve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
     each = fit.problem.replays[0]

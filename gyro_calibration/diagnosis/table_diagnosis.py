@@ -36,7 +36,7 @@ from gyro_calibration.diagnosis.causes import (
     Cause, cause_finding, CAUSES, REFERENCES, sized_finding, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    complete_diagnosis, gain_from_squares, HEADING_WINDOW, previous_origins, widen_range)
+    complete_diagnosis, gain_from_errors, HEADING_WINDOW, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
 from gyro_calibration.diagnosis.gates import check_gates, mismatch_diagnosis, refuse_unusable
@@ -147,14 +147,13 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, withdrawn: fr
     known = np.isfinite(errors['extended'])
     if not known.any():
         return None
-    part_numbers = np.unique(parts[known], return_inverse=True)[1]
     what = 'sweeps' if len(np.unique(dwells.sweep)) >= MIN_SWEEPS else 'consecutive dwells'
     # the heading error of a turn over the window at the rate of a dwell
-    squares = {name: np.outer(np.bincount(part_numbers, error[known] ** 2),
-                              [1.0, HEADING_WINDOW ** 2]) for name, error in errors.items()}
-    return gain_from_squares(f'{what} left out, each of {count} groups in turn',
-                             squares, np.outer(np.bincount(part_numbers), [1, 1]),
-                             'plain' if model is None else 'given', HEADING_WINDOW)
+    of_parts = [{name: (error[rows], HEADING_WINDOW * error[rows])
+                 for name, error in errors.items()}
+                for rows in (known & (parts == part) for part in np.unique(parts[known]))]
+    return gain_from_errors(f'{what} left out, each of {count} groups in turn', of_parts,
+                            'plain' if model is None else 'given', HEADING_WINDOW)
 
 
 def _outlier_findings(fit: Calibration) -> Iterator[Finding]:
@@ -189,8 +188,9 @@ class _NamedCauses:
            withdrawn: Collection[Effect] = ()) -> _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
+        level = VALUE_ALARM_SHARE * FALSE_ALARM_RATE
         causes = [each for each in fit.effects if each not in BASIC_EFFECTS
-                  or model is not None and fit.p_value(each) < VALUE_ALARM_SHARE * FALSE_ALARM_RATE]
+                  or model is not None and fit.p_value(each) < level]
         values = {term.effect: term.values for term in fit.terms}
         if {BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC} <= values.keys():
             # If a parabola over temperature has its vertex near the measured ones, the slope is
