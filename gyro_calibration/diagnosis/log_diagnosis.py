@@ -9,7 +9,7 @@
 # under the License.
 
 
-"""The diagnosis of time-sampled logs: its steps in order."""
+"""The diagnosis of logs and rate tables: its steps in order."""
 
 from __future__ import annotations
 
@@ -55,6 +55,8 @@ from gyro_calibration.diagnosis.search import (
     refine_shape, Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.significance import (
     DETECTION_POWER, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
+from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
+from gyro_calibration.diagnosis.words import is_model_extended
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
@@ -86,7 +88,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
 
     Parameters
     ----------
-    logs : of one gyro, with time, and with a reference unless the gyro is at rest
+    logs : of one gyro, with time, and with a reference unless the gyro is at rest; or a single
+        rate table
     generator : source of the noise that fills gaps
     model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
         best
@@ -100,8 +103,15 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : a diagnosis of these logs is not possible
 
     """
-    on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
+    if any(log.time is None for log in logs):
+        if len(logs) > 1:
+            raise DataRefused(
+                f'{len(logs)} logs were given, and one has no time_s; give a rate table alone, '
+                'or give the sample rate in Hz with --rate')
+        found = replace(diagnose_table(logs[0], model, on_progress), logs=tuple(names))
+        return _keep_unextended_model(found, given_model)
+    on_progress(None, 'checks of the log')
     all_gates: list[Gate] = []
     for log in logs:
         require_output(log)
@@ -143,14 +153,18 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                 references, reference_kind == 'rate_command')
         finally:
             forget_fits()
-    if given_model is not None and found.model is model:
-        # with its self-calibration separate
-        found = replace(found, before=given_model, model=given_model)
+    found = _keep_unextended_model(found, given_model)
     findings = found.findings if len(logs) > 1 else mark_parts_of_log(found.findings)
     return complete_diagnosis(replace(
         found, logs=tuple(names), gates=tuple(all_gates),
         findings=(*findings, *(each for each in slips if each is not None)),
         remarks=(*dict.fromkeys(remarks), *found.remarks)))
+
+
+def _keep_unextended_model(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
+    """Return a diagnosis with the model as it was given, if it is not extended."""
+    return (found if model is None or is_model_extended(found)
+            else replace(found, before=model, model=model))
 
 
 def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding | None]:
