@@ -192,7 +192,7 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
 def _term_of_cause(fit: RegressionFit, cause_index: int) -> Term:
     candidate = fit.causes[cause_index]
     effect = CATALOGUE[candidate.cause]
-    coefficients = ([one.value for one in fit.coefficients(cause_index)]
+    coefficients = (fit.coefficients(cause_index)[0].tolist()
                     or [candidate.amplitude or 0.0][:len(effect.coefficients)])
     return Term(effect, (*candidate.shapes, *coefficients))
 

@@ -33,8 +33,8 @@ from gyro_calibration.diagnosis.causes import (
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, complete_diagnosis, drop_samples, extend_model, heading_contributions,
-    heading_curve, heading_error_shares, is_scale_implausible, measure_gain, merge_self_calibration,
-    unmergeable_causes)
+    heading_curve, heading_error_shares, is_scale_implausible, measure_gain,
+    merge_self_calibration, unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
     Diagnosis, Estimate, Finding, Gate, MIN_PROBABILITY, OnProgress, Reference, TIME_LIMIT_REMARK,
     Unexplained)
@@ -502,7 +502,7 @@ def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidenc
     elif name == 'reference_slip':
         fields['where'] = min(known.shapes[1:]), max(known.shapes[1:])
         shapes |= slip_times(known.shapes[1:])
-    parameters = cause_parameters(name, *fit.coefficient_estimates(cause_index), shapes)
+    parameters = cause_parameters(name, *fit.coefficients(cause_index), shapes)
     size = next(iter(parameters.values()))
     is_sample = name == 'time_offset' and is_sample_offset(size.estimate, size.deviation,
                                                            replays[0].interval)

@@ -284,19 +284,13 @@ class RegressionFit:
         """Return the scale factor error relative to the simulation, 1."""
         return self._column_value(-1, 0)
 
-    def coefficient_estimates(self, cause_index: int) -> tuple[Array, Array]:
+    def coefficients(self, cause_index: int) -> tuple[Array, Array]:
         """Return the values of the columns of a cause, and covariance; 0 for those left out."""
         owners = [(cause_index, number) for number in range(self.column_counts[cause_index])]
         ranks = np.array([self.column_owners.index(each) if each in self.column_owners else -1
                           for each in owners], dtype=np.intp)
         values, covariance = self.estimates
         return np.append(values, 0.0)[ranks], np.pad(covariance, (0, 1))[np.ix_(ranks, ranks)]
-
-    def coefficients(self, cause_index: int) -> list[Value]:
-        """Return the values of the columns of a cause."""
-        values, covariance = self.coefficient_estimates(cause_index)
-        deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return list(map(Value, values.tolist(), deviations.tolist()))
 
     def shapes(self, cause_index: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""
@@ -321,7 +315,7 @@ class RegressionFit:
                     or not self.is_included(place)):
                 continue
             values = ([known.amplitude] if known.amplitude is not None
-                      else [one.value for one in self.coefficients(place)])
+                      else self.coefficients(place)[0].tolist())
             for value, column in zip(values, known.columns(new)):
                 found[known.cause] = found.get(known.cause, 0.0) + value * column
         if replay.command is not None or len(replay.shared_errors):

@@ -228,8 +228,8 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
         # those of fixed amplitude that grow with their shapes begin with that of a free amplitude
         if candidate.cause in ('sine_response', 'time_offset', 'bandwidth', 'clock_rate'):
             free = replace(candidate, cause='column', amplitude=None)
-            ratio = fit_causes(fit.problem, [*fit.causes, free]).coefficients(
-                len(fit.causes))[0].value
+            ratio = float(fit_causes(fit.problem, [*fit.causes, free]).coefficients(
+                len(fit.causes))[0][0])
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
@@ -642,11 +642,14 @@ def _remove_unconfirmed(search: Search, causes: Causes,
     while causes:
         fit, sigmas = fit_causes(search.problem, causes), []
         for place, (known, held_out) in enumerate(zip(causes, held_out_sigmas(search, causes))):
-            sizes = fit.coefficients(place) or list(fit.shapes(place).values())
+            values, covariance = fit.coefficients(place)
+            sizes = [(one.value, one.deviation) for one in fit.shapes(place).values()]
+            if len(values):
+                sizes = [*zip(values.tolist(), np.sqrt(np.diag(covariance)).tolist())]
             # sine or cosine alone may be 0 for a wave that is not
             is_wave = len(sizes) == 2 and known.cause != 'reference_slip'
-            size = (math.inf if is_wave or not sizes or not sizes[0].deviation
-                    else abs(sizes[0].value) / sizes[0].deviation)
+            size = (math.inf if is_wave or not sizes or not sizes[0][1]
+                    else abs(sizes[0][0]) / sizes[0][1])
             sigmas.append(min(held_out / MIN_PREDICTION_SIGMAS, size / NORMAL_QUANTILE_975))
         weakest = int(np.argmin(sigmas))
         if sigmas[weakest] > 1.0:

@@ -61,9 +61,9 @@ _METHOD_TEXT = (
     'dwells and sweeps was estimated by restricted likelihood about a smooth surface. An effect '
     'was taken if it predicts left-out sweeps better and is improbable by chance: of tables '
     'without any cause, {share:.2g} % give an alarm. It is established, and in the model, if it '
-    'predicts them better beyond the scatter between sweeps. Then curves over rate, temperature and the '
-    'order of the dwells were tested on the residual. The reduction of the error was measured on '
-    'held-out sweeps; intervals are of 95 %.')
+    'predicts them better beyond the scatter between sweeps. Then curves over rate, temperature '
+    'and the order of the dwells were tested on the residual. The reduction of the error was '
+    'measured on held-out sweeps; intervals are of 95 %.')
 
 
 def diagnose_table(table: Log | Dwells, model: GyroModel | None,
