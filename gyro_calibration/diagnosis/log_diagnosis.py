@@ -39,8 +39,8 @@ from gyro_calibration.diagnosis.findings import (
     Diagnosis, Estimate, Finding, Gate, MIN_PROBABILITY, OnProgress, Reference, TIME_LIMIT_REMARK,
     Unexplained)
 from gyro_calibration.diagnosis.gates import (
-    check_gates, check_model_units, classify_reference, is_at_rest,
-    is_reference_limiting, is_sample_offset, mismatch_diagnosis, refuse_unusable)
+    classify_reference, examine_log, is_at_rest, is_reference_limiting, is_sample_offset,
+    mismatch_diagnosis)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference, follows_rate, HIDDEN_CAUSES, is_late)
@@ -122,14 +122,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     given, remarks = logs, [remark for each in chosen for remark in each]
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
-        passed = check_gates(log, model, reference_kind == 'rate_command')
-        mismatch = mismatch_diagnosis(passed, given_model)
-        if mismatch is None or passed[-1].name != 'wrapped_heading':
-            refuse_unusable(given[place])
-        if mismatch is None and model is not None:
-            passed = (*passed, check_model_units(log, model))
-            mismatch = mismatch_diagnosis(passed, given_model)
-        if mismatch is not None:
+        passed = examine_log(log, model, reference_kind == 'rate_command', given[place])
+        if (mismatch := mismatch_diagnosis(passed, given_model)) is not None:
             return replace(mismatch, logs=tuple(names[place:place + 1]))
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]

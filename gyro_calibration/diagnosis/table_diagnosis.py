@@ -39,7 +39,7 @@ from gyro_calibration.diagnosis.extended_model import (
     complete_diagnosis, gain_from_errors, HEADING_WINDOW, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
-from gyro_calibration.diagnosis.gates import check_gates, mismatch_diagnosis, refuse_unusable
+from gyro_calibration.diagnosis.gates import examine_log, mismatch_diagnosis
 from gyro_calibration.diagnosis.significance import (
     DETECTION_POWER, MIN_PREDICTION_SIGMAS, prediction_sigmas, SEARCH_ALARM_SHARE,
     VALUE_ALARM_SHARE)
@@ -85,11 +85,10 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     on_progress(0.0, 'search for causes')
     dwells = table if isinstance(table, Dwells) else dwells_from_table(table)
     log = Log(output=dwells.output, reference_rate=dwells.rate, temperature=dwells.temperature)
-    refuse_unusable(log, model)
+    gates = examine_log(log, model)
     if not np.ptp(dwells.rate) > 0.0:
         raise DataRefused('all dwells have one rate, which does not separate scale factor and '
                           'bias; record several rates, both ways')
-    gates = check_gates(log)
     if (mismatch := mismatch_diagnosis(gates, model)) is not None:
         return mismatch
     record = inspect_record(log, model)
