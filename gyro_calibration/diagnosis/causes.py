@@ -184,18 +184,11 @@ def cause_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
                   observed: Mapping[str, float] | None = None, sigmas: float = math.nan,
                   confounders: Sequence[str] = (), **fields: Any) -> Finding:
     """
-    Return the finding of a cause that was searched for.
+    Return the finding of a cause that was searched for; its first parameter is its size.
 
-    Parameters
-    ----------
-    name, parameters, p_value : of the cause; the first parameter is its size
-    deficits : what it and its alternatives lack in log-likelihood, the best first
-    is_established : whether it is confirmed
-    observed : numbers for the next experiment, by `observed_range`; None for none
-    sigmas : smallest detectable size in standard deviations
-    confounders : other causes that these data cannot rule out
-    fields : of the finding, in place of those that follow from the others
-
+    Given are also what it and its alternatives lack in log-likelihood, the best first, other
+    confounders, the numbers of `observed_range` for the next experiment, the smallest detectable
+    size in standard deviations, and fields of the finding in place of those that follow from it.
     """
     size, others = next(iter(parameters.values())), {**deficits}
     others.pop(name, None)
