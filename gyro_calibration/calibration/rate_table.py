@@ -254,11 +254,16 @@ class Calibration:
         slope = GyroModel(self.terms).output_slope(channels_of(self.dwells))
         return np.asarray(self.dwells.rate + self.left_out_residual / slope)
 
-    def cross_validation_misfit(self) -> float:
-        """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
+    @property
+    def left_out_squares(self) -> Array:
+        """Return the mean squared error of each left-out sweep, in dwell variances, (parts,)."""
         parts = cross_validation_parts(self.used)
         squares = (self.left_out_residual / self.deviation)[self.scatter.inliers] ** 2
-        return float(np.mean(sum_by_part(squares, parts) / np.bincount(parts)))
+        return np.asarray(sum_by_part(squares, parts) / np.bincount(parts))
+
+    def cross_validation_misfit(self) -> float:
+        """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
+        return float(np.mean(self.left_out_squares))
 
 
 def channels_of(dwells: Dwells, temperature: float = math.nan) -> Channels:

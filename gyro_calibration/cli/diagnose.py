@@ -23,14 +23,12 @@ import time
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress
-from gyro_calibration.diagnosis.extended_model import merge_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis, OnProgress
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
-from gyro_calibration.diagnosis.words import is_model_extended, terminal_lines
-from gyro_calibration.files import InputError, write_atomically
+from gyro_calibration.diagnosis.words import terminal_lines
+from gyro_calibration.files import write_atomically
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import format_model, read_model
@@ -74,7 +72,7 @@ def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind:
                   on_progress: OnProgress = lambda share, words: None,
                   time_limit: float | None = None) -> Diagnosis:
     """
-    Diagnose logs in time, or a rate table; a model that is not extended is unchanged.
+    Diagnose logs in time, or a rate table.
 
     The search for causes ends after half of a time limit, s, as what follows may take as long.
     """
@@ -84,16 +82,8 @@ def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind:
         on_progress(share, words)
         return time_limit is not None and time.monotonic() - begin > 0.5 * time_limit
 
-    table = any(log.time is None for log in logs)
-    if table and len(logs) > 1:
-        raise InputError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
-                         'alone, or give the sample rate in Hz with --rate')
-    found = (diagnose_table(logs[0], None if model is None else merge_self_calibration(model),
-                            on_progress=on_step)
-             if table else diagnose(logs, np.random.default_rng(seed), model, names=names,
-                                    on_progress=on_step, reference_kind=kind))
-    return (found if model is None or is_model_extended(found)
-            else replace(found, before=model, model=model))
+    return diagnose(logs, np.random.default_rng(seed), model, names=names, on_progress=on_step,
+                    reference_kind=kind)
 
 
 def write_diagnosis(folder: str | Path, found: Diagnosis) -> list[str]:

@@ -12,7 +12,8 @@
 Diagnosis: what a simulation of a gyro gets wrong, why, and what extending its model improves.
 
 Reading order, each imports only from those before it: `findings` (what is found, as records),
-`causes` (that can be named, and experiments that distinguish them), `gates` (which logs are
+`significance` (the rules by which causes are named), `causes` (that can be named, and experiments
+that distinguish them), `gates` (which logs are
 refused, whether gyro and reference belong together, and the kind of the reference), `data_quality`
 (of a record: lost, repeated and outlying samples, codes and limits), `replay` (of a log, and the
 spectrum of its noise), `candidates` (columns of causes, and of what has no name), `regression` (of

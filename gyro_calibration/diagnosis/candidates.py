@@ -158,14 +158,19 @@ def constant_channels(replays: Sequence[Replay]) -> frozenset[str]:
                      and max(float(np.ptp(value)) for value in values) < MIN_CHANNEL_RANGE[name])
 
 
-def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
-    """Return rate, temperature and duration of proposed experiments, deg/s, degC and min."""
-    numbers = {'long': 4.0 * math.ceil(max(each.duration for each in replays) / 60.0)}
-    top = max(float(np.quantile(np.abs(each.channels.rate), 0.999)) for each in replays) / DEGREE
+def observed_range(rates: Sequence[Array], temperatures: Sequence[Array],
+                   duration: float) -> dict[str, float]:
+    """
+    Return rate, temperature and duration of proposed experiments, deg/s, degC and min.
+
+    Given are those of the logs, rad/s, degC and s; no temperatures if they are not known.
+    """
+    numbers = {'long': 4.0 * math.ceil(duration / 60.0)}
+    top = max(float(np.quantile(np.abs(each), 0.999)) for each in rates) / DEGREE
     if top > 0.0:
         numbers |= {'top': top, 'faster': 3.0 * top}
-    if all('temperature' in each.available_channels for each in replays):
-        degc = np.concatenate([each.channels.temperature for each in replays])
+    if temperatures:
+        degc = np.concatenate(temperatures)
         # at least 20 K
         middle, half = 0.5 * (degc.max() + degc.min()), max(0.5 * float(np.ptp(degc)), 10.0)
         numbers |= {'low': float(middle - half), 'high': float(middle + half)}

@@ -22,10 +22,14 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from gyro_calibration.diagnosis.findings import Estimate, Finding, RULED_OUT_DEFICIT
-from gyro_calibration.logs.log import NORMAL_QUANTILE_975
+from gyro_calibration.diagnosis.findings import Estimate, Finding
+from gyro_calibration.diagnosis.significance import (
+    detectable_sigmas, probabilities, RULED_OUT_DEFICIT)
+from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE, Effect
 from gyro_calibration.model.gyro_model import GyroModel
+import numpy as np
+from scipy.stats import t as student
 
 #: Either of these serves as a reference.
 REFERENCES = ('reference_rate', 'reference_heading')
@@ -142,6 +146,10 @@ def untestable_causes(testable: Collection[str], missing: Collection[str],
     return found
 
 
+#: Least p-value of a test; one of 0 is of what the samples themselves show.
+_LEAST_CHANCE = 1e-300
+
+
 def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
                  confounders: Sequence[str] = (), **fields: Any) -> Finding:
     """Return a finding of a cause, with the fields of the cause as defaults."""
@@ -157,6 +165,81 @@ def sized_finding(name: str, value: float, half_width: float, p_value: float,
     """Return a finding of a cause by its size and the half-width of the interval, in SI."""
     size = Estimate.from_half_width(float(value), half_width, CAUSES[name].unit)
     return make_finding(name, {name: size}, p_value, confounders, **fields)
+
+
+def value_finding(name: str, value: float, deviation: float, level: float,
+                  confounders: Sequence[str] = (), freedom: float = math.inf,
+                  max_half_width: float = math.inf, **fields: Any) -> Finding | None:
+    """Return a finding of a value, with Student's distribution, if it differs from 0."""
+    chance = 2.0 * float(student.sf(abs(value) / deviation, freedom)) if deviation > 0.0 else 1.0
+    if chance >= level:
+        return None
+    half = min(float(student.ppf(0.975, freedom)) * deviation, max_half_width)
+    return sized_finding(name, value, half, max(chance, _LEAST_CHANCE), confounders,
+                         minimum_detectable=detectable_sigmas(level) * deviation, **fields)
+
+
+def cause_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
+                  deficits: Mapping[str, float], is_established: bool = True,
+                  observed: Mapping[str, float] | None = None, sigmas: float = math.nan,
+                  confounders: Sequence[str] = (), **fields: Any) -> Finding:
+    """
+    Return the finding of a cause that was searched for; its first parameter is its size.
+
+    Given are also what it and its alternatives lack in log-likelihood, the best first, other
+    confounders, the numbers of `observed_range` for the next experiment, the smallest detectable
+    size in standard deviations, and fields of the finding in place of those that follow from it.
+    """
+    size, others = next(iter(parameters.values())), {**deficits}
+    others.pop(name, None)
+    confounders = tuple(dict.fromkeys((*others, *confounders)))
+    usual: dict[str, Any] = {'probability': probabilities({name: 0.0, **deficits})}
+    if size.deviation > 0.0:
+        usual |= {'minimum_detectable': sigmas * size.deviation,
+                  'evidence': f'{abs(size.estimate) / size.deviation:.3g} sigma from zero'}
+    experiment = '' if observed is None else next_experiment(name, [*others.items()], observed)
+    if experiment:
+        usual['separate_by'] = experiment
+    found = make_finding(name, parameters, max(p_value, _LEAST_CHANCE), confounders,
+                         **{**usual, **fields})
+    return found if is_established else mark_suspected(found)
+
+
+def cause_parameters(name: str, coefficients: Array, covariance: Array,
+                     shapes: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """
+    Return the parameters of a cause, first the one with its name.
+
+    Those of sine and cosine are amplitude and phase. Given are the coefficients of its columns,
+    (k,), their covariance, by which normal intervals hold 95 %, and its fitted shapes.
+    """
+    effect = CATALOGUE.get(name)
+    own = () if effect is None else effect.coefficients
+    unit = own[0].unit if own else CAUSES[name].units.get(name, '1')
+    half = NORMAL_QUANTILE_975 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if len(own) > 1 and [each.name for each in own] != ['sine', 'cosine']:
+        found = {each.name: Estimate.from_half_width(value, within, each.unit)
+                 for each, value, within in zip(own, coefficients.tolist(), half.tolist())}
+    elif len(coefficients) == 2 and name != 'reference_slip':
+        sine, cosine = coefficients.tolist()
+        amplitude = math.hypot(sine, cosine)
+        rotation = np.array([[sine, cosine], [-cosine, sine]]) / amplitude
+        half = NORMAL_QUANTILE_975 * np.sqrt(np.diag(rotation @ covariance @ rotation.T))
+        found = {name: Estimate.from_half_width(amplitude, float(half[0]), unit),
+                 'phase': Estimate.from_half_width(math.atan2(cosine, sine),
+                                                   float(half[1]) / amplitude, 'rad')}
+    else:
+        found = {}
+        if len(coefficients):
+            found[name] = Estimate.from_half_width(float(coefficients[0]), float(half[0]), unit)
+    for shape, size in shapes.items():
+        found[shape if found else name] = size
+    return found
+
+
+def slip_times(times: Iterable[float]) -> dict[str, Estimate]:
+    """Return the times of slips of a reference, s, as parameters."""
+    return {f'slip_time_{place}': Estimate(at, (at, at), 's') for place, at in enumerate(times)}
 
 
 def mark_suspected(found: Finding) -> Finding:

@@ -23,9 +23,10 @@ from dataclasses import replace
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
-from gyro_calibration.diagnosis.causes import NOISE_NAMES
+from gyro_calibration.diagnosis.causes import add_remedies, NOISE_NAMES
 from gyro_calibration.diagnosis.data_quality import DataQuality
-from gyro_calibration.diagnosis.findings import Change, Curve, Finding, Gain
+from gyro_calibration.diagnosis.findings import (
+    Change, Curve, Diagnosis, Finding, Gain, NOT_OFFERED)
 from gyro_calibration.diagnosis.regression import fit_causes, is_single_event, RegressionFit
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import restrict_search, Search, search_causes
@@ -35,7 +36,7 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 from scipy.stats import t as student
 
 #: Effects with a reference value -> the effect that compensates a change of that value.
@@ -80,10 +81,7 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     figures = figures if given.noise.angle_random_walk else noise
     bounds = {name: ends for name, ends in given.noise_bounds.items()
               if getattr(figures, name) == getattr(given.noise, name)}
-    used = {term.effect.name for term in new.terms if term not in given.terms}
-    notes = ambiguity_notes([each for each in findings if each.effect in used])
-    return replace(new, noise=figures, noise_bounds=bounds,
-                   origin={**notes, **previous_origins(given)})
+    return replace(new, noise=figures, noise_bounds=bounds, origin=previous_origins(given))
 
 
 def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> GyroModel:
@@ -94,9 +92,9 @@ def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> G
     rates = [each.channels.rate[each.valid].mean() for each in fit.distorted]
     bias = np.mean(fit.biases) + (fit.scale_factor_error.value - scale) * np.mean(rates)
     terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
-    # of each value its index among the estimates; None for an exact one
+    # of each value its index among the estimates, after the bias; None for an exact one
     of_scale = fit.estimate_index(-1, 0)
-    ranks: list[int | None] = [None, None if implausible else of_scale]
+    ranks: list[int | None] = [None if implausible else of_scale]
     for place, known in enumerate(fit.causes):
         if known.cause in CATALOGUE and fit.is_included(place):
             terms.append(_term_of_cause(fit, place))
@@ -104,35 +102,44 @@ def add_causes(model: GyroModel, fit: RegressionFit, bias_deviation: float) -> G
             ranks += [
                 fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
                 for number in range(len(terms[-1].values))]
-    fitted = [number for number, rank in enumerate(ranks) if rank is not None]
-    chosen = [rank for rank in ranks if rank is not None]
-    term_covariance = np.zeros((len(ranks), len(ranks)))
-    term_covariance[np.ix_(fitted, fitted)] = fit.covariance[np.ix_(chosen, chosen)]
-    term_covariance[0, 0] = bias_deviation ** 2
     moves, replays = of_scale is not None and not implausible, fit.problem.replays
-    return add_terms(model, terms, term_covariance,
+    return add_terms(model, terms, [0, *(-1 if rank is None else 1 + rank for rank in ranks)],
+                     block_diag(bias_deviation ** 2, fit.covariance),
                      [each.channels.output[each.valid] + each.simulated_error[each.valid]
                       for each in replays if moves],
                      [each.channels.temperature[each.valid]
                       for each in replays if 'temperature' in each.available_channels])
 
 
-def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
+def add_terms(model: GyroModel, new: Sequence[Term], places: Sequence[int], covariance: Array,
               outputs: Sequence[Array], temperatures: Sequence[Array]) -> GyroModel:
-    """Return a model with more terms and their covariance, and ranges that include the logs."""
+    """
+    Return a model with more terms and their covariance, and ranges that include the logs.
+
+    Given are the place of each value of the terms in a covariance, -1 for an exact one; and the
+    outputs, rad/s, and temperatures, degC, of logs.
+    """
     has_ranges = bool(model.terms)
     return replace(
-        model, terms=_merge_terms(model.terms, new),
-        covariance=_extended_covariance(model, new, term_covariance),
+        model, terms=_merge_terms(model.terms, new), covariance=_extended_covariance(
+            model, new, np.pad(covariance, (0, 1))[np.ix_(places, places)]),
         rate_range=widen_range(model.rate_range, outputs, has_ranges),
         temperature_range=widen_range(model.temperature_range, temperatures, has_ranges))
 
 
-def ambiguity_notes(findings: Sequence[Finding]) -> dict[str, object]:
-    """Return the note on ambiguous findings for a model file."""
+def complete_diagnosis(found: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with its findings in order, each with a remedy, and the model's notes."""
+    findings = add_remedies(
+        sorted(found.findings, key=lambda each: (each.status != 'established', each.p_value)),
+        found.heading_shares, found.model)
+    new = {term.effect.name for term in found.model.terms if term not in found.before.terms}
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
-            for each in findings if each.ambiguous_with]
-    return {'ambiguous': sets} if sets else {}
+            for each in findings if each.ambiguous_with and each.effect in new]
+    model = (replace(found.model, origin={'ambiguous': sets, **found.model.origin}) if sets
+             else found.model)
+    is_worse = found.gain is not None and found.gain.is_worse
+    return replace(found, findings=tuple(findings), model=model,
+                   remarks=(*found.remarks, *[NOT_OFFERED] * is_worse))
 
 
 def previous_origins(model: GyroModel) -> dict[str, object]:
@@ -185,7 +192,7 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
 def _term_of_cause(fit: RegressionFit, cause_index: int) -> Term:
     candidate = fit.causes[cause_index]
     effect = CATALOGUE[candidate.cause]
-    coefficients = ([one.value for one in fit.coefficients(cause_index)]
+    coefficients = (fit.coefficients(cause_index)[0].tolist()
                     or [candidate.amplitude or 0.0][:len(effect.coefficients)])
     return Term(effect, (*candidate.shapes, *coefficients))
 
@@ -298,8 +305,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
         replace(fit_causes(reduced_search.problem, some), lasting_only=True)
         for some in ((), [each for each in named if each.cause == 'time_offset'], named))
     models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
-    squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
-    counts: list[tuple[int, int]] = []
+    parts = []
     for run, (each, block) in enumerate(zip(replays, blocks)):
         added = {name: 0.0 if found is None else
                  found.total_contribution(each, run) + found.biases[run]
@@ -309,35 +315,34 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
                        each.channels.output - each.reference - some)
                 for name, some in added.items()}
         for part in (block == place for place in np.unique(block[block >= 0])):
-            counts.append((int(np.count_nonzero(part)), 1))
-            for name, (of_rate, increments) in left.items():
-                turned = float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
-                squares[name].append((float(np.sum(of_rate[part] ** 2)), turned ** 2))
+            duration = np.ptp(each.channels.time[part])
+            parts.append({name: (of_rate[part], duration * increments[part].mean(keepdims=True))
+                          for name, (of_rate, increments) in left.items()})
     which = 'the log' if len(replays) == 1 else 'each log'
-    return gain_from_squares(f'every third {length:.3g} s of {which}, {len(counts)} '
-                             'parts', squares, counts, 'given' if has_model else 'straight',
-                             length)
+    return gain_from_errors(f'every third {length:.3g} s of {which}, {len(parts)} parts', parts,
+                            'given' if has_model else 'straight', length)
 
 
-def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: ArrayLike,
-                      before: str, window: float) -> Gain:
+def gain_from_errors(held_out: str, parts: Sequence[Mapping[str, tuple[Array, Array]]],
+                     before: str, window: float) -> Gain:
     """
     Return the gain on held-out parts.
 
     Parameters
     ----------
     held_out : description of the parts
-    squares : model -> sums of squares of the errors of rate and heading, shape (parts, 2)
-    counts : numbers of squares in the sums, shape (parts, 2)
+    parts : of each, model -> errors of the rate, rad/s, and of the heading, rad, shape (n,) each
     before : the model that the extended one is compared with
     window : over which the heading changes, s
 
     """
-    rate, heading = (jackknife_change(np.array([squares[before], squares['extended']])[:, :, k].T,
-                                      np.array(counts, float)[:, k]) for k in (0, 1))
-    whole = np.sum(counts, axis=0)[1]
+    counts = np.array([[float(len(each)) for each in part[before]] for part in parts])
+    squares = {name: np.array([[each @ each for each in part[name]] for part in parts])
+               for name in parts[0]}
+    rate, heading = (jackknife_change(np.column_stack(
+        [squares[name][:, k] for name in (before, 'extended')]), counts[:, k]) for k in (0, 1))
     return Gain(held_out, rate, heading, window,
-                {name: float(np.sqrt(np.sum(each, axis=0)[1] / whole))
+                {name: float(np.sqrt(each[:, 1].sum() / counts[:, 1].sum()))
                  for name, each in squares.items() if name != 'straight'})
 
 

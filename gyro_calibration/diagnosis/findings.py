@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-import math
 from typing import Any, ClassVar, TypeAlias
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
@@ -34,15 +33,6 @@ NOT_OFFERED = ('On the held-out parts, the errors of the extended model are larg
                'the model before; it is not offered.')
 #: Least probability that is stated; the assumptions on the noise do not justify smaller ones.
 MIN_PROBABILITY = 1e-4
-#: Ratio of the level at which a lasting cause is suspected to that at which it is established.
-SUSPECTED_RATE_FACTOR = 5.0
-#: Shares of the false-alarm rate: for the search for causes, and for each value or noise figure.
-SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE = 0.6, 0.05
-#: Probability that an effect of the minimum detectable size is found.
-DETECTION_POWER = 0.95
-#: Least deficit in log-likelihood, relative to the best cause, of a cause that is ruled out (2.5
-#: sigma).
-RULED_OUT_DEFICIT = 3.2
 
 
 class _Record:
@@ -94,13 +84,6 @@ class Estimate(_Record):
     def contains_zero(self) -> bool:
         """Return whether the interval includes zero."""
         return self.interval[0] <= 0.0 <= self.interval[1]
-
-
-def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
-    """Return the probabilities of causes by their deficits in log-likelihood, largest first."""
-    weights = {name: math.exp(-min(max(lack, 0.0), 700.0)) for name, lack in deficits.items()}
-    return {name: max(weight / sum(weights.values()), MIN_PROBABILITY)
-            for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
 
 
 @dataclass(frozen=True)

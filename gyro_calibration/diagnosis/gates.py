@@ -202,9 +202,9 @@ _MAX_TABLE_ROWS = 5000
 _MAX_DURATION = 1e8
 
 
-def refuse_unusable(log: Log, model: GyroModel | None = None) -> None:
+def refuse_unusable(log: Log) -> None:
     """
-    Raise for a log, or a model of it, that cannot be diagnosed.
+    Raise for a log that cannot be diagnosed.
 
     Raises
     ------
@@ -261,16 +261,6 @@ def refuse_unusable(log: Log, model: GyroModel | None = None) -> None:
             f'{100.0 * share:.4g} % of the samples: it is dead, or its quantization step '
             'exceeds all rates of the log; check it, and record again')
     _refuse_copy(log, output)
-    if model is not None and (problem := _unit_problem(log, model)):
-        raise DataRefused(problem)
-
-
-def check_model_units(log: Log, model: GyroModel) -> Gate:
-    """Check whether model and log have the same units."""
-    problem = _unit_problem(select_reference(log)[0], model)
-    evidence, _, remedy = problem.partition('; ')
-    return (Gate('model', False, evidence, remedy) if problem
-            else Gate('model', True, 'model and log have the same units'))
 
 
 def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
@@ -463,6 +453,25 @@ def check_gates(log: Log, model: GyroModel | None = None, is_command: bool = Fal
                             'with rests; otherwise give a reference of this motion, with stamps '
                             'of the same clock'))
     return (*results, failed)
+
+
+def examine_log(log: Log, model: GyroModel | None = None, is_command: bool = False,
+                given_log: Log | None = None) -> tuple[Gate, ...]:
+    """
+    Return the gates of a log and its model, up to the first that failed.
+
+    Raises `DataRefused` for a log that cannot be diagnosed, as it was given if that differs.
+    """
+    gates = check_gates(log, model, is_command)
+    have_passed = all(gate.passed is not False for gate in gates)
+    if have_passed or gates[-1].name != 'wrapped_heading':
+        refuse_unusable(log if given_log is None else given_log)
+    if have_passed and model is not None:
+        problem = _unit_problem(select_reference(log)[0], model)
+        evidence, _, remedy = problem.partition('; ')
+        gates += (Gate('model', False, evidence, remedy) if problem
+                  else Gate('model', True, 'model and log have the same units')),
+    return gates
 
 
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:

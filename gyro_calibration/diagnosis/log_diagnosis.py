@@ -9,13 +9,14 @@
 # under the License.
 
 
-"""The diagnosis of time-sampled logs: its steps in order."""
+"""The diagnosis of logs and rate tables: its steps in order."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
@@ -27,19 +28,19 @@ from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected, next_experiment,
-    NOISE_NAMES, REFERENCES, SINGLE_EVENT_REMEDY, sized_finding, untestable_causes)
+    Cause, cause_finding, cause_parameters, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES,
+    REFERENCES, SINGLE_EVENT_REMEDY, slip_times, untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    add_causes, drop_samples, extend_model, heading_contributions, heading_error_shares,
-    is_scale_implausible, measure_gain, merge_self_calibration, unmergeable_causes)
+    add_causes, complete_diagnosis, drop_samples, extend_model, heading_contributions,
+    heading_curve, heading_error_shares, is_scale_implausible, measure_gain,
+    merge_self_calibration, unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
-    DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, Gate, MIN_PROBABILITY, NOT_OFFERED,
-    OnProgress, probabilities, Reference, SEARCH_ALARM_SHARE, TIME_LIMIT_REMARK, Unexplained,
-    VALUE_ALARM_SHARE)
+    Diagnosis, Estimate, Finding, Gate, MIN_PROBABILITY, OnProgress, Reference, TIME_LIMIT_REMARK,
+    Unexplained)
 from gyro_calibration.diagnosis.gates import (
-    check_gates, check_model_units, classify_reference, is_at_rest,
-    is_reference_limiting, is_sample_offset, mismatch_diagnosis, refuse_unusable)
+    classify_reference, examine_log, is_at_rest, is_reference_limiting, is_sample_offset,
+    mismatch_diagnosis)
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference, follows_rate, HIDDEN_CAUSES, is_late)
@@ -48,11 +49,14 @@ from gyro_calibration.diagnosis.regression import (
     SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
-    allan_curves, find_changed_figures, fit_noise_parameters, heading_error_curve, model_residuals,
-    residual_curves)
+    allan_curves, find_changed_figures, fit_noise_parameters, model_residuals, residual_curves)
 from gyro_calibration.diagnosis.search import (
     complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
-    refine_shape, Scored, Search, search_causes, Selection, start_search)
+    refine_shape, Search, search_causes, Selection, start_search)
+from gyro_calibration.diagnosis.significance import (
+    DETECTION_POWER, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
+from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
+from gyro_calibration.diagnosis.words import is_model_extended
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
@@ -84,7 +88,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
 
     Parameters
     ----------
-    logs : of one gyro, with time, and with a reference unless the gyro is at rest
+    logs : of one gyro, with time, and with a reference unless the gyro is at rest; or a single
+        rate table
     generator : source of the noise that fills gaps
     model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
         best
@@ -98,8 +103,15 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : a diagnosis of these logs is not possible
 
     """
-    on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
+    if any(log.time is None for log in logs):
+        if len(logs) > 1:
+            raise DataRefused(
+                f'{len(logs)} logs were given, and one has no time_s; give a rate table alone, '
+                'or give the sample rate in Hz with --rate')
+        found = replace(diagnose_table(logs[0], model, on_progress), logs=tuple(names))
+        return _keep_unextended_model(found, given_model)
+    on_progress(None, 'checks of the log')
     all_gates: list[Gate] = []
     for log in logs:
         require_output(log)
@@ -110,14 +122,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     given, remarks = logs, [remark for each in chosen for remark in each]
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
-        passed = check_gates(log, model, reference_kind == 'rate_command')
-        mismatch = mismatch_diagnosis(passed, given_model)
-        if mismatch is None or passed[-1].name != 'wrapped_heading':
-            refuse_unusable(given[place])
-        if mismatch is None and model is not None:
-            passed = (*passed, check_model_units(log, model))
-            mismatch = mismatch_diagnosis(passed, given_model)
-        if mismatch is not None:
+        passed = examine_log(log, model, reference_kind == 'rate_command', given[place])
+        if (mismatch := mismatch_diagnosis(passed, given_model)) is not None:
             return replace(mismatch, logs=tuple(names[place:place + 1]))
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
@@ -141,13 +147,18 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                 references, reference_kind == 'rate_command')
         finally:
             forget_fits()
-    if given_model is not None and found.model is model:
-        # with its self-calibration separate
-        found = replace(found, before=given_model, model=given_model)
-    findings = (*found.findings, *add_remedies(
-        [each for each in slips if each is not None], found.heading_shares, found.model))
-    return replace(found, logs=tuple(names), gates=tuple(all_gates), findings=findings,
-                   remarks=(*dict.fromkeys(remarks), *found.remarks))
+    found = _keep_unextended_model(found, given_model)
+    findings = found.findings if len(logs) > 1 else mark_parts_of_log(found.findings)
+    return complete_diagnosis(replace(
+        found, logs=tuple(names), gates=tuple(all_gates),
+        findings=(*findings, *(each for each in slips if each is not None)),
+        remarks=(*dict.fromkeys(remarks), *found.remarks)))
+
+
+def _keep_unextended_model(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
+    """Return a diagnosis with the model as it was given, if it is not extended."""
+    return (found if model is None or is_model_extended(found)
+            else replace(found, before=model, model=model))
 
 
 def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding | None]:
@@ -160,8 +171,7 @@ def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding
         return log, None
     assert log.time is not None
     name, largest = 'reference_slip', int(np.abs(jumps.sizes).argmax())
-    times = {f'slip_time_{place}': Estimate(at, (at, at), 's')
-             for place, at in enumerate((log.time[jumps.rows] - log.time[0]).tolist())}
+    times = slip_times((log.time[jumps.rows] - log.time[0]).tolist())
     size = Estimate.from_half_width(float(jumps.sizes[largest]),
                                     NORMAL_QUANTILE_975 * jumps.deviation, CAUSES[name].unit)
     return log, make_finding(name, {name: size, **times}, max(jumps.p_value, MIN_PROBABILITY))
@@ -214,18 +224,15 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     lasting = any(not is_single_event(known) for known, _ in within)
     gain = None
     if (lasting or changed) and not is_scale_implausible(found) and not time_is_up:
-        tried = {each.cause for _, members in within for each, _ in members}
+        tried = {name for _, members in within for name in members}
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
     on_progress(None, 'findings')
-    findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed)]
-    if len(logs) == 1:
-        findings = mark_parts_of_log(findings)
-    findings += searched.findings
+    findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed),
+                *searched.findings]
     # a motion that follows has noise of its own
     if model is not None and not searched.hidden:
         findings += find_changed_figures(found, model, VALUE_ALARM_SHARE * rate, rounds).values()
-    findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
     inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
                      if out else found, lasting_only=True)
@@ -242,13 +249,14 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         [heading_contributions(found, run, plain if model is None else None)
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
-    return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
+    return Diagnosis(tuple(findings),
                      (*_unexplained_structures(search, found, selection.unnamed),
                       *searched.unexplained), noise, simulated, gain, before, after,
                      _untestable_causes(search, logs, searched.hidden),
-                     residual_curves(left, shown), heading_error_curve(left, shown),
+                     residual_curves(left, shown), heading_curve(
+                         *heading_contributions(shown, 0, None if changed else plain)),
                      allan_curves(found, noise, simulated),
-                     (*_remarks(quality, names, found, selection, out, gain, model),
+                     (*_remarks(quality, names, found, selection, out, model),
                       *searched.remarks, *[TIME_LIMIT_REMARK] * bool(time_is_up)), rate,
                      heading_shares=of_heading,
                      reference=references[0] if len(logs) == 1 else None)
@@ -373,14 +381,14 @@ def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
-    for place, members in enumerate(selection.alternatives):
+    for place, deficits in enumerate(selection.alternatives):
         evidence = evidence_for(search, (*fit.causes, *selection.unnamed), place)
-        yield _cause_finding(search, fit, place, evidence, members)
+        yield _cause_finding(search, fit, place, evidence, deficits)
     for known in selection.suspected:
         everything = refine_jointly(search, (*fit.causes, *selection.unnamed, known))
         place = len(everything) - 1
-        yield mark_suspected(_cause_finding(search, fit_causes(search.problem, everything), place,
-                                            evidence_for(search, everything, place)))
+        yield _cause_finding(search, fit_causes(search.problem, everything), place,
+                             evidence_for(search, everything, place), {}, is_established=False)
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
@@ -412,12 +420,10 @@ def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
             ('bias', bias, ()),
             ('scale_factor_error', fit.scale_factor_error, ('reference_scale',))):
         deviation = math.hypot(value.deviation, own.get(name, 0.0))
-        chance = float(2.0 * norm.sf(abs(value.value) / deviation)) if deviation > 0.0 else 1.0
-        if chance < VALUE_ALARM_SHARE * false_alarm_rate:
-            yield sized_finding(name, value.value, NORMAL_QUANTILE_975 * deviation, chance,
-                                confounders, minimum_detectable=5.4 * deviation,
-                                evidence='it adds to the value of the model, '
-                                f'{abs(value.value) / deviation:.3g} sigma from zero')
+        if found := value_finding(name, value.value, deviation, VALUE_ALARM_SHARE
+                                  * false_alarm_rate, confounders):
+            yield replace(found, evidence='it adds to the value of the model, '
+                          f'{abs(value.value) / deviation:.3g} sigma from zero')
 
 
 def _untestable_causes(search: Search, logs: Sequence[Log],
@@ -445,7 +451,7 @@ def _untestable_causes(search: Search, logs: Sequence[Log],
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,
-             selection: Selection, unmergeable: Sequence[Candidate], gain: Gain | None,
+             selection: Selection, unmergeable: Sequence[Candidate],
              model: GyroModel | None) -> Iterator[str]:
     """Give remarks on the records, on parts of them, and on the model."""
     for place, clean in enumerate(quality):
@@ -467,88 +473,45 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
                   else '')
         yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
                f'cannot be merged with the first one{remedy}.')
-    if gain is not None and gain.is_worse:
-        yield NOT_OFFERED
 
 
 # findings
 
 def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
-                   alternatives: Sequence[Scored] = ()) -> Finding:
-    """Return the finding of a named cause with its evidence and alternatives."""
+                   deficits: Mapping[str, float], is_established: bool = True) -> Finding:
+    """Return the finding of a cause with its evidence and the deficits of its alternatives."""
     known, replays = fit.causes[cause_index], fit.problem.replays
-    name, parameters = known.cause, _cause_parameters(fit, cause_index)
-    probability = probabilities(
-        {name: 0.0, **{each.cause: lack for each, lack in reversed(alternatives)}})
-    others = [(each.cause, lack) for each, lack in alternatives if each.cause != name]
-    confounders = [other for other, _ in others]
+    name, effect = known.cause, CATALOGUE.get(known.cause)
+    names = ([(shape.name, shape.unit) for shape in effect.nonlinear_parameters]
+             if effect is not None else [('width', 's')])
+    shapes = {}
+    for number, value in fit.shapes(cause_index).items():
+        shape, unit = names[number]
+        shapes[shape] = Estimate.from_half_width(
+            value.value, NORMAL_QUANTILE_975 * value.deviation, unit)
+    fields: dict[str, Any] = {'remedy': SINGLE_EVENT_REMEDY if is_single_event(known) else ''}
+    if name == 'bias_step':
+        fields['where'] = (known.shapes[0],
+                           float(replays[known.log_index or 0].channels.time[-1]))
+    elif name == 'reference_slip':
+        fields['where'] = min(known.shapes[1:]), max(known.shapes[1:])
+        shapes |= slip_times(known.shapes[1:])
+    parameters = cause_parameters(name, *fit.coefficients(cause_index), shapes)
     size = next(iter(parameters.values()))
-    deviation = size.deviation
-    if name == 'time_offset' and is_sample_offset(size.estimate, deviation,
-                                                  replays[0].interval):
-        confounders.append('unit_error')
+    is_sample = name == 'time_offset' and is_sample_offset(size.estimate, size.deviation,
+                                                           replays[0].interval)
     # the evidence of a size of n standard deviations is n² / 2
     threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
-    detectable_sigmas = (math.sqrt(2.0 * max(threshold, 0.0))
-                         + float(norm.isf(1.0 - DETECTION_POWER)))
-    log = ('' if known.log_index is None or len(replays) == 1
-           else f'in log {known.log_index + 1}, ')
-    where = None
-    if name == 'bias_step':
-        where = known.shapes[0], float(replays[known.log_index or 0].channels.time[-1])
-    elif name == 'reference_slip':
-        where = min(known.shapes[1:]), max(known.shapes[1:])
-    return make_finding(
-        name, parameters, p_value(name, evidence), tuple(dict.fromkeys(confounders)),
-        minimum_detectable=detectable_sigmas * deviation if deviation > 0.0 else None,
-        separate_by=(next_experiment(name, others, observed_range(replays))
-                     or (CAUSES[name].separate_by if confounders else '')),
-        evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0
-                  else ''), probability=probability, where=where,
-        remedy=SINGLE_EVENT_REMEDY if is_single_event(known) else '')
-
-
-def _cause_parameters(fit: RegressionFit, cause_index: int) -> dict[str, Estimate]:
-    """Return the parameters of a cause, first the one with the name of the cause."""
-    known, coefficients = fit.causes[cause_index], fit.coefficients(cause_index)
-    name, effect = known.cause, CATALOGUE.get(known.cause)
-    own = () if effect is None else effect.coefficients
-    unit = own[0].unit if own else CAUSES[name].units.get(name, '1')
-    shapes = ([(shape.name, shape.unit) for shape in effect.nonlinear_parameters + own]
-              if effect is not None else [('width', 's')])
-    parameters = {}
-    if len(own) > 1 and [each.name for each in own] != ['sine', 'cosine']:
-        parameters = {each.name: _estimate(value, each.unit)
-                      for each, value in zip(own, coefficients)}
-    elif len(coefficients) == 2 and name != 'reference_slip':
-        parameters = _amplitude_and_phase(fit, cause_index, coefficients, unit)
-    elif coefficients:
-        parameters = {name: _estimate(coefficients[0], unit)}
-    for number, value in fit.shapes(cause_index).items():
-        shape, shape_unit = shapes[number]
-        parameters[shape if parameters else name] = _estimate(value, shape_unit)
-    if name == 'reference_slip':
-        parameters.update({f'slip_time_{place}': Estimate(at, (at, at), 's')
-                           for place, at in enumerate(known.shapes[1:])})
-    return parameters
-
-
-def _estimate(value: Value, unit: str) -> Estimate:
-    return Estimate.from_half_width(value.value, NORMAL_QUANTILE_975 * value.deviation, unit)
-
-
-def _amplitude_and_phase(fit: RegressionFit, cause_index: int, coefficients: Sequence[Value],
-                         unit: str) -> dict[str, Estimate]:
-    """Return amplitude and phase of ``sine sin + cosine cos``, with intervals by covariance."""
-    sine, cosine = (value.value for value in coefficients)
-    amplitude, phase = math.hypot(sine, cosine), math.atan2(cosine, sine)
-    ranks = [rank for rank in (fit.estimate_index(cause_index, number) for number in range(2))
-             if rank is not None]
-    covariance = fit.covariance[np.ix_(ranks, ranks)]
-    rotation = np.array([[sine, cosine], [-cosine, sine]]) / amplitude
-    deviation = np.sqrt(np.diag(rotation @ covariance @ rotation.T))
-    return {fit.causes[cause_index].cause: _estimate(Value(amplitude, float(deviation[0])), unit),
-            'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
+    found = cause_finding(
+        name, parameters, p_value(name, evidence), deficits, is_established,
+        observed_range([each.channels.rate for each in replays],
+                       [each.channels.temperature for each in replays
+                        if 'temperature' in common_channels(replays)],
+                       max(each.duration for each in replays)),
+        math.sqrt(2.0 * max(threshold, 0.0)) + float(norm.ppf(DETECTION_POWER)),
+        ['unit_error'] * is_sample, **fields)
+    return (found if known.log_index is None or len(replays) == 1 or not found.evidence else
+            replace(found, evidence=f'in log {known.log_index + 1}, {found.evidence}'))
 
 
 def _unexplained_structures(search: Search, fit: RegressionFit,

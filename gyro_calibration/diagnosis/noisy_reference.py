@@ -34,19 +34,21 @@ from gyro_calibration.calibration.heading_regression import (
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.diagnosis.candidates import (
-    lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE)
+    lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies, Cause, CAUSES, make_finding, mark_parts_of_log, mark_suspected,
-    SINGLE_EVENT_REMEDY, sized_finding, untestable_causes)
+    Cause, cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, sized_finding,
+    untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    add_terms, gain_from_squares, heading_curve, heading_error_shares, HEADING_WINDOW,
+    add_terms, gain_from_errors, heading_curve, heading_error_shares, HEADING_WINDOW,
     MAX_WINDOW_SHARE, previous_origins, window_changes)
 from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, NOT_OFFERED, OnProgress,
-    probabilities, Reference, RULED_OUT_DEFICIT, SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR,
-    TIME_LIMIT_REMARK, VALUE_ALARM_SHARE)
-from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
+    Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress, Reference,
+    TIME_LIMIT_REMARK)
+from gyro_calibration.diagnosis.search import MAX_CAUSES
+from gyro_calibration.diagnosis.significance import (
+    detectable_sigmas, MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT,
+    SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR, VALUE_ALARM_SHARE)
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
@@ -61,8 +63,6 @@ from scipy.stats import t as student
 
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
-#: Standard deviations of a value that is found in 95 % of logs.
-_DETECTION_SIGMAS = 4.8
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -126,10 +126,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
     findings = [*_value_findings(extended, model, false_alarm_rate, reference),
                 *_reference_findings(extended, false_alarm_rate), *record.findings,
-                *(each for cause in found for each in [_cause_finding(cause, extended)]
+                *(each for cause in found for each in [_cause_finding(
+                    cause, extended, VALUE_ALARM_SHARE * false_alarm_rate)]
                   if not each.parameters[each.effect].contains_zero)]
-    findings = mark_parts_of_log(findings)
-    findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
@@ -149,12 +148,12 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                                         or prior is not None)
              else _extend_model(model, model_fit, log, clock_delay, of_clocks))
     curve, trace = _rate_curve_and_trace(extended, parts)
-    return Diagnosis(tuple(add_remedies(findings, of_heading, after)), (), _gyro_noise(extended),
+    return Diagnosis(tuple(findings), (), _gyro_noise(extended),
                      Noise() if model is None else model.noise,
                      None if not changed and model is not None else gain, before, after,
                      _untestable_causes(plain), [curve], heading_curve(parts, time), None,
                      (*record.remarks, *_remarks(reference, extended, prior is not None),
-                      *[NOT_OFFERED] * rejected, *[TIME_LIMIT_REMARK] * bool(time_is_up)),
+                      *[TIME_LIMIT_REMARK] * bool(time_is_up)),
                      false_alarm_rate, trace=trace,
                      method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
                      reference=replace(reference, noise=noise), heading_shares=of_heading)
@@ -167,7 +166,8 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
     """Give delay, and with a model bias and scale factor error, if they are established."""
     own_clock = reference.kind not in _SAME_CLOCK
     for place, name in enumerate(BASE_VALUES):
-        if name != 'time_offset' and model is None:
+        effective = float(fit.effective_stretches[place])
+        if name != 'time_offset' and model is None or effective < MIN_STRETCHES:
             continue
         value, variance = float(fit.values[place]), float(fit.covariance[place, place])
         if name == 'bias' and model is not None:
@@ -178,25 +178,21 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
             variance += max(2.0 / math.pi * each.bias_instability ** 2
                             + each.rate_random_walk ** 2 * duration / 3.0
                             for each in (*shown, model.noise))
-        deviation = math.sqrt(variance)
-        effective, freedom = float(fit.effective_stretches[place]), float(fit.freedom[place])
-        chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
-        # a delay between two clocks is usual
-        share = 1.0 if name == 'time_offset' and own_clock else VALUE_ALARM_SHARE
-        if chance >= share * false_alarm_rate or effective < MIN_STRETCHES:
-            continue
-        half = min(float(student.ppf(0.975, freedom)) * deviation,
-                   NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place])
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
+        # a delay between two clocks is usual
+        level, is_usual = VALUE_ALARM_SHARE * false_alarm_rate, name == 'time_offset' and own_clock
         if name == 'time_offset':
             of_gyro = 0.0 < value < MAX_GYRO_LAG
             confounders = [other for other, might in (('bandwidth', of_gyro), ('clock_rate', True))
                            if might and _is_possible_instead(fit, other)]
             if own_clock and not of_gyro:
                 known['cause'] = 'The gyro has a time offset from its reference.'
-        yield sized_finding(name, value, half, max(chance, MIN_PROBABILITY), confounders,
-                            minimum_detectable=_DETECTION_SIGMAS * deviation,
-                            evidence=f'evidence from {effective:.0f} stretches', **known)
+        if found := value_finding(name, value, math.sqrt(variance),
+                                  false_alarm_rate if is_usual else level, confounders,
+                                  float(fit.freedom[place]),
+                                  NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place],
+                                  evidence=f'evidence from {effective:.0f} stretches', **known):
+            yield found
 
 
 def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
@@ -215,13 +211,11 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
     if asymmetry not in fit.causes:  # it is in motion only, too
         fit = fit_spans(fit.spans, [*fit.causes, asymmetry])
     place = fit.value_slice(CauseTerm(name)).start
-    deviation, chance = math.sqrt(fit.covariance[place, place]), fit.p_value(place)
-    if chance < false_alarm_rate:
-        yield sized_finding(
-            name, fit.values[place], fit.half_width(place), max(chance, MIN_PROBABILITY),
-            ['vibration_rectification'],
-            minimum_detectable=_DETECTION_SIGMAS * deviation,
-            evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias')
+    if found := value_finding(
+            name, float(fit.values[place]), math.sqrt(fit.covariance[place, place]),
+            false_alarm_rate, ['vibration_rectification'], float(fit.freedom[place]),
+            evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias'):
+        yield found
 
 
 def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
@@ -239,52 +233,41 @@ def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
     return bool(abs(values[place] - left) < 3.0 * np.linalg.norm(inverse[place]))
 
 
-def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
+def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
-    term = found_cause.cause_term
-    fit = (extended if found_cause.is_established
-           else fit_spans(extended.spans, [*extended.causes, term]))
-    places = fit.value_slice(term)
-    values = fit.values[places]
-    half = np.array([fit.half_width(place) for place in range(places.start, places.stop)])
-    effect = CATALOGUE.get(term.cause)
-    unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
-            else CAUSES[term.cause].unit)
-    size, within = float(values[0]), float(half[0])
+    term, spans = found.cause_term, extended.spans
+    fit = (extended if found.is_established
+           else fit_spans(spans, [*extended.causes, term]))
+    places, effect, shapes = fit.value_slice(term), CATALOGUE.get(term.cause), {}
+    values, covariance = fit.values[places], fit.normal_covariance[places, places]
+    evidence = {'evidence': f'it adds {found.prediction_gain:.1f} to the log-likelihood of '
+                'held-out stretches, and is selected in '
+                f'{100.0 * found.selection_share:.0f} % of the folds'}
+    if term.is_single_event and found.is_established:
+        evidence = {}
     if term.cause == SINE_RESPONSE.name:
-        size, slope = _shape_of_sine(term, size)
-        within, unit = slope * within, CAUSES[term.cause].unit
-        term = CauseTerm(term.cause)
-    if len(values) > 1:
-        size = float(np.hypot(*values))
-        within = float(np.hypot(*(values * half))) / size
-    parameters = {term.cause: Estimate.from_half_width(size, within, unit)}
-    for parameter, value in zip(() if effect is None else effect.nonlinear_parameters,
-                                term.shapes):
-        if (parameter.default is None and parameter.name not in parameters
-                and found_cause.shape_interval is not None):
-            parameters[parameter.name] = Estimate(value, found_cause.shape_interval,
-                                                  parameter.unit)
-    if term.cause == 'bias_step':
-        parameters = _step_parameters(fit, term, parameters[term.cause])
-    shown = make_finding(
-        term.cause, parameters, found_cause.p_value,
-        [other for other in found_cause.probability if other != term.cause],
-        minimum_detectable=(_DETECTION_SIGMAS * within / NORMAL_QUANTILE_975
-                            if len(values) == 1 else None),
-        evidence=(f'{NORMAL_QUANTILE_975 * abs(size) / within:.3g} sigma from zero'
-                  if found_cause.is_established and term.is_single_event else
-                  f'it adds {found_cause.prediction_gain:.1f} to the log-likelihood of held-out '
-                  f'stretches, and is selected in {100.0 * found_cause.selection_share:.0f} % of '
-                  'the folds'),
-        probability=found_cause.probability,
-        where=((term.shapes[0], float(fit.spans.time[-1])) if term.is_single_event else None),
+        size, slope = _shape_of_sine(term, float(values[0]))
+        shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
+        values, covariance = values[1:], covariance[1:, 1:]
+    elif term.cause == 'bias_step':
+        by_time, shapes['step_time'] = _step_time(fit, term)
+        covariance = covariance + by_time
+    elif found.shape_interval is not None and effect is not None:
+        shape, = effect.nonlinear_parameters
+        shapes[shape.name] = Estimate(term.shapes[0], found.shape_interval, shape.unit)
+    log = spans.log
+    return cause_finding(
+        term.cause, cause_parameters(term.cause, values, covariance, shapes), found.p_value,
+        found.deficits, found.is_established, observed_range(
+            [np.asarray(spans.channels.rate)], [each for each in [log.temperature]
+                                                if each is not None], float(spans.time[-1])),
+        detectable_sigmas(level), **evidence,
+        where=(term.shapes[0], float(spans.time[-1])) if term.is_single_event else None,
         remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
-    return shown if found_cause.is_established else mark_suspected(shown)
 
 
-def _step_parameters(fit: SpanFit, term: CauseTerm, size: Estimate) -> dict[str, Estimate]:
-    """Return the size of a step, given its time, and its time, with intervals."""
+def _step_time(fit: SpanFit, term: CauseTerm) -> tuple[float, Estimate]:
+    """Return the variance of the size of a step by its time, and that time."""
     place = fit.value_slice(term).start
     inflation = float(fit.covariance[place, place] / fit.fit.covariance[place, place])
     data = whiten_regression(fit, [each for each in fit.causes if each != term])
@@ -303,12 +286,9 @@ def _step_parameters(fit: SpanFit, term: CauseTerm, size: Estimate) -> dict[str,
         interval = float(times[first]), float(times[last])
         inside = slice(first, last + 1)
         weights = softmax(-lack[inside])
-        of_time = float(weights @ (sizes[inside] - weights @ sizes[inside]) ** 2)
+        variance = float(weights @ (sizes[inside] - weights @ sizes[inside]) ** 2)
         times = np.linspace(*interval, 100)
-    half = 0.5 * (size.interval[1] - size.interval[0])
-    return {term.cause: Estimate.from_half_width(
-        size.estimate, math.hypot(half, NORMAL_QUANTILE_975 * math.sqrt(of_time)), size.unit),
-        'step_time': Estimate(term.shapes[0], interval, 's')}
+    return variance, Estimate(term.shapes[0], interval, 's')
 
 
 def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
@@ -331,7 +311,7 @@ def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
     if delay_finding is None:
         return after
     size = delay_finding.parameters['time_offset']
-    return add_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
+    return add_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))], [0],
                      np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
 
 
@@ -341,26 +321,22 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log,
     own = 1.0 + sum(
         term.values[0] for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in fit.values[:2])
-    terms, rows = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
-    slopes = [1.0, 1.0]
+    terms, indices = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
+    slopes = np.ones(len(fit.values))
     for cause in fit.causes:
         if cause.cause in CATALOGUE.keys() - {*left_out}:
             places = fit.value_slice(cause)
             shapes, values = cause.shapes, fit.values[places].tolist()
-            # shapes, as the last row, have no variance
             of_term = [*(-1 for _ in shapes), *range(places.start, places.stop)]
             if cause.cause == SINE_RESPONSE.name:
                 # the shape instead of the amplitude
-                shape, slope = _shape_of_sine(cause, values[0])
+                shape, slopes[places] = _shape_of_sine(cause, values[0])
                 shapes, values, of_term = (shape,), [1.0], [places.start, -1]
-                slopes += [slope, 0.0]
             terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
-            rows += of_term
-            slopes += [1.0] * (len(rows) - len(slopes))
-    covariance = (np.pad(fit.normal_covariance, (0, 1))[np.ix_(rows, rows)]
-                  * np.outer(slopes, slopes))
+            indices += of_term
     assert log.output is not None
-    new = add_terms(base_model, terms, covariance, [log.output[np.isfinite(log.output)]],
+    new = add_terms(base_model, terms, indices, fit.normal_covariance * np.outer(slopes, slopes),
+                    [log.output[np.isfinite(log.output)]],
                     [] if log.temperature is None else [log.temperature])
     return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
 
@@ -407,8 +383,7 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
               'plain': (design_matrix(spans, ()), noisy.design),
               'extended': (design_matrix(extended.spans, extended.causes),
                            whiten_regression(extended, extended.causes, plain).design)}
-    squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
-    counts: list[tuple[int, int]] = []
+    errors = []
     for part in range(parts):
         held = np.flatnonzero(number == part)
         # whitened observations across the borders of the part are left out
@@ -416,17 +391,16 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
         if len(held) < 4 or len(kept) < 8:
             return None
         rows = np.append(kept, len(spans.observed) + np.arange(prior))
+        stamps, of_part = time[held[0]:held[-1] + 2], {}
         for name, (columns, white) in models.items():
             values = np.linalg.lstsq(white[rows], noisy.observed[rows], rcond=None)[0]
             left = (spans.observed - columns @ values[:columns.shape[1]])[held]
-            stamps = time[held[0]:held[-1] + 2]
-            turned = window_changes(left, stamps, window)
-            squares[name].append((float(np.sum((left / np.diff(stamps)) ** 2)),
-                                  float(np.sum(turned ** 2))))
-        counts.append((len(left), len(turned)))
-    return gain_from_squares(f'each of {parts} parts of the log in turn, the others being '
-                             'fitted', squares,
-                             counts, 'given', window) if np.all(counts) else None
+            of_part[name] = left / np.diff(stamps), window_changes(left, stamps, window)
+        if not len(of_part['given'][1]):
+            return None
+        errors.append(of_part)
+    return gain_from_errors(f'each of {parts} parts of the log in turn, the others being fitted',
+                            errors, 'given', window)
 
 
 # for people
@@ -502,7 +476,8 @@ class FoundCause:
     prediction_gain: float  # gain in log-likelihood on held-out stretches
     selection_share: float  # share of the folds in which the same cause was selected
     is_established: bool  # whether it is confirmed
-    probability: dict[str, float]  # of the cause and of its alternatives, by name
+    # what it and its alternatives lack in log-likelihood, the best first
+    deficits: Mapping[str, float]
     shape_interval: tuple[float, float] | None = None  # of 95 %; None if no shape was fitted
 
 
@@ -661,9 +636,9 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
             chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
         weakest = int(chances.argmax())
         if chances[weakest] < false_alarm_rate:
-            return [FoundCause(each, max(chance, MIN_PROBABILITY), 0.5 * size ** 2, 1.0,
-                               count >= MIN_STRETCHES, {}) for each, chance, size, count in zip(
-                                   steps, chances.tolist(), sigmas.tolist(), stretches)]
+            return [FoundCause(each, chance, 0.5 * size ** 2, 1.0, count >= MIN_STRETCHES, {})
+                    for each, chance, size, count in zip(
+                        steps, chances.tolist(), sigmas.tolist(), stretches)]
         del steps[weakest]
     return []
 
@@ -710,10 +685,8 @@ def _implausibility(fit: SpanFit, cause: CauseTerm, false_alarm_rate: float) -> 
     if cause.cause == 'reference_once_per_rev':
         # from 1 on, the reference would turn back
         return float(np.hypot(*values))
-    if len(values) == 1:
-        sigmas = abs(values[0]) / math.sqrt(fit.covariance[places.start, places.start])
-        if 2.0 * student.sf(sigmas, fit.freedom[places.start]) >= false_alarm_rate:
-            return math.inf
+    if len(values) == 1 and fit.p_value(places.start) >= false_alarm_rate:
+        return math.inf
     if (CAUSES[cause.cause].along not in ('rate', 'heading')
             or cause.cause not in CATALOGUE):
         return 0.0
@@ -744,7 +717,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     best_of = {terms[place].cause: place
                for place in sorted(range(len(terms)), key=likelihoods.__getitem__)}
     gain = likelihoods[strongest]
-    equivalent = {name: place for name, place in best_of.items() if place == strongest
+    equivalent = {name: place for name, place in reversed(best_of.items()) if place == strongest
                   or gain - likelihoods[place] < RULED_OUT_DEFICIT}
 
     def complexity(place: int) -> tuple[int, float, float]:
@@ -763,16 +736,13 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
                           np.array_split(numbers, count))]
     # errors of a course are correlated over time, so that distant stretches must be predicted too
     sigmas, predicted, selected = max(folds) if spans.treatment.is_fine else min(folds)
-    probability = {name: chance for name, chance in probabilities(
-        {name: gain - likelihoods[place] for name, place in best_of.items()}).items()
-        if name in equivalent}
     established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
                    and selected == 1.0 and evidences[simplest].stretches >= MIN_STRETCHES)
     term, interval = _profile_shape(spans, data, terms[simplest], [
         each.shapes for each in terms if each.cause == terms[simplest].cause],
         evidences[simplest].variance_ratio)
-    return FoundCause(term, max(p_values[simplest], MIN_PROBABILITY), predicted, selected,
-                      established, probability, interval)
+    return FoundCause(term, p_values[simplest], predicted, selected, established, {
+        name: gain - likelihoods[place] for name, place in equivalent.items()}, interval)
 
 
 def _profile_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm,

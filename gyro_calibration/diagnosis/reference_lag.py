@@ -27,20 +27,19 @@ from typing import NamedTuple
 from gyro_calibration.calibration.heading_regression import HEADING_TREATMENT, MIN_STRETCHES
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG
 from gyro_calibration.diagnosis.candidates import effect_candidate
-from gyro_calibration.diagnosis.causes import CAUSES, sized_finding
+from gyro_calibration.diagnosis.causes import CAUSES, value_finding
 from gyro_calibration.diagnosis.extended_model import drop_samples
-from gyro_calibration.diagnosis.findings import Finding, MIN_PROBABILITY
+from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.regression import (
     build_problem, fit_causes, likelihood_with, RegressionFit)
 from gyro_calibration.diagnosis.replay import (
     cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
-from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.quality import white_noise_deviation
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 from scipy.signal import oaconvolve
-from scipy.stats import norm
 
 #: Causes that cannot be told from the dynamics of a motion, which may also vibrate.
 HIDDEN_CAUSES = frozenset({
@@ -90,13 +89,12 @@ def follow_reference(replays: Sequence[Replay],
     away, towards = np.median(limits, axis=0).tolist()
     limited = (f', accelerates by at most {away:.3g} rad/s² and slows down by at most '
                f'{towards:.3g} rad/s²' if math.isfinite(away + towards) else '')
-    half = NORMAL_QUANTILE_975 * deviation
-    return followed, [] if abs(mean) <= half else [sized_finding(
-        'reference_lag', mean, half, max(float(2.0 * norm.sf(abs(mean) / deviation)),
-                                         MIN_PROBABILITY),
+    found = value_finding(
+        'reference_lag', mean, deviation, 0.05,
         evidence=f'the motion is {1e3 * mean:.0f} ms behind the reference rate on average'
         f'{limited}; the output is compared with the motion that follows',
-        remedy='use a measured rate or heading as the reference')]
+        remedy='use a measured rate or heading as the reference')
+    return followed, [] if found is None else [found]
 
 
 def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Array]:

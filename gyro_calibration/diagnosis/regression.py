@@ -165,7 +165,6 @@ class RegressionFit:
     # and 0 for the scale factor error
     column_owners: tuple[tuple[int, int], ...]
     column_counts: tuple[int, ...]  # number of columns with free values of each cause
-    lacks_columns: bool  # whether some columns depend on others, and are left out
     # information, scores: of the columns under each noise, shapes (g, q, q) and (g, q)
     information: Array
     scores: Array
@@ -285,10 +284,13 @@ class RegressionFit:
         """Return the scale factor error relative to the simulation, 1."""
         return self._column_value(-1, 0)
 
-    def coefficients(self, cause_index: int) -> list[Value]:
-        """Return the values of the columns of a cause."""
-        return [self._column_value(cause_index, number)
-                for number in range(self.column_counts[cause_index])]
+    def coefficients(self, cause_index: int) -> tuple[Array, Array]:
+        """Return the values of the columns of a cause, and covariance; 0 for those left out."""
+        owners = [(cause_index, number) for number in range(self.column_counts[cause_index])]
+        ranks = np.array([self.column_owners.index(each) if each in self.column_owners else -1
+                          for each in owners], dtype=np.intp)
+        values, covariance = self.estimates
+        return np.append(values, 0.0)[ranks], np.pad(covariance, (0, 1))[np.ix_(ranks, ranks)]
 
     def shapes(self, cause_index: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""
@@ -313,7 +315,7 @@ class RegressionFit:
                     or not self.is_included(place)):
                 continue
             values = ([known.amplitude] if known.amplitude is not None
-                      else [one.value for one in self.coefficients(place)])
+                      else self.coefficients(place)[0].tolist())
             for value, column in zip(values, known.columns(new)):
                 found[known.cause] = found.get(known.cause, 0.0) + value * column
         if replay.command is not None or len(replay.shared_errors):
@@ -450,7 +452,7 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
     likelihood = -0.5 * ((len(left) - len(rows) + 1) * np.log(squares) + determinants)
     return RegressionFit(problem, distorted, causes, rows,
                          tuple(owners[place] for place in kept[:-1]), tuple(widths),
-                         len(rows) <= len(owners), information, scores, squares, likelihood)
+                         information, scores, squares, likelihood)
 
 
 @lru_cache(maxsize=32)

@@ -26,11 +26,12 @@ from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding, NOISE_NAMES
-from gyro_calibration.diagnosis.findings import Curve, Estimate, Finding, RULED_OUT_DEFICIT
+from gyro_calibration.diagnosis.findings import Curve, Estimate, Finding
 from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, NoiseShape, Replay, spline_derivative_gain)
 from gyro_calibration.diagnosis.search import VALUE_PENALTY
+from gyro_calibration.diagnosis.significance import RULED_OUT_DEFICIT
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
@@ -345,14 +346,6 @@ def _amplitude_spectrum(before: Sequence[Array], after: RegressionFit) -> Curve:
     counts = np.diff(np.append(edges, len(frequency)))
     usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges) / counts)
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual)
-
-
-def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Curve:
-    """Return the heading error over the first log, by its residual before and after extension."""
-    each = after.problem.replays[0]
-    lines = [np.cumsum(each.resample(left[0])) * each.point_interval
-             for left in (before, after.unbiased_residuals)]
-    return Curve('time', 's', np.arange(each.point_count) * each.point_interval, *lines)
 
 
 def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> Curve:

@@ -19,7 +19,7 @@ that are held out, and if the interval of its size excludes 0.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 import math
@@ -31,13 +31,14 @@ from gyro_calibration.diagnosis.candidates import (
     gaussian_pulse, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.findings import (
-    OnProgress, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
+from gyro_calibration.diagnosis.findings import OnProgress
 from gyro_calibration.diagnosis.regression import (
     build_problem, column_evidence, ColumnGroups, fit_causes, group_columns, Indices,
     is_rate_distortion, likelihood_with, MIN_INDEPENDENT_SHARE, RegressionFit, RegressionProblem)
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, inverse_cosine_transform, Replay)
+from gyro_calibration.diagnosis.significance import (
+    MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.fft import fft
@@ -45,7 +46,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 from scipy.special import logsumexp
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 #: Penalties in log-likelihood: of a fitted shape, at least, and of each column beyond the first;
 #: and of a structure without a name.
@@ -59,11 +60,6 @@ _SLIP_DURATIONS, _MAX_SLIPS = (0.0, 0.1, 0.4), 20
 _SLIP_INTERVAL = 1.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
 _MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
-#: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
-#: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
-#: same level, so that no single stretch establishes a cause.
-_LEVEL = 0.05
-MIN_PREDICTION_SIGMAS, _MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
 
 Causes = tuple[Candidate, ...]
 #: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
@@ -232,8 +228,8 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
         # those of fixed amplitude that grow with their shapes begin with that of a free amplitude
         if candidate.cause in ('sine_response', 'time_offset', 'bandwidth', 'clock_rate'):
             free = replace(candidate, cause='column', amplitude=None)
-            ratio = fit_causes(fit.problem, [*fit.causes, free]).coefficients(
-                len(fit.causes))[0].value
+            ratio = float(fit_causes(fit.problem, [*fit.causes, free]).coefficients(
+                len(fit.causes))[0][0])
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
@@ -609,8 +605,8 @@ class Selection:
     """The causes that the data support, and what is left of a search."""
 
     named: Causes  # confirmed, each the simplest of its alternatives
-    # of each named cause, itself included, with deficits in log-likelihood
-    alternatives: Sequence[Sequence[Scored]]
+    # of each named cause, itself included, with deficits in log-likelihood, the best first
+    alternatives: Sequence[Mapping[str, float]]
     unnamed: Causes  # structure without a name, and causes whose names it withdraws
     suspected: Causes
 
@@ -646,11 +642,14 @@ def _remove_unconfirmed(search: Search, causes: Causes,
     while causes:
         fit, sigmas = fit_causes(search.problem, causes), []
         for place, (known, held_out) in enumerate(zip(causes, held_out_sigmas(search, causes))):
-            sizes = fit.coefficients(place) or list(fit.shapes(place).values())
+            values, covariance = fit.coefficients(place)
+            sizes = [(one.value, one.deviation) for one in fit.shapes(place).values()]
+            if len(values):
+                sizes = [*zip(values.tolist(), np.sqrt(np.diag(covariance)).tolist())]
             # sine or cosine alone may be 0 for a wave that is not
             is_wave = len(sizes) == 2 and known.cause != 'reference_slip'
-            size = (math.inf if is_wave or not sizes or not sizes[0].deviation
-                    else abs(sizes[0].value) / sizes[0].deviation)
+            size = (math.inf if is_wave or not sizes or not sizes[0][1]
+                    else abs(sizes[0][0]) / sizes[0][1])
             sigmas.append(min(held_out / MIN_PREDICTION_SIGMAS, size / NORMAL_QUANTILE_975))
         weakest = int(np.argmin(sigmas))
         if sigmas[weakest] > 1.0:
@@ -660,14 +659,6 @@ def _remove_unconfirmed(search: Search, causes: Causes,
         removed = removed if more else (*removed, causes[weakest])
         causes = refine_jointly(search, causes[:weakest] + more + causes[weakest + 1:])
     return causes, removed
-
-
-def prediction_sigmas(log_likelihood_gains: Array) -> float:
-    """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
-    clipped_gains = np.clip(log_likelihood_gains, -_MAX_STRETCH_GAIN, _MAX_STRETCH_GAIN)
-    scatter = float(np.std(clipped_gains, ddof=1)) * len(log_likelihood_gains) ** 0.5
-    return (float(np.sum(clipped_gains)) / max(scatter, 1e-9) if np.sum(log_likelihood_gains) > 0.0
-            else 0.0)
 
 
 def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
@@ -703,7 +694,7 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
 
 
 def _choose_simplest(search: Search, named: Causes,
-                     unnamed: Causes) -> tuple[Causes, list[list[Scored]]]:
+                     unnamed: Causes) -> tuple[Causes, list[dict[str, float]]]:
     """
     Replace each cause by its simplest alternative, and remove those that are not significant then.
 
@@ -720,7 +711,7 @@ def _choose_simplest(search: Search, named: Causes,
 
 
 def _alternatives(search: Search, named: Causes, place: int,
-                  unnamed: Causes) -> tuple[Candidate, list[Scored]]:
+                  unnamed: Causes) -> tuple[Candidate, dict[str, float]]:
     """Return the simplest alternative of a cause, or itself, and all with their deficits."""
     def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
@@ -732,4 +723,5 @@ def _alternatives(search: Search, named: Causes, place: int,
     members = [(each, mine - score) for each, score in steps
                if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(own, 0.0)]
     simplest = min((each for each, _ in members), key=size)
-    return simplest if size(simplest) < size(own) else own, members
+    return (simplest if size(simplest) < size(own) else own,
+            {each.cause: lack for each, lack in members})

@@ -18,7 +18,7 @@ because output less rate is the error to be explained.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 import math
@@ -33,13 +33,16 @@ from gyro_calibration.calibration.selection import (
     BASIC_EFFECTS, distinguishing_rate, FALSE_ALARM_RATE, find_supported_effects,
     MIN_DISTINGUISHING_SIGMAS, resolve_confounders, TECHNOLOGY_EFFECTS, try_fit, try_replace)
 from gyro_calibration.diagnosis.causes import (
-    add_remedies, Cause, CAUSES, make_finding, REFERENCES, sized_finding, untestable_causes)
+    Cause, cause_finding, CAUSES, REFERENCES, sized_finding, untestable_causes)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
-    ambiguity_notes, gain_from_squares, HEADING_WINDOW, previous_origins, widen_range)
+    complete_diagnosis, gain_from_errors, HEADING_WINDOW, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
-    Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
-from gyro_calibration.diagnosis.gates import check_gates, mismatch_diagnosis, refuse_unusable
+    Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
+from gyro_calibration.diagnosis.gates import examine_log, mismatch_diagnosis
+from gyro_calibration.diagnosis.significance import (
+    DETECTION_POWER, MIN_PREDICTION_SIGMAS, prediction_sigmas, SEARCH_ALARM_SHARE,
+    VALUE_ALARM_SHARE)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, CUBIC_NONLINEARITY, Effect,
@@ -52,17 +55,15 @@ from scipy.linalg import block_diag
 from scipy.stats import norm
 from scipy.stats import t as student
 
-#: Share of the false-alarm rate for causes other than a bias and a scale factor that differ from
-#: those of the model, which have 0.1; structure and outliers have the rest.
-_CAUSE_ALARM_SHARE = 0.65
 _METHOD_TEXT = (
     'The rates and temperatures of the dwells were simulated, and the difference of measured and '
     'simulated outputs was compared with the effects of rate and temperature. The scatter of '
     'dwells and sweeps was estimated by restricted likelihood about a smooth surface. An effect '
     'was taken if it predicts left-out sweeps better and is improbable by chance: of tables '
-    'without any cause, {share:.2g} % give an alarm. Then curves over rate, temperature and the '
-    'order of the dwells were tested on the residual. The reduction of the error was measured on '
-    'held-out sweeps; intervals are of 95 %.')
+    'without any cause, {share:.2g} % give an alarm. It is established, and in the model, if it '
+    'predicts them better beyond the scatter between sweeps. Then curves over rate, temperature '
+    'and the order of the dwells were tested on the residual. The reduction of the error was '
+    'measured on held-out sweeps; intervals are of 95 %.')
 
 
 def diagnose_table(table: Log | Dwells, model: GyroModel | None,
@@ -84,11 +85,10 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     on_progress(0.0, 'search for causes')
     dwells = table if isinstance(table, Dwells) else dwells_from_table(table)
     log = Log(output=dwells.output, reference_rate=dwells.rate, temperature=dwells.temperature)
-    refuse_unusable(log, model)
+    gates = examine_log(log, model)
     if not np.ptp(dwells.rate) > 0.0:
         raise DataRefused('all dwells have one rate, which does not separate scale factor and '
                           'bias; record several rates, both ways')
-    gates = check_gates(log)
     if (mismatch := mismatch_diagnosis(gates, model)) is not None:
         return mismatch
     record = inspect_record(log, model)
@@ -96,30 +96,28 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None,
     structures, gains = _find_structure(named.fit)
     # structure along the variable of a cause, above a tenth of what that explains
     withdrawn = frozenset(
-        effect for effect in named.causes if effect not in BASIC_EFFECTS
+        effect for effect in named.without if effect not in BASIC_EFFECTS
         and any(gain > 0.1 * named.misfit_reduction(effect) for name, gain in gains.items()
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
         named = _NamedCauses.of(named.fit, model, withdrawn)
         structures, _ = _find_structure(named.fit)
     gain = (_cross_validated_gain(dwells, model, withdrawn, on_progress)
-            if named.causes else None)
+            if named.without else None)
     on_progress(0.97, 'findings')
     before = model or named.plain_model
-    offered = bool(named.causes) and not (gain is not None and gain.is_worse)
-    after = _assemble_model(model, named.fit) if offered else before
-    strongest_first = sorted(named.causes, key=lambda each: -named.misfit_reduction(each))
-    findings = add_remedies([*record.findings, *_outlier_findings(named.fit), *(
-        _cause_finding(named, effect) for effect in strongest_first)], {}, after)
-    if after is not before:
-        after = replace(after, origin={**after.origin, **ambiguity_notes(findings)})
-    return Diagnosis(
+    offered = bool(named.without) and not (gain is not None and gain.is_worse)
+    after = _assemble_model(model, named.established_fit) if offered else before
+    strongest_first = sorted(named.without, key=lambda each: -named.misfit_reduction(each))
+    findings = [*record.findings, *_outlier_findings(named.fit),
+                *(_cause_finding(named, effect) for effect in strongest_first)]
+    return complete_diagnosis(Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
         _error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
-                 *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
-        method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE), gates=gates)
+                 *_remarks(dwells, model, named, structures, withdrawn, gain)),
+        method=_METHOD_TEXT.format(share=100.0 * FALSE_ALARM_RATE), gates=gates))
 
 
 # the steps
@@ -139,7 +137,8 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, withdrawn: fr
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:
             named = _name_causes(rest, model, withdrawn)
-            models = (model or GyroModel(), named.plain_model, _assemble_model(model, named.fit))
+            models = (model or GyroModel(), named.plain_model,
+                      _assemble_model(model, named.established_fit))
         except DataRefused:
             continue
         for each, error in zip(models, errors.values()):
@@ -147,14 +146,13 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, withdrawn: fr
     known = np.isfinite(errors['extended'])
     if not known.any():
         return None
-    part_numbers = np.unique(parts[known], return_inverse=True)[1]
     what = 'sweeps' if len(np.unique(dwells.sweep)) >= MIN_SWEEPS else 'consecutive dwells'
     # the heading error of a turn over the window at the rate of a dwell
-    squares = {name: np.outer(np.bincount(part_numbers, error[known] ** 2),
-                              [1.0, HEADING_WINDOW ** 2]) for name, error in errors.items()}
-    return gain_from_squares(f'{what} left out, each of {count} groups in turn',
-                             squares, np.outer(np.bincount(part_numbers), [1, 1]),
-                             'plain' if model is None else 'given', HEADING_WINDOW)
+    of_parts = [{name: (error[rows], HEADING_WINDOW * error[rows])
+                 for name, error in errors.items()}
+                for rows in (known & (parts == part) for part in np.unique(parts[known]))]
+    return gain_from_errors(f'{what} left out, each of {count} groups in turn', of_parts,
+                            'plain' if model is None else 'given', HEADING_WINDOW)
 
 
 def _outlier_findings(fit: Calibration) -> Iterator[Finding]:
@@ -181,15 +179,17 @@ class _NamedCauses:
     """Causes that dwells support on top of a model."""
 
     fit: Calibration  # of causes, bias and scale factor to the dwells
-    causes: tuple[Effect, ...]  # the named effects of the fit
+    # named effect -> the fit with that effect as it is in the model, None if it is not possible
+    without: Mapping[Effect, Calibration | None]
 
     @classmethod
     def of(cls, fit: Calibration, model: GyroModel | None,
            withdrawn: Collection[Effect] = ()) -> _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
+        level = VALUE_ALARM_SHARE * FALSE_ALARM_RATE
         causes = [each for each in fit.effects if each not in BASIC_EFFECTS
-                  or model is not None and fit.p_value(each) < _significance_level(each)]
+                  or model is not None and fit.p_value(each) < level]
         values = {term.effect: term.values for term in fit.terms}
         if {BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC} <= values.keys():
             # If a parabola over temperature has its vertex near the measured ones, the slope is
@@ -200,16 +200,25 @@ class _NamedCauses:
             middle = 0.5 * (temperature.max() + temperature.min())
             if abs(vertex - middle) < np.ptp(temperature):
                 causes.remove(BIAS_TEMPERATURE)
-        return cls(fit, tuple(causes))
-
-    def fit_without(self, effect: Effect) -> Calibration | None:
-        """Return a fit with the effect as it is in the model, or None if it is not possible."""
-        return try_fit(self.fit, [each for each in self.fit.effects if each is not effect])
+        return cls(fit, {effect: try_fit(fit, [each for each in fit.effects if each is not effect])
+                         for effect in causes})
 
     def misfit_reduction(self, effect: Effect) -> float:
         """Return the reduction of the sum of squares by a cause."""
-        rest = self.fit_without(effect)
+        rest = self.without[effect]
         return math.inf if rest is None else rest.misfit - self.fit.misfit
+
+    def is_established(self, effect: Effect) -> bool:
+        """Tell whether a cause predicts left-out sweeps better, beyond their scatter."""
+        rest = self.without[effect]
+        return rest is None or prediction_sigmas(0.5 * np.nan_to_num(
+            rest.left_out_squares - self.fit.left_out_squares)) > MIN_PREDICTION_SIGMAS
+
+    @property
+    def established_fit(self) -> Calibration:
+        """Return the fit without the causes that are only suspected."""
+        return self.fit.refit([each for each in self.fit.effects
+                               if each not in self.without or self.is_established(each)])
 
     @property
     def plain_model(self) -> GyroModel:
@@ -218,24 +227,12 @@ class _NamedCauses:
         return fit_effects(self.fit.dwells, basic, self.fit.scatter).model
 
 
-def _tested_count(effect: Effect) -> int:
-    """Return the number of causes that are tested together with one."""
-    basic = len(BASIC_EFFECTS)
-    return basic if effect in BASIC_EFFECTS else len(STATIC_EFFECTS) - basic
-
-
-def _significance_level(effect: Effect) -> float:
-    """Return the p-value below which a cause is named."""
-    share = 0.1 if effect in BASIC_EFFECTS else _CAUSE_ALARM_SHARE
-    return share * FALSE_ALARM_RATE / _tested_count(effect)
-
-
 def _name_causes(dwells: Dwells, model: GyroModel | None,
                  withdrawn: Collection[Effect] = ()) -> _NamedCauses:
     """Find the causes that dwells support on top of a model, or of an ideal gyro."""
     technology = model.gyro.get('technology') if model else None
     fit, _ = resolve_confounders(
-        find_supported_effects(dwells, _CAUSE_ALARM_SHARE * FALSE_ALARM_RATE, model),
+        find_supported_effects(dwells, SEARCH_ALARM_SHARE * FALSE_ALARM_RATE, model),
         technology if technology in TECHNOLOGY_EFFECTS else None)
     return _NamedCauses.of(fit, model, withdrawn)
 
@@ -345,8 +342,7 @@ def _spline_columns(values: Array, max_columns: int) -> Array:
 
 def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
     fit = named.fit
-    others, separate_by = _find_alternatives(fit, effect)
-    along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
+    deficits, separate_by = _find_alternatives(fit, effect)
     # what is added to the model's values
     own = next((term.values for term in fit.given.terms if term.effect is effect),
                (0.0,) * len(effect.parameters))
@@ -354,35 +350,37 @@ def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
         value - own[effect.parameters.index(parameter)], NORMAL_QUANTILE_975 * deviation,
         parameter.unit) for name, parameter, value, deviation in fit.model.estimates()
         if name == effect.name}
-    rest = named.fit_without(effect)
+    rest = named.without[effect]
     evidence = '' if rest is None else (
         f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} deg/s, '
         f'with it to {fit.left_out_rms / DEGREE:.3g} deg/s; '
         f'{math.sqrt(max(named.misfit_reduction(effect), 0.0)):.1f} sigma from zero')
+    basic = len(BASIC_EFFECTS)
+    count, share = ((basic, basic * VALUE_ALARM_SHARE) if effect in BASIC_EFFECTS
+                    else (len(STATIC_EFFECTS) - basic, SEARCH_ALARM_SHARE))
     # That of a sine response is by the cubic: a small one equals -k² w³ / 6.
     detectable, fitted = None, CUBIC_NONLINEARITY if effect is SINE_RESPONSE else effect
     if (by_cubic := fit if fitted is effect else try_replace(fit, effect, fitted)) is not None:
         place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
         detectable = float(
-            uncertainty.half_width(1.0 - _significance_level(effect))[place]
+            uncertainty.half_width(1.0 - share * FALSE_ALARM_RATE / count)[place]
             + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
         if effect is SINE_RESPONSE:
             detectable = math.sqrt(own[0] ** 2 + 6.0 * detectable) - own[0]
-    chance = min(1.0, fit.p_value(effect) * _tested_count(effect))
-    return make_finding(effect.name, estimates, chance, others, minimum_detectable=detectable,
-                        separate_by=separate_by, evidence=evidence, **along)
+    return cause_finding(effect.name, estimates, min(1.0, fit.p_value(effect) * count), deficits,
+                         named.is_established(effect), minimum_detectable=detectable,
+                         separate_by=separate_by, evidence=evidence,
+                         along=('temperature_while_turning' if effect is SCALE_FACTOR_TEMPERATURE
+                                else CAUSES[effect.name].along))
 
 
 def _remarks(dwells: Dwells, model: GyroModel | None, named: _NamedCauses,
-             structures: Sequence[Unexplained], withdrawn: Collection[Effect], gain: Gain | None,
-             offered: bool) -> Iterator[str]:
+             structures: Sequence[Unexplained], withdrawn: Collection[Effect],
+             gain: Gain | None) -> Iterator[str]:
     scatter = named.fit.scatter
     if withdrawn:
         yield (f'Not named: {", ".join(sorted(each.name for each in withdrawn))}: along the same '
                'variable, much structure is left without a name.')
-    if named.causes and not offered:
-        yield ('The errors of the extended model for left-out dwells are larger than those of the '
-               'simulation; it is not offered.')
     if gain is not None:
         yield (f'Heading errors are the errors of dwells integrated over {HEADING_WINDOW:g} s.')
     if any(each.along == 'single_rates' for each in structures):
@@ -461,11 +459,11 @@ def _error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tupl
 _ALWAYS_CONFOUNDED = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
 
 
-def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
-    """Return the alternatives of an effect, and the experiment that would distinguish them."""
+def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[dict[str, float], str]:
+    """Return the deficits of alternatives, and the experiment that would distinguish them."""
     experiment = CAUSES[effect.name].separate_by
     if effect in _ALWAYS_CONFOUNDED:
-        return [_ALWAYS_CONFOUNDED[effect]], experiment
+        return {_ALWAYS_CONFOUNDED[effect]: 0.0}, experiment
     dwells, channels = fit.used, channels_of(fit.used)
     # a curve over temperature keeps its slope
     names = [] if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects else [
@@ -489,13 +487,14 @@ def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str
             for limit in (fastest * np.linspace(0.5, 0.98, 25)).tolist()])
     others, change = [each for each in fit.terms if each.effect is not effect], fit.change(effect)
     known = sensitivity_columns(dwells, others)
-    lacks = {name: fit.largest_gain(change[:, None], known, change)
-             - fit.largest_gain(columns, known, change) for name, columns in tried.items()}
-    names = sorted((name for name in lacks if lacks[name] < MIN_DISTINGUISHING_SIGMAS ** 2),
-                   key=lambda name: max(lacks[name], 0.0))
-    if effect in CONFOUNDERS and CONFOUNDERS[effect].name in names:
+    lacks = {name: 0.5 * (fit.largest_gain(change[:, None], known, change)
+                          - fit.largest_gain(columns, known, change))
+             for name, columns in tried.items()}
+    deficits = {name: max(lack, 0.0) for name, lack in sorted(
+        lacks.items(), key=lambda each: each[1]) if lack < 0.5 * MIN_DISTINGUISHING_SIGMAS ** 2}
+    if effect in CONFOUNDERS and CONFOUNDERS[effect].name in deficits:
         swapped = try_replace(fit, effect, CONFOUNDERS[effect])
         rate = None if swapped is None else distinguishing_rate(fit, swapped)
         if rate is not None:
             experiment = f'add two dwells each way at {rate / DEGREE:.0f} deg/s'
-    return names, experiment if names else ''
+    return deficits, experiment if deficits else ''

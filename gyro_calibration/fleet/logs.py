@@ -44,7 +44,6 @@ from gyro_calibration.calibration.selection import SelectedEffects
 from gyro_calibration.diagnosis.gates import is_at_rest, refuse_mismatch, refuse_unusable
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.files import (
     describe_error, InputError, open_regular_file, read_bytes, sha256_digest, to_printable,
     write_atomically)
@@ -423,8 +422,7 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
     if task.generator is None:
         return found
     try:
-        diagnosis = (diagnose_table(log, None) if log.time is None
-                     else diagnose([log], task.generator, names=[to_printable(path)]))
+        diagnosis = diagnose([log], task.generator, names=[to_printable(path)])
     except (DataRefused, ArithmeticError, np.linalg.LinAlgError) as error:
         found['diagnosis'] = {'verdict': 'refused', 'reason': _format_reason(error, path),
                               'findings': []}

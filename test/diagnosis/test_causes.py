@@ -53,7 +53,8 @@ def _laid():
 @pytest.mark.parametrize('pair', LOOK_ALIKES, ids='-'.join)
 def test_twins_are_given_the_experiment_that_physics_wants_in_either_order(pair, laid):
     for one, other in (pair, pair[::-1]):
-        words = next_experiment(one, [(other, 2.0)], observed_range([laid]))
+        words = next_experiment(one, [(other, 2.0)], observed_range(
+            [laid.channels.rate], [laid.channels.temperature], laid.duration))
         assert WANTED[pair] in words
         assert f'{other.replace("_", " ")} by 2.0 sigma, 2 such logs together by 2.8' in words
 

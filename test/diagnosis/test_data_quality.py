@@ -17,7 +17,8 @@ import re
 from chance import fewest, most, seeded
 from diagnosed import log_of
 from gyro_calibration.diagnosis.data_quality import FALSE_ALARM_CHANCE, inspect_record
-from gyro_calibration.diagnosis.gates import identify_unit_factor, refuse_unusable, UNIT_FACTORS
+from gyro_calibration.diagnosis.gates import (
+    examine_log, identify_unit_factor, refuse_unusable, UNIT_FACTORS)
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import encoder_step
 from gyro_calibration.logs.stamps import fit_stamp_grid
@@ -291,59 +292,62 @@ GOOD = swing(np.random.default_rng(1))
 NAN = np.where(np.arange(6000) < 5950, np.nan, 1.0)
 OTHER_UNITS = GyroModel((Term(SCALE_FACTOR_ERROR, (1.0 / DEGREE - 1.0,)),))
 REFUSED = {
-    'counts alone': (replace(GOOD, output=None, counts=GOOD.output), None,
+    'counts alone': (replace(GOOD, output=None, counts=GOOD.output),
                      'no gyro output in rad/s; with'),
-    'no reference': (replace(GOOD, reference_rate=None), None,
+    'no reference': (replace(GOOD, reference_rate=None),
                      'no reference, and the gyro is not at rest'),
     'few': (Log(output=GOOD.output[:90], time=GOOD.time[:90],
-                reference_rate=GOOD.reference_rate[:90]),
-            None, '90 of 90 samples'),
+                reference_rate=GOOD.reference_rate[:90]), '90 of 90 samples'),
     'short': (Log(output=GOOD.output[:900], time=GOOD.time[:900],
-                  reference_rate=GOOD.reference_rate[:900]), None, 'lasts 8.99 s'),
-    'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1), None,
+                  reference_rate=GOOD.reference_rate[:900]), 'lasts 8.99 s'),
+    'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1),
                  'in 100 % of the samples: it is dead'),
-    'same': (replace(GOOD, reference_rate=GOOD.output), None, '1 times the reference plus'),
-    'affine': (replace(GOOD, reference_rate=(GOOD.output - 0.1) / 1.3), None,
+    'same': (replace(GOOD, reference_rate=GOOD.output), '1 times the reference plus'),
+    'affine': (replace(GOOD, reference_rate=(GOOD.output - 0.1) / 1.3),
                '1.3 times the reference plus 5.73 deg/s'),
     'summed up': (Log(output=GOOD.output, time=GOOD.time,
                       reference_heading=np.cumsum(GOOD.output) * INTERVAL),
-                  None, '1 times the reference'),
-    'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None,
-                  'the gyro has a value in 50 of 6000'),
-    'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None,
+                  '1 times the reference'),
+    'lost gyro': (replace(GOOD, output=GOOD.output * NAN), 'the gyro has a value in 50 of 6000'),
+    'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN),
                        'the reference has a value in 50 of 6000 samples; at least 100, and a '
                        'tenth or at even intervals, are needed: repair its line'),
     'few fixes': (Log(output=GOOD.output, time=GOOD.time, reference_heading=np.where(
-        np.arange(6000) % 100, np.nan, np.cumsum(GOOD.reference_rate) * INTERVAL)), None,
+        np.arange(6000) % 100, np.nan, np.cumsum(GOOD.reference_rate) * INTERVAL)),
         'in 60 of 6000 samples; at least 100 are needed: record longer, 99 s'),
-    'few rows': (Log(output=GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None,
-                 '5 rows'),
-    'model in deg/s': (GOOD, OTHER_UNITS, 'other units'),
-    'range in rad/s read as deg/s': (GOOD, GyroModel(rate_range=(-0.01, 0.01)),
-                                     'other units, or belongs to another gyro'),
-    'noise in deg': (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate,
-                             reference_rate=None),
-                     GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk')}
+    'few rows': (Log(output=GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), '5 rows')}
 
 
-@pytest.mark.parametrize('log, model, reason', REFUSED.values(), ids=REFUSED)
-def test_a_log_that_allows_no_diagnosis_is_refused_in_one_sentence(log, model, reason):
+@pytest.mark.parametrize('log, reason', REFUSED.values(), ids=REFUSED)
+def test_a_log_that_allows_no_diagnosis_is_refused_in_one_sentence(log, reason):
     with pytest.raises(DataRefused) as refused:
-        refuse_unusable(log, model)
+        refuse_unusable(log)
     assert (reason in str(refused.value) and '\n' not in str(refused.value)
             and re.search('[:;]', str(refused.value)))
+
+
+@pytest.mark.parametrize('log, model, evidence', [
+    (GOOD, OTHER_UNITS, 'which is not plausible'),
+    (GOOD, GyroModel(rate_range=(-0.01, 0.01)), 'the model is for rates up to'),
+    (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None),
+     GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk'),
+    (Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), OTHER_UNITS,
+     'which is not plausible')], ids=['in deg/s', 'range', 'noise in deg', 'table'])
+def test_a_model_of_other_units_fails_a_gate(log, model, evidence):
+    gate = examine_log(log, model)[-1]
+    assert gate.name == 'model' and gate.passed is False
+    assert evidence in gate.evidence and 'rad/' in gate.remedy
 
 
 def test_a_log_that_allows_a_diagnosis_is_accepted():
     own = GyroModel((Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))),
                     rate_range=(-1.0, 1.0), noise=WHITE)
     half = np.where(np.arange(6000) % 1000 < 300, np.nan, 1.0)
-    refuse_unusable(GOOD)
-    refuse_unusable(GOOD, own)
+    for log in (GOOD, Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100])):
+        assert all(gate.passed for gate in examine_log(log, own))
     refuse_unusable(replace(GOOD, output=GOOD.output * half,
-                            reference_rate=GOOD.reference_rate * half[::-1]), own)
-    refuse_unusable(replace(GOOD, output=GOOD.output / DEGREE), own)
-    refuse_unusable(Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
+                            reference_rate=GOOD.reference_rate * half[::-1]))
+    refuse_unusable(replace(GOOD, output=GOOD.output / DEGREE))
 
 
 RECORDINGS = {

@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 import json
+import math
 import re
 
 from gyro_calibration.calibration.dwells import join_dwells
@@ -104,7 +105,21 @@ def test_a_parabola_over_temperature_stays_where_its_slope_is_withdrawn():
     slope = STATIC_EFFECTS['bias_temperature']
     assert {slope, STATIC_EFFECTS['bias_temperature_quadratic']} <= set(found.fit.effects)
     withdrawn = diagnosis._name_causes(dwells, None, [slope])
-    assert STATIC_EFFECTS['bias_temperature_quadratic'] in withdrawn.causes
+    assert STATIC_EFFECTS['bias_temperature_quadratic'] in withdrawn.without
+
+
+def test_a_cause_that_left_out_sweeps_do_not_confirm_is_suspected_and_in_no_model(
+        without_gain, monkeypatch):
+    generator, truth = np.random.default_rng(7), gyro('cubic_nonlinearity', -0.01)
+    table = Table().measure(truth, generator)
+    (found,) = diagnose_table(table, None).findings
+    assert found.status == 'established' and sum(found.probability.values()) == pytest.approx(1.0)
+    assert {*found.probability} == members(found)
+    monkeypatch.setattr(diagnosis, 'MIN_PREDICTION_SIGMAS', math.inf)
+    found = diagnose_table(table, None)
+    assert [each.status for each in found.findings] == ['suspected']
+    assert found.verdict == 'adequate'
+    assert [term.effect.name for term in found.model.terms] == [*NUISANCES]
 
 
 # sets, and what separates them

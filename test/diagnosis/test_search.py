@@ -19,8 +19,9 @@ from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
-    confirm_causes, evidence_for, held_out_sigmas, MIN_PREDICTION_SIGMAS, p_value, refine_jointly,
-    search_causes, start_search)
+    confirm_causes, evidence_for, held_out_sigmas, p_value, refine_jointly, search_causes,
+    start_search)
+from gyro_calibration.diagnosis.significance import MIN_PREDICTION_SIGMAS
 from gyro_calibration.logs.log import Log
 from gyro_calibration_bench.hidden import hide
 import numpy as np
