@@ -733,29 +733,16 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
 
 def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Array]:
     """Return the spans with the rate corrected by first values, and variances of points."""
-    free = spans.prior_deviations(causes)
-    count = len(spans.time) - 1
-    delayed = replace(spans, delay=spans.delay or _find_delay(spans))
-    point_variances: Array = np.ones(count + 1)
-    scale = 0.0
+    corrected, scale = replace(spans, delay=spans.delay or _find_delay(spans)), 0.0
     for number in range(20):
-        design = design_matrix(delayed, causes)
-        if spans.treatment.is_fine:
-            values = _robust_least_squares(design, delayed.observed, free)[0]
-        else:
-            values, error = _fit_headings(delayed, design, point_variances, free)
-            point_variances = _burst_variance(delayed.time, error)
-        corrected = delayed.with_corrected_rate(values, causes)
-        if spans.treatment.is_fine:
-            values += (delayed.correction(causes, len(values))
-                       - corrected.correction(causes, len(values)))
-            left = corrected.observed - design_matrix(corrected, causes) @ values
-            point_variances = _point_variances(left[:count])
-        delayed, change, scale = corrected, values[0] - scale, values[0]
+        values, left = _robust_least_squares(design_matrix(corrected, causes), corrected.observed,
+                                             spans.prior_deviations(causes))
+        corrected = corrected.with_corrected_rate(values, causes)
+        change, scale = values[0] - scale, values[0]
         # the columns are of the rate by the scale before
         if number and abs(scale * change) < 1e-4:
             break
-    return delayed, point_variances
+    return corrected, _point_variances(corrected, left)
 
 
 def _find_delay(spans: Spans) -> float:
@@ -804,43 +791,25 @@ def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
     return replace(spans, rests=spans.rests[agree], stands=spans.stands[agree])
 
 
-def _fit_headings(spans: Spans, design: Array, point_variances: Array,
-                  prior: Array) -> tuple[Array, Array]:
-    """Return values by weighted least squares of the headings, and the error of each point."""
-    count, observed = len(point_variances) - 1, spans.observed
-    columns = np.pad(np.cumsum(design[:count], axis=0), ((1, 0), (0, 0)))
-    columns = np.column_stack([columns, np.ones(len(columns))])
-    error = heading = np.append(0.0, np.cumsum(observed[:count]))
-    # the prior, and rests in which the reference stands
-    noise = spans.walk_bounds[1] * np.sqrt(spans.rest_durations[spans.stands])
-    own = np.vstack([np.diag(1.0 / prior), design[count:][spans.stands] / noise[:, None]])
-    own = np.pad(own, ((0, 0), (0, 1)))
-    known = np.append(np.zeros(len(prior)), observed[count:][spans.stands] / noise)
-    for _ in range(3):
-        weight = 1.0 / np.sqrt(point_variances) / (robust_deviation(error) + 1e-9)
-        values = np.linalg.lstsq(np.vstack([columns * weight[:, None], own]),
-                                 np.append(heading * weight, known), rcond=None)[0]
-        error = heading - columns @ values
-    return values[:-1], error
+def _point_variances(spans: Spans, left: Array) -> Array:
+    """
+    Return the variance of each point relative to the usual one, by the residual, shape (n + 1,).
 
-
-def _burst_variance(time: Array, error: Array) -> Array:
-    """Return the variance of each point of a course relative to the usual one."""
-    around = np.abs(time[:, None] - time) <= 2.5  # bursts of errors last for about 5 s
-    squares, count = around @ error ** 2, around.sum(axis=1)
+    Outliers have more, by up to 100, and beside a course all points around bursts of errors, which
+    last for about 5 s.
+    """
+    error = np.append(0.0, np.cumsum(left[:len(spans.time) - 1]))
+    if spans.treatment.is_fine:
+        off = np.abs(error - median_filter(error, 9, mode='nearest'))
+        # a monotonic drift is equal to its median
+        by_steps = robust_deviation(np.diff(error, 2)) / math.sqrt(6.0)
+        size = max(robust_deviation(off), by_steps) + 1e-9
+        return np.clip(off / (3.0 * size), 1.0, 10.0) ** 2
+    around = np.abs(spans.time[:, None] - spans.time) <= 2.5
+    squares, count = around @ (error - np.median(error)) ** 2, around.sum(axis=1)
     usual = max(float(np.median(squares / count)), 1e-12)
     # Student's distribution with 4 degrees of freedom, and one for each observed error
     return np.asarray((4.0 + squares / usual) / (4.0 + count))
-
-
-def _point_variances(left: Array) -> Array:
-    """Return the relative variance of each point, larger for outliers, at most 100."""
-    point = np.concatenate([[0.0], np.cumsum(left)])
-    off = np.abs(point - median_filter(point, 9, mode='nearest'))
-    # a monotonic drift is equal to its median
-    by_steps = robust_deviation(np.diff(point, 2)) / math.sqrt(6.0)
-    size = max(robust_deviation(off), by_steps) + 1e-9
-    return np.clip(off / (3.0 * size), 1.0, 10.0) ** 2
 
 
 def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
