@@ -50,6 +50,7 @@ from gyro_calibration.calibration.own_instants import (
     is_slow, keep_own_instants, MAX_GYRO_LAG, MAX_ROUNDING_STEP, OwnInstants)
 from gyro_calibration.calibration.reference_noise import (
     find_rests, heading_difference, MIN_COURSE_NOISE, rate_noise_share)
+from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
@@ -58,6 +59,7 @@ from gyro_calibration.logs.quality import (
     quantization_step, robust_deviation, rounding_errors, white_noise_deviation)
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
+from gyro_calibration.model.motion import motion_from_headings
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
@@ -747,16 +749,9 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Arr
 
 def _find_delay(spans: Spans) -> float:
     """Return the trial delay of the best agreement of gyro and reference, s."""
-    count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
-
-    def disagreement(delay: float) -> float:
-        """Return the robust difference of gyro and reference over a span at a delay, rad."""
-        moved = replace(spans, delay=delay)
-        left = _robust_least_squares(moved.rate_columns(), moved.observed, prior[:2])[1]
-        return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
-
-    most = int(spans.treatment.largest_delay / _DELAY_STEP + 1e-6)
-    return min((_DELAY_STEP * np.arange(-most, most + 1)).tolist(), key=disagreement)
+    run = split_run(spans.stamps - spans.time[0], spans.output)
+    return fit_profile(run, motion_from_headings(spans.time, spans.heading),
+                       spans.treatment.largest_delay)[2]
 
 
 def design_matrix(spans: Spans, causes: Sequence[CauseTerm]) -> Array:
