@@ -24,13 +24,15 @@ import math
 
 from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, bias_wander_columns, TridiagonalMatrix)
+from gyro_calibration.calibration.run_faults import (
+    DeviatingStretch, find_deviating_stretch, fit_profile, split_run)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, robust_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import helmert, orth
+from scipy.linalg import helmert
 from scipy.special import softmax
 
 
@@ -167,7 +169,7 @@ class _RunAlignment:
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
                  slip_deviation: float, cross_rotation: Array, bias_wanders: bool):
-        self._time, self._rate = time, rate
+        self._time, self._rate, self._motion = time, rate, motion
         self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
         self._integral = integrate(time, rate)
         # rate and acceleration are differences over this time to either side, s
@@ -270,28 +272,8 @@ class _RunAlignment:
         return within + (at - inside) * rate
 
     def find_coarse_offset(self, largest: float) -> float:
-        """Return the smallest of the offsets, s, at which most increments fit about as well."""
-        # a profile is smoother than measured headings
-        step = 0.02 if self.is_measured else 0.04
-        offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
-        misfits = np.array([self._misfit(offset) for offset in offsets])
-        padded = np.pad(misfits, 1, constant_values=math.inf)
-        bottoms = offsets[(misfits <= np.minimum(padded[:-2], padded[2:]))
-                          & (misfits <= 6.0 * misfits.min())]
-        if len(bottoms) < 2 or math.isinf(misfits.min()):
-            return float(offsets[misfits.argmin()])
-        fine = np.arange(-5, 6) * 0.002
-        deepest = [min((self._misfit(offset), offset) for offset in bottom + fine)
-                   for bottom in bottoms]
-        alike = [offset for misfit, offset in deepest if misfit <= 1.5 * min(deepest)[0]]
-        return float(min(alike, key=abs))
-
-    def _misfit(self, offset: float) -> float:
-        data = self.increments_at(offset)
-        if len(data.gyro_increments) < 10:
-            return math.inf
-        return float(
-            np.mean(np.abs(robust_residual(data.columns[:, :2], data.gyro_increments, 3))))
+        """Return the trial offset, s, at which gyro and motion agree best."""
+        return fit_profile(split_run(self._time, self._rate), self._motion, largest, 0.02)[2]
 
 
 def _second_difference(heading: Callable[[Array], Array], at: Array, base: float) -> Array:
@@ -826,22 +808,6 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     return float(start), math.sqrt(variance) / abs(scale)
 
 
-@dataclass(frozen=True)
-class DeviatingStretch:
-    """The stretch of a run that improves a fit most by a turn of its own."""
-
-    # edges that it begins and ends at
-    first: int
-    last: int
-    excess_rate: float  # its excess rate, rad/s
-    # sum of squares that it explains, and that remains
-    explained_squares: float
-    remaining_squares: float
-    # what each stretch explains, and its column beside those of the fit, squares, shape (m,)
-    all_explained_squares: Array
-    column_squares: Array
-
-
 #: Standard deviation of a turn beside the profile, by hand or a slip, rad/s.
 EXCESS_RATE_DEVIATION = 0.0175
 
@@ -889,28 +855,3 @@ def _average_over_stretch(
     return average_hypotheses(
         np.array([1.0, odds]) / (1.0 + odds), np.array([values, other.values[:2]]),
         np.array([covariance, other.covariance[:2, :2]]))
-
-
-def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> DeviatingStretch:
-    """
-    Return the stretch that improves a fit most.
-
-    Given are white columns of the fit, (n, k), the addition of a turn of 1 rad/s from each edge
-    on, (n, m), of which the last is the end, and what is fitted, (n,).
-    """
-    basis = orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), 1e-7)
-    step_residuals = steps - basis @ (basis.T @ steps)
-    sums, products, whole = (step_residuals.T @ observed, step_residuals.T @ step_residuals,
-                             steps.T @ steps)
-    differences = sums[:, None] - sums
-    norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
-                     for matrix in (products, whole))
-    # no empty stretches, nor those of which the fit explains 80 %: noise gives them large turns
-    distinct = np.triu(norms > 0.2 * wholes, 1)
-    gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
-    first, last = np.unravel_index(int(gains.argmax()), gains.shape)
-    gain = float(gains[first, last])
-    return DeviatingStretch(
-        int(first), int(last), float(differences[first, last] / max(norms[first, last], 1e-300)),
-        gain, float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
-        gains[distinct], norms[distinct])
