@@ -433,14 +433,13 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
                            (rounding, max(float(np.ptp(heading)), 2.0 * rounding)))
     largest = max(TECHNOLOGY_PRIORS[technology][1], 3.0 * abs(bias))
     found = fit_noise_grid(
-        moved, spacing[:, None], [walk, repeated],
-        *bias_wander_columns(middle, cosine_count=WANDER_COSINES), prior_mean=np.array([-bias]),
-        prior_deviation=np.array([largest]),
+        moved + bias * spacing, spacing[:, None], [walk, repeated],
+        *bias_wander_columns(middle, cosine_count=WANDER_COSINES),
         hierarchical_priors=(HierarchicalPrior('bias', 0, (0.1 * largest, largest)),))
     white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
-    return _Drift(bias + float(found.values[0]), float(found.deviations[0]),
+    return _Drift(float(found.values[0]), float(found.deviations[0]),
                   math.sqrt(found.unobservable_variance),
                   (math.sqrt(squares / stats.chi2.ppf(0.975, len(white) - 1)),
                    math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))

@@ -26,12 +26,12 @@ from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, bias_wander_columns, TridiagonalMatrix)
 from gyro_calibration.calibration.run_faults import (
     DeviatingStretch, find_deviating_stretch, fit_profile, split_run)
-from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, robust_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 from scipy.linalg import helmert
 from scipy.special import softmax
 
@@ -171,7 +171,7 @@ class _RunAlignment:
                  slip_deviation: float, cross_rotation: Array, bias_wanders: bool):
         self._time, self._rate, self._motion = time, rate, motion
         self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
-        self._integral = integrate(time, rate)
+        self._integral = make_interp_spline(time, rate, 1).antiderivative()
         # rate and acceleration are differences over this time to either side, s
         self._smoothing_time = max(float(np.median(np.diff(time))), 0.01)
         self._acceleration_time = self._smoothing_time
@@ -223,7 +223,7 @@ class _RunAlignment:
         walk = _random_walk_covariance(time, weight, begins)
         accelerations = np.empty((0, 3))
         if self.is_measured:  # those by gyro and reference over a block, and the 4th order
-            whole, half = (_second_difference(self._integral_at, gyro_time[is_covered], each)
+            whole, half = (_second_difference(self._integral, gyro_time[is_covered], each)
                            for each in (base, 0.5 * base))
             of_reference = _second_difference(
                 lambda at: np.interp(at, points.time, points.heading), time, base)
@@ -258,18 +258,10 @@ class _RunAlignment:
     def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """Return rate, acceleration and integral of the rate at times, corrected for a lag."""
         base = self._smoothing_time
-        integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
+        integral, later, earlier = (self._integral(at + shift) for shift in (0.0, base, -base))
         rate = 0.5 * (later - earlier) / base
-        acceleration = _second_difference(self._integral_at, at, self._acceleration_time)
+        acceleration = _second_difference(self._integral, at, self._acceleration_time)
         return rate + constant * acceleration, acceleration, integral + constant * rate
-
-    def _integral_at(self, at: Array) -> Array:
-        inside = np.clip(at, self._time[0], self._time[-1])
-        index = np.searchsorted(self._time, inside, side='right') - 1
-        rate = np.interp(inside, self._time, self._rate)
-        within = (self._integral[index]
-                  + 0.5 * (inside - self._time[index]) * (rate + self._rate[index]))
-        return within + (at - inside) * rate
 
     def find_coarse_offset(self, largest: float) -> float:
         """Return the trial offset, s, at which gyro and motion agree best."""
@@ -401,8 +393,7 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     time, heading = (0.5 * (values[index] + values[index + 1])
                      for values in (motion.time, motion.heading))
     speed = np.abs(np.diff(heading) / np.diff(time))
-    relative_deviation = (np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)])
-                          if len(time) else time)
+    relative_deviation = np.maximum(np.append(speed, 0.0), np.append(0.0, speed))[:len(time)]
     relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
                                   np.clip(relative_deviation * np.diff(motion.time)[index] / step,
                                           0.05, 1.0))
