@@ -357,17 +357,13 @@ class Spans:
         """Return the rate by a Wiener filter: its noise would pass for information on a delay."""
         return self._smooth(np.asarray(self.channels.rate))
 
-    def rate_columns(self) -> Array:
-        """Return the columns of scale factor error and bias, shape (n + r, 2)."""
-        rate = np.asarray(self.channels.rate)
-        columns = np.column_stack([-self.span_integrals(each)
-                                   for each in (rate, np.ones_like(rate))])
-        columns[:len(self.time) - 1, 0] *= self.angles != 0.0
-        return columns
-
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
-        return np.column_stack([self.rate_columns(), self.span_changes(self.smooth_rate)])
+        rate = np.asarray(self.channels.rate)
+        columns = np.column_stack([-self.span_integrals(rate), -self.span_integrals(np.ones(1)),
+                                   self.span_changes(self.smooth_rate)])
+        columns[:len(self.time) - 1, 0] *= self.angles != 0.0
+        return columns
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
@@ -1007,7 +1003,7 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                           'walk')
     fit = fit_spans(spans)
     turned = np.diff(spans.heading)
-    left = fit.spans.observed - fit.values[0] * fit.spans.rate_columns()[:, 0]
+    left = fit.spans.observed - fit.values[0] * fit.spans.base_columns()[:, 0]
     # a bias is the same in each span
     residual, variation = (robust_deviation(each - np.median(each))
                            for each in (left[:len(turned)], turned))

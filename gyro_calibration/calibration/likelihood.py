@@ -182,12 +182,12 @@ class _RunAlignment:
         self.shaft_error: Array = np.zeros(2)  # in the columns of the shaft, rad
         self.has_shaft = self.is_measured and not cross_rotation.size
 
-    def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
+    def increments_at(self, offset: float, lag: float) -> _Increments:
         """
         Return the increments if the gyro is `offset` s late, part of it by a first-order lag.
 
         The output of a lag with the time constant √(2 `lag`), plus its rate times that, is the
-        input.
+        input. `DataRefused` is raised for hardly any.
         """
         points, constant = self._points, math.sqrt(2.0 * lag)
         gyro_time = points.time + offset - constant
@@ -198,9 +198,10 @@ class _RunAlignment:
             for at, known in ((points.time, points.time), (gyro_time, self._time)):
                 is_covered &= (at >= known[0] + base) & (at <= known[-1] - base)
         time, weight = points.time[is_covered], 1.0 / points.variance[is_covered]
-        if len(time) < 2:
-            return _Increments(np.empty((0, 4)), *np.empty((9, 0)))
-        begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / base + 1e-6), prepend=-1.0))
+        begins = np.flatnonzero(np.diff(np.floor((time - time[:1]) / base + 1e-6), prepend=-1.0))
+        if len(begins) <= 10:
+            raise DataRefused('the samples cover less than ten blocks of the motion: '
+                              'record the whole motion')
         precision = np.add.reduceat(weight, begins)
         weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
         known = np.column_stack([points.heading[is_covered], time,
@@ -246,14 +247,6 @@ class _RunAlignment:
         shared = np.column_stack([_shaft_columns(correct_shaft(points.heading, sizes)),
                                   points.shared[:, 2:]])
         self._points = replace(points, shared=shared)
-
-    def require_increments(self, offset: float, lag: float) -> _Increments:
-        """Return the increments, or refuse a run with hardly any."""
-        data = self.increments_at(offset, lag)
-        if len(data.gyro_increments) < 10:
-            raise DataRefused('the samples cover less than ten blocks of the motion: '
-                              'record the whole motion')
-        return data
 
     def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """Return rate, acceleration and integral of the rate at times, corrected for a lag."""
@@ -730,7 +723,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
-    data = alignment.require_increments(offset, lag)
+    data = alignment.increments_at(offset, lag)
     possible, response_deviation = float(alignment.prior_deviation[3]), 0.0
     estimate: _Estimate | None = None
     for prior_factors in (data.prior_factors[:1], data.prior_factors, data.prior_factors):
@@ -741,7 +734,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
                 alignment.prior_deviation[3], response_deviation = _lag_prior(
                     data, estimate, offset, possible)
                 alignment.set_lag(float(estimate.values[3]))
-            data = alignment.require_increments(offset, lag)
+            data = alignment.increments_at(offset, lag)
         values, covariance, estimate = _average_over_noise(data, prior_factors,
                                                            alignment.has_shaft)
         for _ in range(8):
@@ -757,7 +750,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
             if abs(delay_change) < 1e-9 and abs(lag_change) < 1e-9:
                 break
             offset, lag = offset - delay_change, lag + lag_change
-            data = alignment.require_increments(offset, lag)
+            data = alignment.increments_at(offset, lag)
             noise = _IncrementCovariance(data, estimate.noise.ratio)
             estimate = _solve_weighted(data, noise, noise.solve(_instrument(data, noise)),
                                        estimate.prior_deviation)

@@ -205,7 +205,7 @@ def test_noise_of_the_gyro_is_no_turn_of_a_course():
     spans = lay_out_spans(short_odometry(0, 1.0, 5, 0.0))
     count = len(spans.heading) - 1
     straight = replace(spans, heading=np.zeros(count + 1))
-    turned, none = (each.rate_columns()[:count, 0] for each in (spans, straight))
+    turned, none = (each.base_columns()[:count, 0] for each in (spans, straight))
     assert np.abs(turned).max() > 45.0 * DEGREE
     assert (none == 0.0).all() and (straight.angles == 0.0).all()
 
