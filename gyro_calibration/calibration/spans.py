@@ -93,7 +93,6 @@ class ReferenceTreatment:
     # whether its errors are small enough to show a random walk of the bias, and events
     is_fine: bool
     errs_as_heading: bool  # whether it has errors of a heading, not of an integrated rate
-    is_followed: bool = False  # whether the motion may follow it, late and with another size
     wide_prior: tuple[float, float] = WIDE_PRIOR  # of scale factor error and bias, rad/s
 
     @property
@@ -108,7 +107,7 @@ COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0
 HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
                                        True)
 _TREATMENTS = {
-    'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False, is_followed=True),
+    'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
     # on the host of the gyro: small delays, as a swing agrees again a period later
     'encoder': replace(HEADING_TREATMENT,
                        prior=(*HEADING_TREATMENT.prior[:2], MAX_ENCODER_OFFSET / _DELAY_SIGMAS)),
