@@ -260,11 +260,6 @@ class _Regression:
     banded: Sequence[BandedNoise]
     shared: Sequence[SharedNoise]  # and priors of unknown size; with variances of shape (m + q,)
 
-    @property
-    def parts(self) -> list[BandedNoise | SharedNoise]:
-        """Return the parts of the noise and the priors of unknown size."""
-        return [*self.banded, *self.shared]
-
     def banded_covariance(self, sizes: Iterable[float]) -> TridiagonalMatrix:
         """Return the covariance of the banded noise."""
         diagonal, neighbours = np.zeros((2, len(self.observed)))
@@ -338,7 +333,8 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
             f'{len(observed)} observations do not determine {count} values and their noise')
     together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
     width = together.shape[1]
-    precision = np.zeros(width)
+    # shared values without a variance are zero
+    precision = np.append(np.zeros(count), np.full(width - count, 1e300))
     if prior_deviation is not None:
         precision[:count] = 1.0 / np.square(prior_deviation)
     shared = [*(replace(part, variance=np.append(np.zeros(count), part.variance))
@@ -348,14 +344,15 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     regression = _Regression(_quasi_differences(observed, carried),
                              _quasi_differences(together, carried), count, precision, banded,
                              shared)
+    parts: list[BandedNoise | SharedNoise] = [*banded, *shared]
     axes = [np.array([low]) if low == high else np.geomspace(low, high, 5)
-            for low, high in (part.size_range for part in regression.parts)]
+            for low, high in (part.size_range for part in parts)]
     for remaining in reversed(range(4)):
         sizes, log_likelihoods, all_values, covariances = _evaluate_grid(regression, axes)
         weights = softmax(log_likelihoods)
         if remaining:
             axes = [_refine_axis(axis, sizes[:, place], weights, part.size_range)
-                    for place, (axis, part) in enumerate(zip(axes, regression.parts))]
+                    for place, (axis, part) in enumerate(zip(axes, parts))]
     unobservable = sizes[:, len(banded):] ** 2 @ np.array(
         [part.unobservable_variance for part in shared])
     if wandering_value is not None:
@@ -365,7 +362,7 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     noise = regression.banded_covariance(sizes[best, :len(banded)])
     _, (likeliest,), _ = regression.solve(
         noise, regression.prior_precisions(sizes[best: best + 1, len(banded):]))
-    names = [part.name for part in regression.parts]
+    names = [part.name for part in parts]
     return GridFit(values, covariance,
                    {name: _interval_95(each, weights) for name, each in zip(names, sizes.T)},
                    dict(zip(names, sizes[best].tolist())),
