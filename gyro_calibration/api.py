@@ -26,7 +26,7 @@ import reprlib
 from typing import Any
 
 from gyro_calibration.calibration.encoder import calibrate
-from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
+from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import plots
 from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures

@@ -11,7 +11,7 @@
 """
 Logs to a model: self-calibration, whole turns, rate table, encoder, course over ground.
 
-Reading order: `noise_grid`, `likelihood`, `run_faults`, `self_calibration`, `whole_turns`,
+Reading order: `noise_grid`, `run_faults`, `likelihood`, `self_calibration`, `whole_turns`,
 `motion_design`, `dwells`, `scatter`, `rate_table`, `selection`, `own_instants`,
-`reference_noise`, `heading_regression`, `encoder`.
+`reference_noise`, `spans`, `heading_regression`, `encoder`.
 """

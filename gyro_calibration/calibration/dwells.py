@@ -425,12 +425,12 @@ def _find_straight(samples: _Samples) -> list[slice]:
         headings[reach:-reach] - 0.5 * (headings[2 * reach:] + headings[:-2 * reach]))))
         for reach in (2, 3, 5) if len(headings) > 2 * reach), default=math.inf)
     tolerance = step + float(np.clip(3.0 * deviation, 0.02 * DEGREE, _MAX_DEVIATION))
-    kept: list[slice] = []
+    kept: list[range] = []
     for cone in _split_into_lines(times, headings, 2.0 * tolerance):
         if times[cone.stop - 1] - times[cone.start] < 0.5 * _MIN_DURATION:
             continue
         # a line through the middle is extended within the tolerance, by at most its own length
-        length = cone.stop - cone.start
+        length = len(cone)
         middle = slice(cone.start + length // 5, cone.stop - length // 5)
         begin, end = max(0, cone.start - length), min(len(times), cone.stop + length)
         slope = fit_scale(headings[middle], times[middle])[1]
@@ -443,21 +443,17 @@ def _find_straight(samples: _Samples) -> list[slice]:
             end = begin + int(after[0]) - _count_ramp_blocks(off[after[0]:], tolerance)
         if len(before):
             begin += int(before[-1]) + 1 + _count_ramp_blocks(off[before[-1]::-1], tolerance)
-        part = slice(begin, max(begin, end))
+        part = range(begin, max(begin, end))
         # of two stretches that overlap, the longer one has the more accurate line
-        if kept and part.start < kept[-1].stop and _length(part) > _length(kept[-1]):
+        if kept and part.start < kept[-1].stop and len(part) > len(kept[-1]):
             kept.pop()
         if not kept or part.start >= kept[-1].stop:
             kept.append(part)
     return [slice(int(edges[part.start]), int(edges[part.stop]))
-            for part in kept if _length(part) > 4]
+            for part in kept if len(part) > 4]
 
 
-def _length(part: slice) -> int:
-    return int(part.stop - part.start)
-
-
-def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator[slice]:
+def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator[range]:
     """Divide a heading into the longest stretches that a line through their first point fits."""
     start, low, high = 0, -math.inf, math.inf
     times, headings = time.tolist(), heading.tolist()
@@ -466,9 +462,9 @@ def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator
         rise = headings[place] - headings[start]
         low, high = max(low, (rise - tolerance) / elapsed), min(high, (rise + tolerance) / elapsed)
         if low > high or times[place] - times[place - 1] > _MIN_DURATION:
-            yield slice(start, place)
+            yield range(start, place)
             start, low, high = place, -math.inf, math.inf
-    yield slice(start, len(times))
+    yield range(start, len(times))
 
 
 def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:

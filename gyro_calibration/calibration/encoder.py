@@ -30,8 +30,7 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     join_dwells, MIN_DWELL_SHARE, NothingSteady)
 from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, find_motion_errors, fit_course, is_noisy, lag_deviation, MAX_ENCODER_OFFSET,
-    MAX_FOLLOWED_RESIDUAL, TECHNOLOGY_PRIORS, WANDER_COSINES)
+    find_motion_errors, fit_course, is_noisy, MAX_FOLLOWED_RESIDUAL)
 from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
     ScaleBiasFit)
@@ -45,9 +44,11 @@ from gyro_calibration.calibration.reference_noise import (
 from gyro_calibration.calibration.run_faults import (
     fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
-    FALSE_ALARM_RATE, select_effects, SelectedEffects)
+    FALSE_ALARM_RATE, select_effects, SelectedEffects, TECHNOLOGY_PRIORS)
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
+from gyro_calibration.calibration.spans import (
+    COURSE_TREATMENT, lag_deviation, MAX_ENCODER_OFFSET, WANDER_COSINES)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -95,7 +96,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         samples without a number count as lost
     method : 'likelihood', or 'course' for a course over ground; None for 'course' where the
         reference is one, else 'likelihood'
-    technology : of the gyro, one of `heading_regression.TECHNOLOGY_PRIORS`; with 'course' its
+    technology : of the gyro, one of `selection.TECHNOLOGY_PRIORS`; with 'course' its
         prior decides what a drive leaves open
 
     Raises
@@ -434,14 +435,13 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
                            (rounding, max(float(np.ptp(heading)), 2.0 * rounding)))
     largest = max(TECHNOLOGY_PRIORS[technology][1], 3.0 * abs(bias))
     found = fit_noise_grid(
-        moved, spacing[:, None], [walk, repeated],
-        *bias_wander_columns(middle, cosine_count=WANDER_COSINES), prior_mean=np.array([-bias]),
-        prior_deviation=np.array([largest]),
+        moved + bias * spacing, spacing[:, None], [walk, repeated],
+        *bias_wander_columns(middle, cosine_count=WANDER_COSINES),
         hierarchical_priors=(HierarchicalPrior('bias', 0, (0.1 * largest, largest)),))
     white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
-    return _Drift(bias + float(found.values[0]), float(found.deviations[0]),
+    return _Drift(float(found.values[0]), float(found.deviations[0]),
                   math.sqrt(found.unobservable_variance),
                   (math.sqrt(squares / stats.chi2.ppf(0.975, len(white) - 1)),
                    math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))

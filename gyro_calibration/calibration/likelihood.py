@@ -24,13 +24,15 @@ import math
 
 from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, bias_wander_columns, TridiagonalMatrix)
-from gyro_calibration.heading.integration import integrate
+from gyro_calibration.calibration.run_faults import (
+    DeviatingStretch, find_deviating_stretch, fit_profile, split_run)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import encoder_step, MISALIGNMENT_DEVIATION, robust_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import helmert, orth
+from scipy.interpolate import make_interp_spline
+from scipy.linalg import helmert
 from scipy.special import softmax
 
 
@@ -167,9 +169,9 @@ class _RunAlignment:
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag_deviation: float,
                  slip_deviation: float, cross_rotation: Array, bias_wanders: bool):
-        self._time, self._rate = time, rate
+        self._time, self._rate, self._motion = time, rate, motion
         self.prior_deviation = np.array([math.inf, math.inf, DELAY_DEVIATION, lag_deviation])
-        self._integral = integrate(time, rate)
+        self._integral = make_interp_spline(time, rate, 1).antiderivative()
         # rate and acceleration are differences over this time to either side, s
         self._smoothing_time = max(float(np.median(np.diff(time))), 0.01)
         self._acceleration_time = self._smoothing_time
@@ -180,12 +182,12 @@ class _RunAlignment:
         self.shaft_error: Array = np.zeros(2)  # in the columns of the shaft, rad
         self.has_shaft = self.is_measured and not cross_rotation.size
 
-    def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
+    def increments_at(self, offset: float, lag: float) -> _Increments:
         """
         Return the increments if the gyro is `offset` s late, part of it by a first-order lag.
 
         The output of a lag with the time constant √(2 `lag`), plus its rate times that, is the
-        input.
+        input. `DataRefused` is raised for hardly any.
         """
         points, constant = self._points, math.sqrt(2.0 * lag)
         gyro_time = points.time + offset - constant
@@ -196,9 +198,10 @@ class _RunAlignment:
             for at, known in ((points.time, points.time), (gyro_time, self._time)):
                 is_covered &= (at >= known[0] + base) & (at <= known[-1] - base)
         time, weight = points.time[is_covered], 1.0 / points.variance[is_covered]
-        if len(time) < 2:
-            return _Increments(np.empty((0, 4)), *np.empty((9, 0)))
-        begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / base + 1e-6), prepend=-1.0))
+        begins = np.flatnonzero(np.diff(np.floor((time - time[:1]) / base + 1e-6), prepend=-1.0))
+        if len(begins) <= 10:
+            raise DataRefused('the samples cover less than ten blocks of the motion: '
+                              'record the whole motion')
         precision = np.add.reduceat(weight, begins)
         weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
         known = np.column_stack([points.heading[is_covered], time,
@@ -221,7 +224,7 @@ class _RunAlignment:
         walk = _random_walk_covariance(time, weight, begins)
         accelerations = np.empty((0, 3))
         if self.is_measured:  # those by gyro and reference over a block, and the 4th order
-            whole, half = (_second_difference(self._integral_at, gyro_time[is_covered], each)
+            whole, half = (_second_difference(self._integral, gyro_time[is_covered], each)
                            for each in (base, 0.5 * base))
             of_reference = _second_difference(
                 lambda at: np.interp(at, points.time, points.heading), time, base)
@@ -245,53 +248,17 @@ class _RunAlignment:
                                   points.shared[:, 2:]])
         self._points = replace(points, shared=shared)
 
-    def require_increments(self, offset: float, lag: float) -> _Increments:
-        """Return the increments, or refuse a run with hardly any."""
-        data = self.increments_at(offset, lag)
-        if len(data.gyro_increments) < 10:
-            raise DataRefused('the samples cover less than ten blocks of the motion: '
-                              'record the whole motion')
-        return data
-
     def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """Return rate, acceleration and integral of the rate at times, corrected for a lag."""
         base = self._smoothing_time
-        integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
+        integral, later, earlier = (self._integral(at + shift) for shift in (0.0, base, -base))
         rate = 0.5 * (later - earlier) / base
-        acceleration = _second_difference(self._integral_at, at, self._acceleration_time)
+        acceleration = _second_difference(self._integral, at, self._acceleration_time)
         return rate + constant * acceleration, acceleration, integral + constant * rate
 
-    def _integral_at(self, at: Array) -> Array:
-        inside = np.clip(at, self._time[0], self._time[-1])
-        index = np.searchsorted(self._time, inside, side='right') - 1
-        rate = np.interp(inside, self._time, self._rate)
-        within = (self._integral[index]
-                  + 0.5 * (inside - self._time[index]) * (rate + self._rate[index]))
-        return within + (at - inside) * rate
-
     def find_coarse_offset(self, largest: float) -> float:
-        """Return the smallest of the offsets, s, at which most increments fit about as well."""
-        # a profile is smoother than measured headings
-        step = 0.02 if self.is_measured else 0.04
-        offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
-        misfits = np.array([self._misfit(offset) for offset in offsets])
-        padded = np.pad(misfits, 1, constant_values=math.inf)
-        bottoms = offsets[(misfits <= np.minimum(padded[:-2], padded[2:]))
-                          & (misfits <= 6.0 * misfits.min())]
-        if len(bottoms) < 2 or math.isinf(misfits.min()):
-            return float(offsets[misfits.argmin()])
-        fine = np.arange(-5, 6) * 0.002
-        deepest = [min((self._misfit(offset), offset) for offset in bottom + fine)
-                   for bottom in bottoms]
-        alike = [offset for misfit, offset in deepest if misfit <= 1.5 * min(deepest)[0]]
-        return float(min(alike, key=abs))
-
-    def _misfit(self, offset: float) -> float:
-        data = self.increments_at(offset)
-        if len(data.gyro_increments) < 10:
-            return math.inf
-        return float(
-            np.mean(np.abs(robust_residual(data.columns[:, :2], data.gyro_increments, 3))))
+        """Return the trial offset, s, at which gyro and motion agree best."""
+        return fit_profile(split_run(self._time, self._rate), self._motion, largest, 0.02)[2]
 
 
 def _second_difference(heading: Callable[[Array], Array], at: Array, base: float) -> Array:
@@ -419,8 +386,7 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     time, heading = (0.5 * (values[index] + values[index + 1])
                      for values in (motion.time, motion.heading))
     speed = np.abs(np.diff(heading) / np.diff(time))
-    relative_deviation = (np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)])
-                          if len(time) else time)
+    relative_deviation = np.maximum(np.append(speed, 0.0), np.append(0.0, speed))[:len(time)]
     relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
                                   np.clip(relative_deviation * np.diff(motion.time)[index] / step,
                                           0.05, 1.0))
@@ -757,7 +723,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
-    data = alignment.require_increments(offset, lag)
+    data = alignment.increments_at(offset, lag)
     possible, response_deviation = float(alignment.prior_deviation[3]), 0.0
     estimate: _Estimate | None = None
     for prior_factors in (data.prior_factors[:1], data.prior_factors, data.prior_factors):
@@ -768,7 +734,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
                 alignment.prior_deviation[3], response_deviation = _lag_prior(
                     data, estimate, offset, possible)
                 alignment.set_lag(float(estimate.values[3]))
-            data = alignment.require_increments(offset, lag)
+            data = alignment.increments_at(offset, lag)
         values, covariance, estimate = _average_over_noise(data, prior_factors,
                                                            alignment.has_shaft)
         for _ in range(8):
@@ -784,7 +750,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
             if abs(delay_change) < 1e-9 and abs(lag_change) < 1e-9:
                 break
             offset, lag = offset - delay_change, lag + lag_change
-            data = alignment.require_increments(offset, lag)
+            data = alignment.increments_at(offset, lag)
             noise = _IncrementCovariance(data, estimate.noise.ratio)
             estimate = _solve_weighted(data, noise, noise.solve(_instrument(data, noise)),
                                        estimate.prior_deviation)
@@ -824,22 +790,6 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     start = heading + (shared @ estimate.values[of_shared] - error - gyro_angle
                        + bias * elapsed) / scale
     return float(start), math.sqrt(variance) / abs(scale)
-
-
-@dataclass(frozen=True)
-class DeviatingStretch:
-    """The stretch of a run that improves a fit most by a turn of its own."""
-
-    # edges that it begins and ends at
-    first: int
-    last: int
-    excess_rate: float  # its excess rate, rad/s
-    # sum of squares that it explains, and that remains
-    explained_squares: float
-    remaining_squares: float
-    # what each stretch explains, and its column beside those of the fit, squares, shape (m,)
-    all_explained_squares: Array
-    column_squares: Array
 
 
 #: Standard deviation of a turn beside the profile, by hand or a slip, rad/s.
@@ -889,28 +839,3 @@ def _average_over_stretch(
     return average_hypotheses(
         np.array([1.0, odds]) / (1.0 + odds), np.array([values, other.values[:2]]),
         np.array([covariance, other.covariance[:2, :2]]))
-
-
-def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> DeviatingStretch:
-    """
-    Return the stretch that improves a fit most.
-
-    Given are white columns of the fit, (n, k), the addition of a turn of 1 rad/s from each edge
-    on, (n, m), of which the last is the end, and what is fitted, (n,).
-    """
-    basis = orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), 1e-7)
-    step_residuals = steps - basis @ (basis.T @ steps)
-    sums, products, whole = (step_residuals.T @ observed, step_residuals.T @ step_residuals,
-                             steps.T @ steps)
-    differences = sums[:, None] - sums
-    norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
-                     for matrix in (products, whole))
-    # no empty stretches, nor those of which the fit explains 80 %: noise gives them large turns
-    distinct = np.triu(norms > 0.2 * wholes, 1)
-    gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
-    first, last = np.unravel_index(int(gains.argmax()), gains.shape)
-    gain = float(gains[first, last])
-    return DeviatingStretch(
-        int(first), int(last), float(differences[first, last] / max(norms[first, last], 1e-300)),
-        gain, float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
-        gains[distinct], norms[distinct])

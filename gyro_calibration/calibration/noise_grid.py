@@ -55,7 +55,7 @@ determinant 1, likelihoods of different correlations can be compared (`carried_s
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 import math
 
@@ -251,20 +251,14 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
 
 @dataclass(frozen=True)
 class _Regression:
-    """All columns together, shape (n, m + q), and the prior precision of the first m."""
+    """All columns together, shape (n, m + q), with the prior precisions of known size."""
 
     observed: Array
     columns: Array
     value_count: int
     prior_precision: Array
     banded: Sequence[BandedNoise]
-    shared: Sequence[SharedNoise]
-    hierarchical_priors: Sequence[HierarchicalPrior]
-
-    @property
-    def parts(self) -> list[BandedNoise | SharedNoise | HierarchicalPrior]:
-        """Return the parts of the noise and the priors of unknown size."""
-        return [*self.banded, *self.shared, *self.hierarchical_priors]
+    shared: Sequence[SharedNoise]  # and priors of unknown size; with variances of shape (m + q,)
 
     def banded_covariance(self, sizes: Iterable[float]) -> TridiagonalMatrix:
         """Return the covariance of the banded noise."""
@@ -277,14 +271,9 @@ class _Regression:
 
     def prior_precisions(self, sizes: Array) -> Array:
         """Return prior precisions, shape (k, m + q), for sizes of shape (k, parts)."""
-        fixed = np.tile(self.prior_precision, (len(sizes), 1))
-        for prior, size in zip(self.hierarchical_priors, sizes[:, len(self.shared):].T):
-            fixed[:, prior.value_index] = 1.0 / size**2
-        if not self.shared:
-            return fixed
-        variance = sizes[:, : len(self.shared)] ** 2 @ np.array(
-            [part.variance for part in self.shared])
-        return np.concatenate([fixed, 1.0 / np.maximum(variance, 1e-300)], axis=1)
+        variance = sum((size[:, None] ** 2 * part.variance
+                        for size, part in zip(sizes.T, self.shared)), np.zeros((len(sizes), 1)))
+        return np.where(variance > 0.0, 1.0 / np.maximum(variance, 1e-300), self.prior_precision)
 
     def solve(self, covariance: TridiagonalMatrix,
               precisions: Array) -> tuple[Array, Array, Array]:
@@ -318,7 +307,7 @@ class _Regression:
 
 def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise],
                    shared_columns: Array | None = None, shared: Sequence[SharedNoise] = (),
-                   prior_mean: Array | None = None, prior_deviation: Array | None = None,
+                   prior_deviation: Array | None = None,
                    wandering_value: int | None = None,
                    hierarchical_priors: Sequence[HierarchicalPrior] = (),
                    carried: Array | None = None) -> GridFit:
@@ -332,7 +321,7 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     observed, columns : shape (n,), and those of the values, shape (n, m)
     banded : parts of the noise; their sum must be positive definite
     shared_columns, shared : of the shared values, shape (n, q), and parts of their variances
-    prior_mean, prior_deviation : of the values, shape (m,); infinite deviation for a flat prior
+    prior_deviation : of the values about zero, shape (m,); infinite for a flat prior
     wandering_value : number of the value whose variance includes `unobservable_variance`
     hierarchical_priors : values with a prior of unknown size
     carried : share of the observation before that is subtracted from each, shape (n,); None where
@@ -342,21 +331,29 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     if len(observed) <= count:
         raise ValueError(
             f'{len(observed)} observations do not determine {count} values and their noise')
-    mean = np.zeros(count) if prior_mean is None else prior_mean
-    precision = np.zeros(count) if prior_deviation is None else 1.0 / np.square(prior_deviation)
     together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
-    regression = _Regression(_quasi_differences(observed - columns @ mean, carried),
+    width = together.shape[1]
+    # shared values without a variance are zero
+    precision = np.append(np.zeros(count), np.full(width - count, 1e300))
+    if prior_deviation is not None:
+        precision[:count] = 1.0 / np.square(prior_deviation)
+    shared = [*(replace(part, variance=np.append(np.zeros(count), part.variance))
+                for part in shared),
+              *(SharedNoise(prior.name, np.eye(width)[prior.value_index], prior.size_range)
+                for prior in hierarchical_priors)]
+    regression = _Regression(_quasi_differences(observed, carried),
                              _quasi_differences(together, carried), count, precision, banded,
-                             shared, hierarchical_priors)
+                             shared)
+    parts: list[BandedNoise | SharedNoise] = [*banded, *shared]
     axes = [np.array([low]) if low == high else np.geomspace(low, high, 5)
-            for low, high in (part.size_range for part in regression.parts)]
+            for low, high in (part.size_range for part in parts)]
     for remaining in reversed(range(4)):
         sizes, log_likelihoods, all_values, covariances = _evaluate_grid(regression, axes)
         weights = softmax(log_likelihoods)
         if remaining:
             axes = [_refine_axis(axis, sizes[:, place], weights, part.size_range)
-                    for place, (axis, part) in enumerate(zip(axes, regression.parts))]
-    unobservable = sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
+                    for place, (axis, part) in enumerate(zip(axes, parts))]
+    unobservable = sizes[:, len(banded):] ** 2 @ np.array(
         [part.unobservable_variance for part in shared])
     if wandering_value is not None:
         covariances[:, wandering_value, wandering_value] += unobservable
@@ -365,8 +362,8 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     noise = regression.banded_covariance(sizes[best, :len(banded)])
     _, (likeliest,), _ = regression.solve(
         noise, regression.prior_precisions(sizes[best: best + 1, len(banded):]))
-    names = [part.name for part in regression.parts]
-    return GridFit(values + mean, covariance,
+    names = [part.name for part in parts]
+    return GridFit(values, covariance,
                    {name: _interval_95(each, weights) for name, each in zip(names, sizes.T)},
                    dict(zip(names, sizes[best].tolist())),
                    float(logsumexp(log_likelihoods)) - math.log(len(weights)),

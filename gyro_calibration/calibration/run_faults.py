@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from itertools import permutations
 import math
 
-from gyro_calibration.calibration.likelihood import find_deviating_stretch
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import RATE_UNITS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
+from scipy.linalg import orth
 
 #: Shortest pieces in which motions are compared, and step of the tried offsets, s.
 _TRIAL_STEP = 0.1
@@ -116,6 +116,47 @@ def split_run(time: Array, rate: Array) -> RunPieces:
     return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
 
 
+@dataclass(frozen=True)
+class DeviatingStretch:
+    """The stretch of a run that improves a fit most by a turn of its own."""
+
+    # edges that it begins and ends at
+    first: int
+    last: int
+    excess_rate: float  # its excess rate, rad/s
+    # sum of squares that it explains, and that remains
+    explained_squares: float
+    remaining_squares: float
+    # what each stretch explains, and its column beside those of the fit, squares, shape (m,)
+    all_explained_squares: Array
+    column_squares: Array
+
+
+def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> DeviatingStretch:
+    """
+    Return the stretch that improves a fit most.
+
+    Given are white columns of the fit, (n, k), the addition of a turn of 1 rad/s from each edge
+    on, (n, m), of which the last is the end, and what is fitted, (n,).
+    """
+    basis = orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), 1e-7)
+    step_residuals = steps - basis @ (basis.T @ steps)
+    sums, products, whole = (step_residuals.T @ observed, step_residuals.T @ step_residuals,
+                             steps.T @ steps)
+    differences = sums[:, None] - sums
+    norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
+                     for matrix in (products, whole))
+    # no empty stretches, nor those of which the fit explains 80 %: noise gives them large turns
+    distinct = np.triu(norms > 0.2 * wholes, 1)
+    gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
+    first, last = np.unravel_index(int(gains.argmax()), gains.shape)
+    gain = float(gains[first, last])
+    return DeviatingStretch(
+        int(first), int(last), float(differences[first, last] / max(norms[first, last], 1e-300)),
+        gain, float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
+        gains[distinct], norms[distinct])
+
+
 def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
                         slip: str = '') -> None:
     """Refuse a run that another motion explains far better; `slip` is a message on a slip."""
@@ -148,15 +189,15 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
 
 
 def fit_profile(run: RunPieces, motion: Motion,
-                largest_offset: float) -> tuple[float, float, float]:
+                largest_offset: float, step: float = _TRIAL_STEP) -> tuple[float, float, float]:
     """Return the unexplained fraction of the squares at the best delay, the scale, and that, s."""
     return min((*run.fit_scale(run.reference_angle(motion, offset)), offset)
-               for offset in _trial_offsets(largest_offset).tolist())
+               for offset in _trial_offsets(largest_offset, step).tolist())
 
 
-def _trial_offsets(largest_offset: float) -> Array:
-    count = round(largest_offset / _TRIAL_STEP)
-    return np.arange(-count, count + 1) * _TRIAL_STEP
+def _trial_offsets(largest_offset: float, step: float = _TRIAL_STEP) -> Array:
+    count = round(largest_offset / step)
+    return np.arange(-count, count + 1) * step
 
 
 def _try_motions(run: RunPieces, motion: Motion,

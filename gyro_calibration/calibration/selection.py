@@ -26,7 +26,7 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import (
     Calibration, channels_of, CONFOUNDERS, fit_effects)
 from gyro_calibration.calibration.scatter import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
-from gyro_calibration.logs.log import DataRefused, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, Effect,
     SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STATIC_EFFECTS)
@@ -40,8 +40,12 @@ MIN_DISTINGUISHING_SIGMAS = 4.0
 #: Technology -> which of sine response and cubic nonlinearity its physics causes.
 TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
                       'mems': CUBIC_NONLINEARITY}
-
-
+#: Largest standard deviations of scale factor error and bias, rad/s, by technology.
+TECHNOLOGY_PRIORS = {
+    'mems': (0.01, 1.0 * DEGREE),
+    'open_loop_fog': (0.005, 0.02 * DEGREE),
+    'closed_loop_fog': (0.001, 0.002 * DEGREE),
+}
 #: Effects of every gyro.
 BASIC_EFFECTS = BIAS, SCALE_FACTOR_ERROR
 

@@ -24,8 +24,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
-from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, TECHNOLOGY_PRIORS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.diagnosis.gates import is_degree_ratio

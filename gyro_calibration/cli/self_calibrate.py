@@ -24,10 +24,10 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.run_faults import (
     fit_profile, MAX_UNEXPLAINED_SHARE, refuse_unit_error, split_run, UNIT_TOLERANCE)
+from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
     check_end, check_rest, default_reference_errors, describe_implausible_scale, find_rest_after,
     METHODS, ReferenceErrors, RestCheck, RunLimits, self_calibrate, to_model_record)

@@ -28,11 +28,12 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import (
-    BASE_VALUES, CauseTerm, design_matrix, effective_clusters, fit_spans, HEADING_TREATMENT,
-    lay_out_spans, MIN_STRETCHES, MISALIGNMENT_TERM, SpanFit, Spans, whiten_regression,
-    WhitenedRegression)
+    effective_clusters, fit_spans, MIN_STRETCHES, SpanFit, whiten_regression, WhitenedRegression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, OwnInstants
+from gyro_calibration.calibration.spans import (
+    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
+    Spans)
 from gyro_calibration.diagnosis.candidates import (
     lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
@@ -243,7 +244,7 @@ def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Findin
     evidence = {'evidence': f'it adds {found.prediction_gain:.1f} to the log-likelihood of '
                 'held-out stretches, and is selected in '
                 f'{100.0 * found.selection_share:.0f} % of the folds'}
-    if term.is_single_event and found.is_established:
+    if term.is_single_event:
         evidence = {}
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))

@@ -25,9 +25,8 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 import math
 
-from gyro_calibration.calibration.heading_regression import (
-    COURSE_TREATMENT, HEADING_TREATMENT, lag_deviation)
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
+from gyro_calibration.calibration.spans import COURSE_TREATMENT, HEADING_TREATMENT, lag_deviation
 from gyro_calibration.diagnosis.gates import (
     heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
     spline_rate)

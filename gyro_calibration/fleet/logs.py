@@ -327,7 +327,7 @@ class LogTask:
 
     entry: FleetLog
     folder: str  # of the results
-    technology: str = 'mems'  # of the gyros, one of `heading_regression.TECHNOLOGY_PRIORS`
+    technology: str = 'mems'  # of the gyros, one of `selection.TECHNOLOGY_PRIORS`
     file_pattern: re.Pattern[str] | None = None  # by `compile_file_pattern`
     #: For the diagnosis, the same for each log; None without a diagnosis.
     generator: np.random.Generator | None = None

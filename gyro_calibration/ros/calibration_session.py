@@ -29,7 +29,7 @@ import os
 from pathlib import Path
 from types import SimpleNamespace
 
-from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
+from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias, check_rest, describe_implausible_scale, find_rest_after, ReferenceErrors,
     RunLimits, self_calibrate, SETTLING_TIME, to_model_record)

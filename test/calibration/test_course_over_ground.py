@@ -15,10 +15,9 @@ import math
 
 from diagnosed import established
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.heading_regression import lay_out_spans
 from gyro_calibration.calibration.own_instants import keep_own_instants
-from gyro_calibration.calibration.reference_noise import (
-    find_rests, heading_difference, is_course)
+from gyro_calibration.calibration.reference_noise import find_rests, heading_difference, is_course
+from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import (
     DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, read_log)
@@ -216,7 +215,7 @@ def test_noise_of_the_gyro_is_no_turn_of_a_course():
     spans = lay_out_spans(short_odometry(0, 1.0, 5, 0.0))
     count = len(spans.heading) - 1
     straight = replace(spans, heading=np.zeros(count + 1))
-    turned, none = (each.rate_columns()[:count, 0] for each in (spans, straight))
+    turned, none = (each.base_columns()[:count, 0] for each in (spans, straight))
     assert np.abs(turned).max() > 45.0 * DEGREE
     assert (none == 0.0).all() and (straight.angles == 0.0).all()
 

@@ -16,8 +16,9 @@ import re
 
 from chance import fewest, seeded
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.heading_regression import fit_spans, lay_out_spans
+from gyro_calibration.calibration.heading_regression import fit_spans
 from gyro_calibration.calibration.reference_noise import heading_difference
+from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DEGREE, Log, log_from_table

@@ -15,8 +15,8 @@ from dataclasses import replace
 from chance import evidence, rms_bounds, seeds
 from diagnosed import established, judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.heading_regression import (
-    CauseTerm, find_drift, fit_spans, lay_out_spans)
+from gyro_calibration.calibration.heading_regression import find_drift, fit_spans
+from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
