@@ -35,7 +35,7 @@ from gyro_calibration.calibration.noise_grid import (
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.reference_noise import MIN_COURSE_NOISE
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
-from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.spans import (
     BASE_VALUES, CauseTerm, design_matrix, DRIFT_TERM, lay_out_spans, MISALIGNMENT_TERM, Spans,
     WIDE_PRIOR)
