@@ -26,12 +26,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+import math
 
 from gyro_calibration.diagnosis.candidates import (
     Candidate, candidate_transforms, fitted_shape_indices, MAX_STEP_TIME_LACK, MAX_STEP_TIMES,
     smooth_shapes, with_shape)
 from gyro_calibration.diagnosis.replay import (
-    band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay)
+    band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
+    stated_shapes)
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
@@ -98,23 +100,33 @@ def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
             NoiseShape(walk, rounding_ratio=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))
             for walk in (0.0, 1e-4, 1e-2)])
         rounding_ratio = tried.noise_shapes[fit_causes(tried, []).best_noise].rounding_ratio
-    shapes = noise_grid(min(each.point_interval for each in logs),
-                        max(each.duration for each in logs), rounding_ratio)
-    problem = _assemble_problem(logs, NoiseShape(rounding_ratio=rounding_ratio), shapes)
-    if len(logs) == 1:
+    size = min(each.point_interval for each in logs), max(each.duration for each in logs)
+    shapes = noise_grid(*size, rounding_ratio)
+    first = NoiseShape(rounding_ratio=rounding_ratio)
+    problem = _assemble_problem(logs, first, shapes)
+    if len(logs) == 1 and not logs[0].stated_noises:
         return problem
     fit = fit_causes(problem, [])
+    density = float(fit.residual_squares[fit.best_noise]) / fit.degrees_of_freedom
+    stated = [shape for each in logs[0].stated_noises
+              for shape in stated_shapes(each, density, *size, rounding_ratio)]
+    if len(logs) == 1:
+        return _assemble_problem(logs, first, shapes, stated=stated)
     # most coefficients are of white noise
     white = [float(np.median((part * factor) ** 2)) for part, factor in zip(
         fit.residual_transforms(), fit.whitening_factors())]
-    return _assemble_problem(logs, NoiseShape(rounding_ratio=rounding_ratio), shapes,
-                             (np.array(white) / np.mean(white)).tolist())
+    return _assemble_problem(logs, first, shapes, (np.array(white) / np.mean(white)).tolist(),
+                             stated)
 
 
 def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
                       shapes: Sequence[NoiseShape], white: Sequence[float] = (),
-                      ) -> RegressionProblem:
-    """Set up the regression; given are the variances of white noise in each log, relative to 1."""
+                      stated: Sequence[NoiseShape] = ()) -> RegressionProblem:
+    """
+    Set up the regression with a grid of noises, and with those that the model states.
+
+    Given are the variances of white noise in each log, relative to 1.
+    """
     parts = [(coefficient_angles(each.point_count), each.point_interval) for each in replays]
     more = [each - 1.0 for each in white or [1.0] * len(parts)]
     plain = np.concatenate([(first.variance(angle, step) + own) / step
@@ -132,13 +144,15 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
     angle, step, own, plain = angle[chosen], step[chosen], own[chosen], plain[chosen]
     sums = [np.add.reduceat((shape.variance(angle, step) + own) / step / plain, first_of)
-            for shape in shapes]
+            for shape in (*shapes, *stated)]
     relative = np.array(sums) / [len(part) for part in few]
     # Each combination of components has the same prior probability, whatever its number of sizes.
     kinds = [(bool(each.walk_ratio), bool(each.markov_ratio), bool(each.flicker_corner))
              for each in shapes]
-    rare = [np.log(kinds.count(kind)) for kind in kinds]
-    return RegressionProblem(replays, deviation, starts, tuple(shapes), 1.0 / relative,
+    rare = [math.log(kinds.count(kind) * len({*kinds})) for kind in kinds]
+    # those that are stated together are as probable as all others
+    rare += [math.log(max(len(stated), 1))] * len(stated)
+    return RegressionProblem(replays, deviation, starts, (*shapes, *stated), 1.0 / relative,
                              np.log(relative) @ count + 2.0 * np.array(rare))
 
 

@@ -38,6 +38,7 @@ from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import motion_from_rates
+from gyro_calibration.model.noise import MARKOV_FLOOR_RATIO, Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
@@ -125,7 +126,7 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
         alone.append(alone[-1] * math.exp(min(3.0 * sigma, step)))
     walks = [0.0, *np.geomspace(alone[0], highest, 1 + math.ceil(
         math.log(highest / alone[0]) / step))]
-    times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
+    times = _correlation_times(interval, duration)
     # by their spectral density at frequency 0 relative to white noise
     strong = [(level, time) for time in times for level in np.geomspace(0.3, 1000.0, 7)]
     corners = np.geomspace(0.1 / duration, 0.3 / interval, 14)
@@ -135,6 +136,26 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
               if not walk or small * lowest < walk / level < 1.0 / (small * time ** 2)),
             *(NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
               for walk in walks[::4] for corner in corners)]
+
+
+def _correlation_times(interval: float, duration: float) -> Array:
+    return np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
+
+
+def stated_shapes(noise: Noise, density: float, interval: float, duration: float,
+                  rounding_ratio: float = 0.0) -> list[NoiseShape]:
+    """
+    Return the slow noise of a model, relative to a density of the white noise, (rad/s)² s.
+
+    Its bias instability is flicker, or a Gauss-Markov process with such a floor.
+    """
+    walk, squared = noise.rate_random_walk ** 2 / density, noise.bias_instability ** 2 / density
+    plain = NoiseShape(walk, rounding_ratio=rounding_ratio)
+    if not squared:
+        return [plain]
+    return [replace(plain, flicker_corner=squared / (2.0 * math.pi)),
+            *(replace(plain, markov_ratio=MARKOV_FLOOR_RATIO ** 2 * squared, correlation_time=time)
+              for time in _correlation_times(interval, duration))]
 
 
 #: Least noise of a rounded output, in steps.
@@ -181,6 +202,7 @@ class Replay:
     command: Array | None = None
     responses: Array = field(default_factory=lambda: np.empty((0, 0)))
     response_noise: NoiseShape = NoiseShape()  # noise under which the response is fitted
+    stated_noises: tuple[Noise, ...] = ()  # between which that of the model lies, if it states any
 
     @property
     def point_interval(self) -> float:
@@ -448,7 +470,19 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     rate = model.distort('rate', smooth, time)
     added = model.output_from_channels(plain.channels.with_rate(rate, rate)) - rate
     return replace(plain, channels=plain.channels.with_rate(rate, plain.channels.output - added),
-                   reference=reference + (rate - smooth), simulated_error=added)
+                   reference=reference + (rate - smooth), simulated_error=added,
+                   stated_noises=_stated_noises(model))
+
+
+def _stated_noises(model: GyroModel) -> tuple[Noise, ...]:
+    """Return the noises at the bounds of a model's figures; none without slow noise in it."""
+    noise, bounds = model.noise, model.noise_bounds
+    flicker, walk = (sorted({getattr(noise, name), *bounds.get(name, ())})
+                     for name in ('bias_instability', 'rate_random_walk'))
+    if not (flicker[-1] or walk[-1]):
+        return ()
+    return tuple(replace(noise, bias_instability=one, rate_random_walk=other)
+                 for one in flicker for other in walk)
 
 
 def _refuse_gaps(time: Array, grid_index: NDArray[np.intp]) -> None:

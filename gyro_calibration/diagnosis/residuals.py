@@ -36,15 +36,12 @@ from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise
+from gyro_calibration.model.noise import MARKOV_FLOOR_RATIO, Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 
-#: Standard deviation of a Gauss-Markov process whose Allan deviation has its peak at the floor by
-#: a bias instability of 1: the peak is at 1.89 correlation times.
-_MARKOV_RATIO = ALLAN_FLOOR_RATIO / 0.617
 #: Index of a figure -> lowest and highest logarithm of its square.
 Limits: TypeAlias = Mapping[int, tuple[float, float]]
 #: Bins of a curve.
@@ -247,7 +244,7 @@ def _band_energies(fit: RegressionFit) -> BandEnergies:
     if problem.noise_shapes[0].rounding_ratio:
         parts.append(spline_derivative_gain(angle) / step)
     times = {each.correlation_time for each in problem.noise_shapes if each.markov_ratio}
-    markov = [_MARKOV_RATIO ** 2 * (NoiseShape(0.0, 1.0, time).variance(angle, step) - 1.0) / step
+    markov = [MARKOV_FLOOR_RATIO ** 2 * (NoiseShape(0.0, 1.0, time).variance(angle, step) - 1.0) / step
               for time in sorted(times)]
     energy, count, *totals = (np.add.reduceat(part * used, problem.band_starts)
                               for part in (left ** 2, np.ones(len(left)), coarse, *parts, *markov))

@@ -21,6 +21,9 @@ from scipy.special import xlogy
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR_RATIO = math.sqrt(2.0 * math.log(2.0) / math.pi)
+#: Standard deviation of a Gauss-Markov process whose Allan deviation has its peak at the floor by
+#: a bias instability of 1: the peak is at 1.89 correlation times.
+MARKOV_FLOOR_RATIO = ALLAN_FLOOR_RATIO / 0.617
 #: Averaging time of the bias estimate, s: the length of a self-calibration.
 BIAS_AVERAGING_TIME = 20.0
 #: Time constants, s, of the Gauss-Markov processes that approximate flicker from 1 s to hours.

@@ -23,6 +23,8 @@ from gyro_calibration.diagnosis.search import (
     start_search)
 from gyro_calibration.diagnosis.significance import MIN_PREDICTION_SIGMAS
 from gyro_calibration.logs.log import Log
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest
@@ -222,3 +224,30 @@ def test_columns_that_nearly_depend_on_each_other_leave_a_positive_residual():
     assert (fit.residual_squares > 0.0).all()
     units = fit.columns / np.linalg.norm(fit.columns, axis=1)[:, None]
     assert np.linalg.svd(units, compute_uv=False)[-1] ** 2 > 0.5e-9
+
+
+# the noise that a model states
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_noise_of_the_model_shows_a_drift_that_a_random_walk_may_be(seed):
+    """A ramp of 9.6 standard deviations in white noise, of which `allan` saw no random walk."""
+    time, noise = np.arange(9000) / 10.0, Noise(1e-4, 0.0, 0.0)
+    ramp = 9.6 * noise.angle_random_walk * math.sqrt(12.0 / time[-1] ** 3) * time
+    output = simulate_noise(noise, len(time), 0.1, np.random.default_rng([4, seed]))
+    model = GyroModel(noise=noise, noise_bounds={'rate_random_walk': (0.0, 1e-7)})
+    found = {name: established(diagnose([Log(output=output + ramp, time=time)],
+                                        np.random.default_rng(0), given))
+             for name, given in (('stated', model), ('not stated', GyroModel(noise=noise)))}
+    assert 'rate_ramp' in found['stated'] and 'rate_random_walk' not in found['stated']
+    assert 'rate_ramp' not in found['not stated']
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_random_walk_beyond_that_of_the_model_is_no_drift(seed):
+    time = np.arange(9000) / 10.0
+    output = simulate_noise(Noise(1e-4, 0.0, 3e-6), len(time), 0.1,
+                            np.random.default_rng([5, seed]))
+    model = GyroModel(noise=Noise(1e-4, 0.0, 0.0),
+                      noise_bounds={'rate_random_walk': (0.0, 1e-7)})
+    found = established(diagnose([Log(output=output, time=time)], np.random.default_rng(0), model))
+    assert not {'rate_ramp', 'warm_up', 'bias_step'} & set(found)
