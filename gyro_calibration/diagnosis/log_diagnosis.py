@@ -380,10 +380,17 @@ def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
 
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
-    """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
+    """
+    Give the named causes, and the doubtful ones as suspected, each given all named causes.
+
+    A cause that is not significant where the noise has a random walk of any size may be that.
+    """
+    causes = (*fit.causes, *selection.unnamed)
+    walking = replace(search, problem=search.problem.with_random_walks())
     for place, deficits in enumerate(selection.alternatives):
-        evidence = evidence_for(search, (*fit.causes, *selection.unnamed), place)
-        yield _cause_finding(search, fit, place, evidence, deficits)
+        by_walk = p_value(causes[place].cause, evidence_for(walking, causes, place)) >= search.rate
+        yield _cause_finding(search, fit, place, evidence_for(search, causes, place), deficits,
+                             ['rate_random_walk'] * by_walk)
     for known in selection.suspected:
         everything = refine_jointly(search, (*fit.causes, *selection.unnamed, known))
         place = len(everything) - 1
@@ -478,7 +485,8 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 # findings
 
 def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
-                   deficits: Mapping[str, float], is_established: bool = True) -> Finding:
+                   deficits: Mapping[str, float], confounders: Sequence[str] = (),
+                   is_established: bool = True) -> Finding:
     """Return the finding of a cause with its evidence and the deficits of its alternatives."""
     known, replays = fit.causes[cause_index], fit.problem.replays
     name, effect = known.cause, CATALOGUE.get(known.cause)
@@ -509,7 +517,7 @@ def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidenc
                         if 'temperature' in common_channels(replays)],
                        max(each.duration for each in replays)),
         math.sqrt(2.0 * max(threshold, 0.0)) + float(norm.ppf(DETECTION_POWER)),
-        ['unit_error'] * is_sample, **fields)
+        [*confounders, *['unit_error'] * is_sample], **fields)
     return (found if known.log_index is None or len(replays) == 1 or not found.evidence else
             replace(found, evidence=f'in log {known.log_index + 1}, {found.evidence}'))
 

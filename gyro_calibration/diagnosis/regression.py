@@ -63,6 +63,15 @@ class RegressionProblem:
     noise_shapes: tuple[NoiseShape, ...]  # noises that are tried
     weights: Array  # one over the variance of each band relative to the first noise, shape (g, b)
     log_determinants: Array  # of the relative variances, and of the prior probability, shape (g,)
+    stated_count: int = 0  # number of the last of the noises, which a model states
+
+    def with_random_walks(self) -> RegressionProblem:
+        """Return the problem with the noises that have a random walk, and are not stated."""
+        kept = [place for place, shape in enumerate(
+            self.noise_shapes[:len(self.noise_shapes) - self.stated_count]) if shape.walk_ratio]
+        return replace(self, noise_shapes=tuple(self.noise_shapes[place] for place in kept),
+                       weights=self.weights[kept], log_determinants=self.log_determinants[kept],
+                       stated_count=0)
 
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
@@ -153,7 +162,7 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     # those that are stated together are as probable as all others
     rare += [math.log(max(len(stated), 1))] * len(stated)
     return RegressionProblem(replays, deviation, starts, (*shapes, *stated), 1.0 / relative,
-                             np.log(relative) @ count + 2.0 * np.array(rare))
+                             np.log(relative) @ count + 2.0 * np.array(rare), len(stated))
 
 
 @dataclass(frozen=True)

@@ -244,7 +244,8 @@ def _band_energies(fit: RegressionFit) -> BandEnergies:
     if problem.noise_shapes[0].rounding_ratio:
         parts.append(spline_derivative_gain(angle) / step)
     times = {each.correlation_time for each in problem.noise_shapes if each.markov_ratio}
-    markov = [MARKOV_FLOOR_RATIO ** 2 * (NoiseShape(0.0, 1.0, time).variance(angle, step) - 1.0) / step
+    floor = MARKOV_FLOOR_RATIO ** 2 / step
+    markov = [floor * (NoiseShape(0.0, 1.0, time).variance(angle, step) - 1.0)
               for time in sorted(times)]
     energy, count, *totals = (np.add.reduceat(part * used, problem.band_starts)
                               for part in (left ** 2, np.ones(len(left)), coarse, *parts, *markov))
