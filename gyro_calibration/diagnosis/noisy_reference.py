@@ -504,7 +504,7 @@ def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
-    return (cause in ('reference_once_per_rev', 'clock_rate') or effect is not None
+    return (cause == 'clock_rate' or effect is not None
             and 'rate' in effect.inputs)
 
 
@@ -583,7 +583,8 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
     A step is tried at each point, and around the best of them; first also two at once. The noise
     is fitted again with the steps, so that a random walk that they had caused does not hide them,
     and one that the log has is not a step. Of three steps those that are not significant are
-    removed, the weakest first.
+    removed, the weakest first. A step beside a fine reference that too few stretches show is
+    suspected.
     """
     times = fit.spans.time[2:-2]
     every = max(len(times) // 200, 1)
@@ -632,12 +633,16 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
             # at the best of all times, beside the noise without the step
             evidence = np.array([_step_evidence(with_steps, fit_with(
                 *causes, *(other for other in steps if other != each)), each) for each in steps])
-            chances = np.maximum(chances, 2.0 * len(times) * np.exp(-evidence))
+            by_noise = 2.0 * len(times) * np.exp(-evidence)
+            chances = np.maximum(by_noise, data.stretch_count * chances)
+            least = np.maximum(by_noise, chances / SUSPECTED_RATE_FACTOR)
         else:
-            chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
-        weakest = int(chances.argmax())
-        if chances[weakest] < false_alarm_rate:
-            return [FoundCause(each, chance, 0.5 * size ** 2, 1.0, count >= MIN_STRETCHES, {})
+            least = chances = np.where(
+                stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
+        weakest = int(least.argmax())
+        if least[weakest] < false_alarm_rate:
+            return [FoundCause(each, chance, 0.5 * size ** 2, 1.0,
+                               chance < false_alarm_rate and count >= MIN_STRETCHES, {})
                     for each, chance, size, count in zip(
                         steps, chances.tolist(), sigmas.tolist(), stretches)]
         del steps[weakest]
