@@ -633,7 +633,7 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
             # at the best of all times, beside the noise without the step
             evidence = np.array([_step_evidence(with_steps, fit_with(
                 *causes, *(other for other in steps if other != each)), each) for each in steps])
-            by_noise = 2.0 * len(times) * np.exp(-evidence)
+            by_noise = 2.0 * len(times) * np.exp(-np.maximum(evidence, 0.0))
             chances = np.maximum(by_noise, data.stretch_count * chances)
             least = np.maximum(by_noise, chances / SUSPECTED_RATE_FACTOR)
         else:
@@ -644,7 +644,7 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
             return [FoundCause(each, chance, 0.5 * size ** 2, 1.0,
                                chance < false_alarm_rate and count >= MIN_STRETCHES, {})
                     for each, chance, size, count in zip(
-                        steps, chances.tolist(), sigmas.tolist(), stretches)]
+                        steps, chances.tolist(), sigmas.tolist(), stretches.tolist())]
         del steps[weakest]
     return []
 

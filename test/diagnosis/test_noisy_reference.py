@@ -323,6 +323,16 @@ def test_a_random_walk_of_the_bias_is_no_step(step, seed):
     assert not [each for each in found.findings if each.effect == 'bias_step']
 
 
+@pytest.mark.parametrize('seed', seeds(4))
+def test_a_step_is_found_beside_a_random_walk_after_which_few_stretches_show_it(seed):
+    found = diagnosed(turning_log(seed, lambda time, generator: 0.017 * (time > 130.0) + 5e-5
+                                  * np.cumsum(generator.standard_normal(len(time))) / np.sqrt(
+                                      RATE), 0.36))
+    step, = (each for each in found.findings if each.effect == 'bias_step')
+    low, high = step.parameters['bias_step'].interval
+    assert low < 0.017 < high and high - low < 5e-3
+
+
 HIDDEN = {
     'heading_sensitivity': lambda time, rate, heading, temperature: 0.01 * np.sin(heading + 0.5),
     'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0)}
@@ -370,7 +380,9 @@ def turning_once(seed):
                + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
 
 
-def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
+@pytest.mark.parametrize('lacks_turns', [False, True])
+def test_a_reference_that_would_turn_back_each_revolution_is_not_established(lacks_turns):
+    """It shows within a revolution, also where a steady turn does not show the scale."""
     generator, time = np.random.default_rng(9), np.arange(0.0, 120.0, 1.0 / RATE)
     rate = 1.2 + 0.3 * np.sin(0.21 * time)
     heading = np.cumsum(rate) / RATE
@@ -378,8 +390,10 @@ def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
         log = Log(time=time, output=rate + 1e-3 * generator.standard_normal(len(time)),
                   reference_heading=heading - size * np.cos(heading)
                   + 1e-3 * generator.standard_normal(len(time)))
-        _, found = select_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
-                                 lambda share, words: None)
+        fit = fit_spans(lay_out_spans(log, 'motion_capture'))
+        if lacks_turns:
+            fit = replace(fit, effective_stretches=np.ones(len(fit.values)))
+        _, found = select_causes(fit, 0.01, lambda share, words: None)
         assert named == ('reference_once_per_rev' in {
             each.cause_term.cause for each in found if each.is_established}), size
 
@@ -388,8 +402,7 @@ def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
 def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
     found = diagnosed(turning_once(seed), kind='course')
     assert 'Fewer than three stretches' in ' '.join(found.remarks)
-    follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
-              'reference_once_per_rev'}
+    follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity'}
     assert not follow & {each.effect for each in found.findings}, terminal_lines(found)
     assert all('three stretches' in found.cannot_show[name] for name in follow)
 
