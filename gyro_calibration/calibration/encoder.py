@@ -534,9 +534,9 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
         half = NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0])
         largest, largest_bias = NORMAL_QUANTILE_975 * np.array(TECHNOLOGY_PRIORS[technology])
         if abs(fit.bias) > largest_bias:
-            yield (f'the bias is beyond what gyros of the technology {technology} have: check '
-                   '--technology and units')
-        if abs(s) > largest:
+            yield (f'the bias exceeds {largest_bias / DEGREE:.3g} deg/s, which is usual with the '
+                   f'technology {technology}: check --technology and units')
+        elif abs(s) > largest:
             yield ('the scale factor error is beyond what gyros of the technology '
                    f'{technology} have: check the units, and the size and distance of wheels')
         elif half > 1.001 * largest:

@@ -109,7 +109,7 @@ def test_a_bias_beyond_the_technology_is_found(bias):
     for found in fits:
         deviation = math.sqrt(found.fit.covariance[1, 1])
         assert abs(found.fit.bias - bias * DEGREE) < 3.0 * deviation < 0.1 * DEGREE
-    assert any('beyond what gyros of the technology' in each for each in fits[1].remarks)
+    assert any('which is usual with the technology' in each for each in fits[1].remarks)
 
 
 @pytest.mark.parametrize(
