@@ -609,7 +609,9 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
         step, gain = refined(data, every * int(np.argmax(
             _step_gains(fit, data, times[::every])[0])))
         by_two, pair = (gain, (0, 0)) if steps else _best_pair(fit, data, times[::every])
-        if max(gain, by_two - likely) < likely - math.log(false_alarm_rate):
+        # one is tried in any case beside a fine reference: a random walk may have hidden it
+        if max(gain, by_two - likely) < likely - math.log(false_alarm_rate) and (
+                steps or not fit.spans.treatment.is_fine):
             break
         if gain >= by_two - likely:
             steps.append(step)
@@ -633,18 +635,18 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
             # at the best of all times, beside the noise without the step
             evidence = np.array([_step_evidence(with_steps, fit_with(
                 *causes, *(other for other in steps if other != each)), each) for each in steps])
-            by_noise = 2.0 * len(times) * np.exp(-np.maximum(evidence, 0.0))
-            chances = np.maximum(by_noise, data.stretch_count * chances)
-            least = np.maximum(by_noise, chances / SUSPECTED_RATE_FACTOR)
+            chances = np.maximum(chances, 2.0 * len(times) * np.exp(-np.maximum(evidence, 0.0)))
+            places_tried, most = data.stretch_count, SUSPECTED_RATE_FACTOR * false_alarm_rate
         else:
-            least = chances = np.where(
-                stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
-        weakest = int(least.argmax())
-        if least[weakest] < false_alarm_rate:
-            return [FoundCause(each, chance, 0.5 * size ** 2, 1.0,
-                               chance < false_alarm_rate and count >= MIN_STRETCHES, {})
-                    for each, chance, size, count in zip(
-                        steps, chances.tolist(), sigmas.tolist(), stretches.tolist())]
+            chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
+            places_tried, most = 1, false_alarm_rate
+        weakest = int(chances.argmax())
+        if chances[weakest] < most:
+            return [FoundCause(
+                each, chance, 0.5 * size ** 2, 1.0,
+                places_tried * chance < false_alarm_rate and count >= MIN_STRETCHES, {})
+                for each, chance, size, count in zip(
+                    steps, chances.tolist(), sigmas.tolist(), stretches.tolist())]
         del steps[weakest]
     return []
 
@@ -741,9 +743,12 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
              for sets in ([numbers[fold::count] for fold in range(count)],
                           np.array_split(numbers, count))]
     # errors of a course are correlated over time, so that distant stretches must be predicted too
-    sigmas, predicted, selected = max(folds) if spans.treatment.is_fine else min(folds)
-    established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
-                   and selected == 1.0 and evidences[simplest].stretches >= MIN_STRETCHES)
+    confirmed = [sigmas > MIN_PREDICTION_SIGMAS and selected == 1.0
+                 for sigmas, _, selected in folds]
+    best = max if spans.treatment.is_fine else min
+    is_confirmed, (_, predicted, selected) = best(zip(confirmed, folds))
+    established = (p_values[simplest] < false_alarm_rate and is_confirmed
+                   and evidences[simplest].stretches >= MIN_STRETCHES)
     term, interval = _profile_shape(spans, data, terms[simplest], [
         each.shapes for each in terms if each.cause == terms[simplest].cause],
         evidences[simplest].variance_ratio)
