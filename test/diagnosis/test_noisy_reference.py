@@ -222,7 +222,7 @@ def test_a_bias_that_held_out_parts_contradict_is_not_offered():
     assert 'is not offered' in ' '.join(terminal_lines(found))
 
 
-def turning_log(seed, bias, step=0.0):
+def turning_log(seed, bias, step=0.0, white=2e-4):
     """Return 240 s beside an encoder of a step, deg, or motion capture; bias at each time, s."""
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, 240.0, 1.0 / RATE)
@@ -230,7 +230,7 @@ def turning_log(seed, bias, step=0.0):
     rate = np.interp(time, 2.0 * np.arange(122), knots)
     heading = np.cumsum(rate) / RATE
     output = (1.0 + SCALE) * rate + bias(time, generator) + (
-        2e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
+        white * np.sqrt(RATE) * generator.standard_normal(len(time)))
     reference = (step * DEGREE * np.floor(heading / (step * DEGREE)) if step
                  else heading + 0.05 * DEGREE * generator.standard_normal(len(time)))
     return Log(output=output, time=time, reference_heading=reference)
@@ -331,6 +331,16 @@ def test_a_step_is_found_beside_a_random_walk_after_which_few_stretches_show_it(
     step, = (each for each in found.findings if each.effect == 'bias_step')
     low, high = step.parameters['bias_step'].interval
     assert low < 0.017 < high and high - low < 5e-3
+
+
+@pytest.mark.parametrize('seed', seeds(3))
+@pytest.mark.parametrize('step', [0.0, 0.2])
+def test_a_small_step_of_a_good_gyro_is_no_random_walk(step, seed):
+    """Of 0.017 deg/s; without a step the fit has a random walk under which none is significant."""
+    found = established(diagnosed(turning_log(
+        seed, lambda time, _: 3e-4 * (time > 130.0), step, 2e-5)))
+    low, high = found['bias_step'].parameters['bias_step'].interval
+    assert low < 3e-4 < high and high - low < 2e-4
 
 
 HIDDEN = {
