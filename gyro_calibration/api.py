@@ -17,6 +17,8 @@ answer raise `DataRefused`, files that cannot be read `LogError` or `ModelError`
 are not possible `InputError`; all of them are a `ValueError` whose text says what to do.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape

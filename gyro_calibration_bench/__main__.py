@@ -9,6 +9,8 @@
 # under the License.
 """Make a bench, answer it by a method that is here, and score answers."""
 
+from __future__ import annotations
+
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict

@@ -15,6 +15,8 @@ A case has a name, such as ``effects/warm_up/2/mixed/rate/0``; its random number
 name and a seed alone.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math

@@ -18,6 +18,8 @@ noise. They have no columns for faults of samples, noise figures, saturation, qu
 tones, and a wrong unit.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math

@@ -10,6 +10,8 @@
 
 """Scores of answers, and the table of a set of them."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -14,6 +14,8 @@ Bot Thoughts (blog): gyro calibration on a turntable and on a turntable with an 
 Counts, deg/s and per cent are as in the source; rates are computed in SI and converted.
 """
 
+from __future__ import annotations
+
 import math
 
 from gyro_calibration.calibration.likelihood import fit_likelihood

@@ -10,6 +10,8 @@
 
 """The results of a reproduction: published and computed numbers, and contradictions."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 import math

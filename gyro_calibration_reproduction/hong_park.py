@@ -15,6 +15,8 @@ Source: "Minimal-drift heading measurement using a MEMS gyro for indoor mobile r
 Published numbers are in their units; numbers here are computed in SI and converted.
 """
 
+from __future__ import annotations
+
 import math
 
 from gyro_calibration.allan.noise_fit import fit_noise

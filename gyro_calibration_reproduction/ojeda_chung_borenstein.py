@@ -15,6 +15,8 @@ Source: "Precision calibration of fiber-optics gyroscopes for mobile robot navig
 Published numbers are in their units; numbers here are computed in SI and converted.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 import math
 

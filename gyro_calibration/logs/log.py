@@ -15,6 +15,8 @@ A log is a CSV file, one row a sample or, without time, one row a dwell of a rat
 names each column with its unit.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv

@@ -20,6 +20,8 @@ A foreign command is one of another node: own commands come back on `cmd_vel` in
 sending, and every other command is foreign, also an additional zero.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

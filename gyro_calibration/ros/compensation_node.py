@@ -15,6 +15,8 @@ It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``
 ``imu/data``, ``heading``, ``yaw_rate``, ``~/calibration_status`` and diagnostics.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 import math
 import os

@@ -15,6 +15,8 @@ One thread reads, decodes, stamps and publishes; the executor only reports once 
 thread ends by a fault of the program, the node ends too, so that a launch file can restart it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 import sys

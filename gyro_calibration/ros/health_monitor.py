@@ -17,6 +17,8 @@ model, and the mean rate against zero. The levels of both tests follow from a st
 alarms.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from dataclasses import dataclass
 import math

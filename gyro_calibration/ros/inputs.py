@@ -15,6 +15,8 @@ Parameters are a table with checks of their values. The clocks are steady second
 ROS time, which may be paused. The motion is that of odometry and commands of the last second.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass

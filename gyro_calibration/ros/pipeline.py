@@ -20,6 +20,8 @@ one part is at most half of it. Two such intervals while the graph lists several
 proof. The graph alone is not, since it lists a killed driver for up to 20 s.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

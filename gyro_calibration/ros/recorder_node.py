@@ -15,6 +15,8 @@ A subscription requests the offered QoS: best effort publishers are received, an
 lose nothing. Publishers may start late, stop, and start again with another QoS.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 import importlib
 import os

@@ -19,6 +19,8 @@ destroyed. The handlers of rclpy invalidate the context while a callback still p
 ends some runs in a traceback.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 import faulthandler

@@ -15,6 +15,8 @@ The calibration file is a complete model file with the effects that were in use 
 If they differ from the model in use, the self-calibration is not used.
 """
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
 

@@ -22,6 +22,8 @@ between, `heldrate` and `linesrate` rates; `lost` is a heading that is repeated 
 up to 2 s.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math

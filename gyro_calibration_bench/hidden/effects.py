@@ -18,6 +18,8 @@ on the finished output ('output'), on the reference ('reference'), on single sam
 on the unit ('unit'), on the noise ('noise').
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math

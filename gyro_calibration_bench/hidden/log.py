@@ -16,6 +16,8 @@ saturation; quantization; faults of samples; a wrong unit. Effects on the refere
 reference alone.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import gzip

@@ -10,6 +10,8 @@
 
 """Random conditions of a gyro during a recording: motion, temperature, supply, tilt, vibration."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

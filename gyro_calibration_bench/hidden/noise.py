@@ -18,6 +18,8 @@ their states over all samples is banded, and so ``x' S^-1 y`` takes one banded C
 (`Whitening`).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 import math
 

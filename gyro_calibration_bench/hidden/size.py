@@ -17,6 +17,8 @@ Z, a bias of each recording and one scale; its standard deviation is 1 / sqrt(I)
 error x has the norm `DETECTION_SIGMAS`: sqrt(x' S^-1 x - ...).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 import math
 

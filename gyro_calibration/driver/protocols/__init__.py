@@ -20,6 +20,8 @@ records. No port, no ROS and no clock is used here.
 [Sample(output=-0.00027459265121626786, ...)]
 """
 
+from __future__ import annotations
+
 import importlib
 import pkgutil
 
