@@ -635,18 +635,18 @@ def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence
             # at the best of all times, beside the noise without the step
             evidence = np.array([_step_evidence(with_steps, fit_with(
                 *causes, *(other for other in steps if other != each)), each) for each in steps])
-            chances = np.maximum(chances, 2.0 * len(times) * np.exp(-np.maximum(evidence, 0.0)))
-            places_tried, most = data.stretch_count, SUSPECTED_RATE_FACTOR * false_alarm_rate
+            chances = np.maximum(data.stretch_count * chances, 2.0 * len(times) * np.exp(
+                -np.maximum(evidence, 0.0)))
+            most = SUSPECTED_RATE_FACTOR * false_alarm_rate
         else:
             chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
-            places_tried, most = 1, false_alarm_rate
+            most = false_alarm_rate
         weakest = int(chances.argmax())
         if chances[weakest] < most:
-            return [FoundCause(
-                each, chance, 0.5 * size ** 2, 1.0,
-                places_tried * chance < false_alarm_rate and count >= MIN_STRETCHES, {})
-                for each, chance, size, count in zip(
-                    steps, chances.tolist(), sigmas.tolist(), stretches.tolist())]
+            return [FoundCause(each, chance, 0.5 * size ** 2, 1.0,
+                               chance < false_alarm_rate and count >= MIN_STRETCHES, {})
+                    for each, chance, size, count in zip(
+                        steps, chances.tolist(), sigmas.tolist(), stretches.tolist())]
         del steps[weakest]
     return []
 
