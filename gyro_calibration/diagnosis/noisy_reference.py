@@ -743,10 +743,10 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
              for sets in ([numbers[fold::count] for fold in range(count)],
                           np.array_split(numbers, count))]
     # errors of a course are correlated over time, so that distant stretches must be predicted too
-    confirmed = [sigmas > MIN_PREDICTION_SIGMAS and selected == 1.0
-                 for sigmas, _, selected in folds]
-    best = max if spans.treatment.is_fine else min
-    is_confirmed, (_, predicted, selected) = best(zip(confirmed, folds))
+    confirmed = [(sigmas > MIN_PREDICTION_SIGMAS and selected == 1.0, sigmas, predicted, selected)
+                 for sigmas, predicted, selected in folds]
+    is_confirmed, _, predicted, selected = (
+        max(confirmed) if spans.treatment.is_fine else min(confirmed, key=lambda each: each[1:]))
     established = (p_values[simplest] < false_alarm_rate and is_confirmed
                    and evidences[simplest].stretches >= MIN_STRETCHES)
     term, interval = _profile_shape(spans, data, terms[simplest], [
