@@ -548,17 +548,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         walks = [min(walks[0], 5e-4)]  # more is vibration of the vehicle
     by_code = kind == 'encoder' and encoder_step(reference) > 0.0 and (at == time).all()
     if by_code:
-        # between two readings with different codes the shaft was in the middle of both, but for
-        # what the gyro turns unevenly; a single code gives only a range, and its error at rest or
-        # at a reversal is systematic
-        rows = np.flatnonzero(np.isfinite(reference))
-        (begin, end), turned = (rows[:-1], rows[1:]), integrate(time, output)
-        middle, codes = 0.5 * (time[begin] + time[end]), reference
-        bent = np.interp(middle, time, turned) - 0.5 * (turned[begin] + turned[end])
-        passed = (codes[begin] != codes[end]) & (end - begin <= 1.5 * np.median(end - begin))
-        at, reference = time.copy(), np.full(len(time), np.nan)
-        at[begin] = middle
-        reference[begin[passed]] = (0.5 * (codes[begin] + codes[end]) + bent)[passed]
+        at, reference = _find_code_changes(time, output, reference)
     rests, stands = find_rests(time, output, reference if treatment.is_fine else given)
     if treatment.is_fine:
         rests, stands = rests[~stands], stands[~stands]
@@ -585,6 +575,22 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
                  find_holes(time[measured_rows], length), step,
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
+
+
+def _find_code_changes(time: Array, output: Array, codes: Array) -> tuple[Array, Array]:
+    """Return the times at which the code of an encoder changes, and its headings then, or nan."""
+    # between two readings with different codes the shaft was in the middle of both, but for what
+    # the gyro turns unevenly; a single code gives only a range, and its error at rest or at a
+    # reversal is systematic
+    rows = np.flatnonzero(np.isfinite(codes))
+    (begin, end), turned = (rows[:-1], rows[1:]), integrate(time, output)
+    middle = 0.5 * (time[begin] + time[end])
+    bent = np.interp(middle, time, turned) - 0.5 * (turned[begin] + turned[end])
+    passed = (codes[begin] != codes[end]) & (end - begin <= 1.5 * np.median(end - begin))
+    at, reference = time.copy(), np.full(len(time), np.nan)
+    at[begin] = middle
+    reference[begin[passed]] = (0.5 * (codes[begin] + codes[end]) + bent)[passed]
+    return at, reference
 
 
 def _place_values(log: Log, instants: OwnInstants | None) -> tuple[Array, Array]:
