@@ -109,8 +109,9 @@ def calibrate_encoder(log: Log, method: str | None = None,
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
     if method is None:
-        method = 'course' if find_motion_errors(log) is not None else 'likelihood'
-        if log.reference_heading is not None:
+        if log.reference_heading is None:
+            method = 'course' if find_motion_errors(log) is not None else 'likelihood'
+        else:
             method = 'course' if is_course(log) or is_noisy(log) else 'likelihood'
             longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
             if longest < 0.5 * motion.duration and (

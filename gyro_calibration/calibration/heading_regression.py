@@ -454,8 +454,9 @@ def find_drift(log: Log) -> tuple[float, float] | None:
 
     The bias that the motion shows is compared with that of the rests in which the reference
     stands. Either may change steadily with time, and what depends on the rate is not of the
-    reference. None without such rests, or where both agree (Welch's test, at 1 %), as a whole or
-    in the ways from rest to rest, each compared with the rests around it: the bias may wander.
+    reference. None without such rests, or where both agree as a whole (Welch's test, at 0.01 %)
+    or in the ways from rest to rest, each compared with the rests around it, as the bias may
+    wander (at 1 %).
     """
     spans = lay_out_spans(log)
     rests = spans.rests[spans.stands]
@@ -481,7 +482,8 @@ def find_drift(log: Log) -> tuple[float, float] | None:
                                     + 1e-300)
     drift = of_rests[0] - of_motion[0]
     deviation = math.hypot(math.sqrt(one + other), spans.rest_rounding)
-    if abs(drift) <= student.ppf(0.995, freedom) * deviation:
+    # with a drifting bias, exact encoders are beyond 1 % more often than stated
+    if abs(drift) <= student.isf(5e-5, freedom) * deviation:
         return None
     # the bias on each way from rest to rest, and that of the rests around it
     way = np.searchsorted(time[rests[:, 0]], in_motion[:, 1] / in_motion[:, 0] + middle) - 1
@@ -511,23 +513,28 @@ def _weighted_fit(columns: Array, observed: Array,
 
 def find_motion_errors(log: Log) -> tuple[float, float] | None:
     """
-    Return how a rate by odometry errs over a second in motion, and the gyro in rests, rad.
+    Return how odometry errs over a second in motion, and the gyro in rests, rad.
 
-    Such a rate is exactly 0 in rests. In motion it errs by more than the gyro: the variance of the
-    difference of their turns is more than twice that of rests (F-test, at 1 %), beyond what a
-    delay, a lag or effects of the gyro explain, which are smooth functions of the rate
-    (differences of neighbours: Rice, Annals of Statistics 12, 1984). None for another rate, for
-    one that is mostly steady in motion, as of a rate table, and for one that the motion follows
-    later than a gyro does, as a robot its command.
+    Such a rate is exactly 0 in rests, and such a heading constant. In motion it errs by more than
+    the gyro: the variance of the difference of their turns is more than twice that of rests
+    (F-test, at 1 %), beyond what a delay, a lag, an error once per revolution or effects of the
+    gyro explain, which are smooth functions of the rate (differences of neighbours: Rice, Annals
+    of Statistics 12, 1984). None for another reference, for one that is mostly steady in motion,
+    as of a rate table, and for one that the motion follows later than a gyro does, as a robot its
+    command.
     """
-    rate, time = log.reference_rate, log.time
-    known = np.isfinite([] if rate is None else rate)
-    if rate is None or time is None or log.output is None or not known.any():
+    time, by_rate = log.time, log.reference_rate is not None
+    reference = log.reference_rate if by_rate else log.reference_heading
+    known = np.isfinite([] if reference is None else reference)
+    if reference is None or time is None or log.output is None or not known.any():
         return None
-    rate = np.interp(time, time[known], rate[known])
+    reference = np.interp(time, time[known], reference[known])
+    rate = reference if by_rate else np.gradient(reference, time)
     turned = integrate(time, bridge_gaps(log.output))
     powers = [integrate(time, each) for each in (
         rate, np.abs(rate), rate ** 2, rate ** 3, (time - time.mean()) * rate)]
+    if not by_rate:
+        powers += [np.sin(reference), np.cos(reference)]
     at = np.arange(time[0] + _ERROR_LAGS[-1], time[-1] - _ERROR_LAGS[-1], 1.0)
     if len(at) < 2:
         return None
@@ -552,13 +559,15 @@ def find_motion_errors(log: Log) -> tuple[float, float] | None:
     response = values[:len(lags)]
     if response @ lags > MAX_GYRO_LAG * response.sum():
         return None
-    by_rate = np.argsort(columns[in_motion, _ERROR_LAGS.size - 1], kind='stable')
-    errors = robust_deviation(np.diff(left[in_motion[is_whole]][by_rate])) / math.sqrt(2.0)
+    order = np.argsort(columns[in_motion, _ERROR_LAGS.size - 1], kind='stable')
+    errors = robust_deviation(np.diff(left[in_motion[is_whole]][order])) / math.sqrt(2.0)
     # in rests the rounding of an output with little noise does not scatter
     of_rests = left[at_rest[is_whole]] - np.median(left[at_rest[is_whole]])
     of_rests = of_rests[np.abs(of_rests) <= 5.0 * robust_deviation(of_rests)]
-    usual = math.hypot(float(np.std(of_rests)), quantization_step(
-        log.output[np.isfinite(log.output)]) / math.sqrt(12.0))
+    rounding = [quantization_step(log.output[np.isfinite(log.output)])]
+    if not by_rate:  # nor does that of a heading
+        rounding.append(math.sqrt(2.0) * quantization_step(reference[known]))
+    usual = math.hypot(float(np.std(of_rests)), *np.array(rounding) / math.sqrt(12.0))
     return ((errors, usual)
             if errors ** 2 > 2.0 * usual ** 2 * fisher.isf(FALSE_ALARM_RATE, *freedom) else None)
 

@@ -17,7 +17,7 @@ from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.own_instants import (
     find_own_instants, keep_own_instants, MAX_GYRO_LAG, output_delay)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
-from gyro_calibration.heading.integration import integrate_with_curvature
+from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, find_runs, quantization_step, robust_deviation,
@@ -31,6 +31,9 @@ from scipy.ndimage import binary_erosion, maximum_filter1d, uniform_filter1d
 _BLOCK_SAMPLES = 25
 #: The errors of an encoder are at most so many times its rounding error.
 MAX_ROUNDING_RATIO = 1.5
+#: Least ratio of the noise of a course to that of the gyro: measured are 4.6 to 920, below 8 only
+#: on straight lines between slower fixes, and up to 5 for odometry.
+_COURSE_NOISE_RATIO = 8.0
 #: Least noise of a course, rad, over a second or from span to span; RTK in town has 0.4 deg.
 MIN_COURSE_NOISE = 0.25 * DEGREE
 
@@ -154,8 +157,14 @@ def heading_difference(log: Log) -> HeadingDifference:
 
 
 def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
+    """Return the ratio of the noise of a reference rate to that of the gyro; 0 if none shows."""
+    variance, gyro = rate_noise_variances(log, is_commanded)
+    return math.sqrt(variance / max(gyro, 1e-3 * variance)) if variance else 0.0
+
+
+def rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, float]:
     """
-    Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
+    Return the variances of a reference rate and of the gyro, (rad/s)²; 0, 0 if none is detected.
 
     A command has none, however it jumps. It is estimated where the reference is quietest, by the
     updates of a held one. White noise is detected by third differences of alternating sign, other
@@ -171,14 +180,14 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     if log.time is not None and (is_commanded or len(begins) < 0.5 * len(rate)):
         delay = output_delay(log, log.reference_rate)
         if delay > (0.0 if len(begins) < 0.5 * len(rate) else MAX_GYRO_LAG):
-            return 0.0
+            return 0.0, 0.0
     slow = None if log.time is None else find_own_instants(log.time[known], rate)
     if slow is not None and slow.is_held:
         counts = np.diff(begins, append=len(rate))
         rate, output = rate[begins], np.add.reduceat(output, begins) / counts
         steps = np.ones(len(begins) - 1)
     if len(rate) < 100 or not np.ptp(rate) > 0.0:
-        return 0.0
+        return 0.0, 0.0
     line = np.polyfit(rate, output, 1)
     # across lost samples the motion has changed more
     index = np.flatnonzero(maximum_filter1d(steps, 3)[1:-1] < 1.5 * np.median(steps))
@@ -197,22 +206,50 @@ def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
             fast, left, place = part, rest[:len(quiet)][quiet], index[:len(quiet)][quiet]
     if not len(fast):
-        return 0.0
+        return 0.0, 0.0
     energy = float(np.mean(fast ** 2))
     variance, products = energy / 20.0, (fast[1:] * fast[:-1])[np.diff(place) == 1]
     # neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
     # random walk, and of -0.5 for its integral, which is as smooth as a motion
     if not (variance > 0.0 and products.sum() < -0.5 * energy * len(products)):
         if is_commanded:
-            return 0.0
+            return 0.0, 0.0
         product = -fast * left / 20.0
         # third differences of white noise are correlated over three samples
         deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
         variance = float(np.mean(product)) / line[0]
         if not variance > 3.0 * deviation:
-            return 0.0
+            return 0.0, 0.0
     gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
-    return math.sqrt(variance / max(gyro, 1e-3 * variance))
+    return variance, gyro
+
+
+def heading_noise_share(log: Log) -> float:
+    """
+    Return the ratio of the rate noise of a reference heading to that of the gyro; 0 if none shows.
+
+    A filter or a magnetometer errs like a random walk of the heading over a second, of which the
+    gyro shows nothing. White noise of the heading does not count.
+    """
+    assert log.time is not None and log.output is not None and log.reference_heading is not None
+    turned = integrate(log.time, bridge_gaps(log.output))
+    rows, walks = np.flatnonzero(np.isfinite(log.reference_heading)), list[float]()
+    if len(rows) < 2:
+        return 0.0
+    for own in (rows, rows[::2]):
+        steps = np.diff(log.time[own])
+        variance, of_gyro = rate_noise_variances(Log(
+            time=log.time[own[1:]] - 0.5 * steps, output=np.diff(turned[own]) / steps,
+            reference_rate=np.diff(log.reference_heading[own]) / steps))
+        # the gyro has what is not in the difference
+        walks.append(min(variance, variance + of_gyro) * float(np.median(steps)))  # rad²/s
+    white = white_noise_deviation(log.output) ** 2 * float(np.median(np.diff(log.time)))
+    # by white noise of the heading the second is half of the first; where either exceeds the noise
+    # of the gyro by far, it does not matter
+    if not (white > 0.0 < walks[0]
+            and walks[1] > min(0.75 * walks[0], _COURSE_NOISE_RATIO ** 2 * white)):
+        return 0.0
+    return math.sqrt(walks[0] / white)
 
 
 def is_course(log: Log) -> bool:
@@ -232,10 +269,9 @@ def is_course(log: Log) -> bool:
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
-    # least ratio to the noise of the gyro: measured are 4.6 to 920, below 8 only where a heading
-    # between slower fixes is on straight lines, and up to 5 for odometry
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = 2.0 if usual < 0.1 * large and lost > 0.003 else 8.0
+    # a heading between slower fixes is on straight lines
+    larger = 2.0 if usual < 0.1 * large and lost > 0.003 else _COURSE_NOISE_RATIO
     # an encoder errs by its rounding; a difference over a second has 3 times the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
     return heading_difference(log).total_walk > max(larger * walk, MAX_ROUNDING_RATIO * rounding,

@@ -33,7 +33,8 @@ from gyro_calibration.calibration.heading_regression import find_drift, find_mot
 from gyro_calibration.calibration.own_instants import (
     interpolate_by_splines, is_slow, MAX_GYRO_LAG, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
-    heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
+    heading_difference, heading_noise_share, is_course, MAX_ROUNDING_RATIO, rate_noise_share,
+    step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gate, Reference
@@ -718,7 +719,7 @@ def refuse_mismatch(log: Log) -> None:
 
 REFERENCE_KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro',
                    'rest')
-#: Largest noise of an exact reference rate as a share of that of the gyro: it adds 1e-4 to the
+#: Largest rate noise of an exact reference as a share of that of the gyro: it adds 1e-4 to the
 #: variance, which logs of up to 2e8 samples do not show.
 _MAX_RATE_NOISE_SHARE = 0.01
 
@@ -728,11 +729,7 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
     if stated_kind is not None:
         return Reference(stated_kind, 'as given')
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        if (errors := find_motion_errors(log)) is None:
-            return Reference('rate_command', 'the log has a reference rate')
-        return Reference('odometry', 'its rate is 0 in rests, and errs in motion: over a second '
-                         'it differs from the gyro by {:.2g} deg there, by {:.2g} deg in rests'
-                         .format(*np.array(errors) / DEGREE))
+        return _as_odometry(log) or Reference('rate_command', 'the log has a reference rate')
     heading = log.reference_heading
     if heading is None or not np.isfinite(heading).any():
         return Reference('rest', 'the log has no reference')
@@ -755,7 +752,16 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
             step = 0.0
     if step:
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
-    return Reference('motion_capture', 'the heading has no steps of an encoder')
+    return _as_odometry(log) or Reference(
+        'motion_capture', 'the heading has no steps of an encoder')
+
+
+def _as_odometry(log: Log) -> Reference | None:
+    """Return the reference as odometry, if it stands in rests and errs in motion."""
+    errors = find_motion_errors(log)
+    return None if errors is None else Reference(
+        'odometry', 'it stands in rests, and errs in motion: over a second it differs from the '
+        'gyro by {:.2g} deg there, by {:.2g} deg in rests'.format(*np.array(errors) / DEGREE))
 
 
 def is_reference_limiting(log: Log, reference: Reference) -> bool:
@@ -782,6 +788,8 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     rate_rounding = math.sqrt(2.0) * rounding / interval
     if (rate_rounding > _MAX_RATE_NOISE_SHARE * white_noise_deviation(log.output)
             and step_evenness(log, step) > 0.5):
+        return True
+    if reference.kind == 'motion_capture' and heading_noise_share(log) > _MAX_RATE_NOISE_SHARE:
         return True
     if not (errors.is_significant or replace(errors, constant_error=rounding).is_significant):
         return False

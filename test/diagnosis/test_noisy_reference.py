@@ -16,6 +16,7 @@ from chance import evidence, rms_bounds, seeds
 from diagnosed import established, judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import find_drift, fit_spans
+from gyro_calibration.calibration.reference_noise import heading_noise_share
 from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
@@ -26,9 +27,11 @@ from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration_bench.cases import Case, make_logs, random_source
 from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.stats import t as student
 
@@ -604,6 +607,52 @@ def test_the_errors_of_a_rate_by_odometry_are_no_effects_of_the_gyro(asymmetry, 
     fit = calibrate_encoder(log)
     assert fit.method == 'course'
     assert abs(fit.fit.bias - bias) < 2.5 * np.sqrt(fit.fit.covariance[1, 1]) < 0.03 * DEGREE
+
+
+@pytest.mark.parametrize('effect, multiple, noise', [
+    ('bias_temperature', 2.0, 'flicker'), ('scale_factor_asymmetry', 5.0, 'white'),
+    ('interference_tone', 2.0, 'gauss_markov')])
+def test_an_exact_encoder_beside_a_wandering_bias_is_no_odometry(effect, multiple, noise):
+    case = Case('effects', (effect,), multiple, noise, 'encoder', int(effect[0] != 'i'))
+    assert classify_reference(
+        log_of(make_logs(case, random_source(case, 7))[0])).kind == 'encoder'
+
+
+def integrated(log):
+    """Return a log with the heading of its reference rate."""
+    known = np.isfinite(log.reference_rate)
+    turned = np.full(len(log.time), np.nan)
+    turned[known] = cumulative_trapezoid(log.reference_rate[known], log.time[known], initial=0.0)
+    return replace(log, reference_rate=None, reference_heading=turned)
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_the_errors_of_a_heading_by_odometry_are_no_effects_of_the_gyro(seed):
+    # taken for motion capture, they were a bandwidth with a delay, or remained unexplained
+    found = diagnosed(integrated(wheels(seed)[0]))
+    assert found.reference.kind == 'odometry', found.reference
+    assert not established(found) and not found.unexplained
+    exact = integrated(wheels(seed, slip=0.0, noise=0.0)[0])
+    assert classify_reference(exact).kind == 'motion_capture'
+
+
+@pytest.mark.parametrize('share', [0.3, 3.0, 20.0])
+def test_the_noise_of_a_filtered_heading_is_no_lag_of_the_gyro(share):
+    """Over less than 20 s it is a random walk, `share` times that of the gyro."""
+    generator = np.random.default_rng(round(share))
+    time = np.arange(0.0, 300.0, 0.02)
+    rate, left = stop_and_go(generator, time), np.exp(-0.02 / 20.0)
+    noise = 1e-3 * share * np.sqrt(0.5 * 20.0)  # after 0.001 rad/√s
+    heading = cumulative_trapezoid(rate, time, initial=0.0) + lfilter(
+        [noise * np.sqrt(1.0 - left ** 2)], [1.0, -left], generator.standard_normal(len(time)))
+    log = Log(time=time, reference_heading=heading, output=1.003 * rate + 2e-3
+              + 1e-3 / np.sqrt(0.02) * generator.standard_normal(len(time)))
+    assert heading_noise_share(log) == pytest.approx(share, rel=0.3)
+    found = diagnosed(log)
+    assert not established(found), terminal_lines(found)
+    white = 2e-4 * generator.standard_normal(len(time))
+    assert heading_noise_share(replace(log, reference_heading=white + cumulative_trapezoid(
+        rate, time, initial=0.0))) == 0.0
 
 
 def test_a_coarse_output_beside_odometry_is_diagnosed_and_drifts_of_neither_are_named():
