@@ -60,9 +60,6 @@ class _OctaveVariances:
     loss_factor: Array  # of the scatter of an Allan deviation by lost windows, shape (n,)
     variance: Array  # shape (n,)
     columns: Array  # of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
-    #: The covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or
-    #: (n, n, 6, 6) with a process.
-    forms: Array
     process: GaussMarkov | None = None  # of 1 rad/s
 
     @classmethod
@@ -71,9 +68,19 @@ class _OctaveVariances:
                                    np.zeros(len(chart.size)),
                                    -QUANTIZATION_NOISE.allan_variance(chart.size)])
         scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.difference_count)
-        forms = (_octave_covariance_forms(chart.samples, tuple(chart.size.tolist()))
-                 * np.outer(scarcity, scarcity)[:, :, None, None])
-        return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns, forms)
+        return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns)
+
+    @cached_property
+    def forms(self) -> Array:
+        """
+        Return the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5).
+
+        With a process it is (n, n, 6, 6).
+        """
+        sizes = self.size.tolist()
+        return np.array([[_symmetric_form(self.samples, *sorted((one, other)), self.process)
+                          for other in sizes] for one in sizes]) * np.outer(
+            self.loss_factor, self.loss_factor)[:, :, None, None]
 
     def process_columns(self, process: GaussMarkov) -> Array:
         """Return the columns with that of a process of 1 rad/s, its times in samples."""
@@ -83,9 +90,7 @@ class _OctaveVariances:
 
     def with_process(self, process: GaussMarkov) -> _OctaveVariances:
         """Add a process of 1 rad/s, and its part of the covariance."""
-        forms = _octave_covariance_forms(self.samples, tuple(self.size.tolist()), process)
-        return replace(self, columns=self.process_columns(process), process=process, forms=forms
-                       * np.outer(self.loss_factor, self.loss_factor)[:, :, None, None])
+        return replace(self, columns=self.process_columns(process), process=process)
 
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
@@ -97,15 +102,11 @@ class _OctaveVariances:
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
-@lru_cache(maxsize=64)
-def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
-                             process: GaussMarkov | None = None) -> Array:
-    """Return the covariances as forms of the squared coefficients, as `_OctaveVariances.forms`."""
-    forms = np.zeros((len(sizes),) * 2 + (len(NOISE_TERMS) + (process is not None),) * 2)
-    for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
-        form = covariance_form(samples, sizes[i], sizes[j], process)
-        forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
-    return forms
+@lru_cache(maxsize=4096)
+def _symmetric_form(samples: int, first: int, second: int, process: GaussMarkov | None) -> Array:
+    """Return `covariance_form` for products of coefficients in either order."""
+    form = covariance_form(samples, first, second, process)
+    return 0.5 * (form + form.T)
 
 
 @dataclass(frozen=True)
@@ -246,9 +247,8 @@ class _Ranking:
 
 def _rank_from_octave(octaves: _OctaveVariances, start: int, misfit: float) -> _Ranking:
     """Fit all combinations of terms to the octaves from one on."""
-    since = replace(octaves, forms=octaves.forms[start:, start:], **{
-        name: getattr(octaves, name)[start:]
-        for name in ('size', 'loss_factor', 'variance', 'columns')})
+    since = replace(octaves, **{name: getattr(octaves, name)[start:]
+                                for name in ('size', 'loss_factor', 'variance', 'columns')})
     descriptions = tuple(
         sorted((_fit_combination(since, places, misfit) for places in _COMBINATIONS),
                key=_CombinationFit.penalized_deviance))

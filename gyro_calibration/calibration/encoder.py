@@ -59,7 +59,8 @@ from gyro_calibration.logs.quality import (
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import Motion, motion_from_headings, motion_from_rates
+from gyro_calibration.model.motion import (
+    Motion, motion_from_headings, motion_from_log, motion_from_rates)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -332,15 +333,11 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
 
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
     """Return time and output of the gyro, motion and its cross rotation, without lost samples."""
-    heading, rate = log.reference_heading, log.reference_rate
-    if log.time is None or log.output is None or (heading is None and rate is None):
+    reference = log.reference_rate if log.reference_heading is None else log.reference_heading
+    if log.time is None or log.output is None or reference is None:
         raise DataRefused('the log holds no reference over time: it needs values of time_s, '
                           'gyro_dps and reference_heading_deg or reference_rate_dps')
-    if heading is None:
-        assert rate is not None
-        known, heading = np.isfinite(rate), np.full(len(log), np.nan)
-        heading[known] = integrate(log.time[known], rate[known])
-    output_known, reference_known = np.isfinite(log.output), np.isfinite(heading)
+    output_known, reference_known = np.isfinite(log.output), np.isfinite(reference)
     # a reference may come far less often than the gyro
     for known, name, fewest, remedy in (
             (output_known, 'gyro', max(100, len(log) // 10), 'repair its line and record again'),
@@ -349,12 +346,9 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
         if known.sum() < fewest:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               f'at least {fewest} are needed: {remedy}')
-    start = log.time[reference_known][0]
-    motion = motion_from_headings(log.time[reference_known], heading[reference_known])
-    if log.reference_heading is None and rate is not None and not rate_noise_share(log):
-        # a rate without noise may be a command, which the motion follows
-        motion = motion_from_rates(log.time[reference_known], rate[reference_known])
-    motion = replace(motion, name='reference')
+    motion, start = motion_from_log(log)
+    if motion.rate is not None and rate_noise_share(log):  # else it may be a command
+        motion = replace(motion, rate=None)
     # the last value stands for an interval too; the rounding of stamps, 1 us, is no lack
     duration = motion.duration + float(np.median(np.diff(motion.time)))
     if duration < 10.0 - 1e-6:
