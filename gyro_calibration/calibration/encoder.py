@@ -48,7 +48,7 @@ from gyro_calibration.calibration.selection import (
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
 from gyro_calibration.calibration.spans import (
-    COURSE_TREATMENT, lag_deviation, MAX_ENCODER_OFFSET, WANDER_COSINES)
+    COURSE_TREATMENT, lag_deviation, lay_out_spans, MAX_ENCODER_OFFSET, WANDER_COSINES)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -109,15 +109,17 @@ def calibrate_encoder(log: Log, method: str | None = None,
     refuse_wrapped(log)
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
-    if method is None:
+    spans = None
+    if method is None and log.reference_heading is None:
         method = 'course' if find_motion_errors(log) is not None else 'likelihood'
-        if log.reference_heading is not None:
-            method = 'course' if is_course(log) or is_noisy(log) else 'likelihood'
-            longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
-            if longest < 0.5 * motion.duration and (
-                    hole := _find_turn_in_hole(time, output, motion)):
-                method = 'course'
-                chosen.append(f'{hole}, over which they are not compared')
+    elif method is None:
+        spans = lay_out_spans(log, technology=technology)
+        method = 'course' if is_course(log) or is_noisy(log, spans) else 'likelihood'
+        longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
+        if longest < 0.5 * motion.duration and (
+                hole := _find_turn_in_hole(time, output, motion)):
+            method = 'course'
+            chosen.append(f'{hole}, over which they are not compared')
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps, _ = bridge_jumps(log)
@@ -126,7 +128,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
-        fit = fit_course(log, technology)
+        fit = fit_course(spans or lay_out_spans(log, technology=technology))
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
