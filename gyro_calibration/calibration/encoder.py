@@ -37,10 +37,9 @@ from gyro_calibration.calibration.likelihood import (
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, HierarchicalPrior,
     TridiagonalMatrix)
-from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings, is_course, rate_noise_share)
+    drop_repeated_headings, is_course, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
     fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (

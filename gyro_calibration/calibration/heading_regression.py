@@ -32,8 +32,8 @@ from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior)
-from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, MAX_ROUNDING_STEP
-from gyro_calibration.calibration.reference_noise import MIN_COURSE_NOISE
+from gyro_calibration.calibration.reference_noise import (
+    MAX_GYRO_LAG, MAX_ROUNDING_STEP, MIN_COURSE_NOISE)
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.spans import (

@@ -37,9 +37,8 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.noise_grid import bias_wander_columns, SharedNoise
-from gyro_calibration.calibration.own_instants import is_slow, keep_own_instants, OwnInstants
 from gyro_calibration.calibration.reference_noise import (
-    find_rests, heading_difference, rate_noise_share)
+    find_rests, heading_difference, is_slow, keep_own_instants, OwnInstants, rate_noise_share)
 from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask

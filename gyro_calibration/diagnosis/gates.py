@@ -30,10 +30,9 @@ from gyro_calibration.calibration.dwells import (
     few_values_remedy, find_lost_reference, require_output)
 from gyro_calibration.calibration.encoder import choose_reference
 from gyro_calibration.calibration.heading_regression import find_drift, find_motion_errors
-from gyro_calibration.calibration.own_instants import (
-    interpolate_by_splines, is_slow, MAX_GYRO_LAG, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
-    heading_difference, is_course, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
+    heading_difference, interpolate_by_splines, is_course, is_slow, MAX_GYRO_LAG,
+    MAX_ROUNDING_RATIO, MAX_ROUNDING_STEP, rate_noise_share, step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.spans import lay_out_spans
