@@ -175,19 +175,23 @@ class _CombinationFit:
         return float(lower), float(upper)
 
 
+def _solve_nonnegative(half: Array, columns: Array, observed: Array) -> Array:
+    """Return squared coefficients, none negative, by a Cholesky factor of the covariance."""
+    white = np.linalg.solve(half, np.column_stack([columns, observed]))
+    size = np.linalg.norm(white[:, :-1], axis=0)
+    return nnls(white[:, :-1] / size, white[:, -1])[0] / size
+
+
 def _fit_combination(octaves: _OctaveVariances, indices: tuple[int, ...], misfit: float,
                      fixed_term: int = -1, fixed_square: float = 0.0) -> _CombinationFit:
     """Fit nonnegative terms, with the covariance of the fitted noise; one more may be fixed."""
     given = np.zeros(_FILTER_BEND + 1)
     if fixed_term >= 0:
         given[fixed_term] = fixed_square
-    both = np.column_stack([octaves.columns[:, indices],
-                            octaves.variance - octaves.columns @ given])
+    observed = octaves.variance - octaves.columns @ given
     squares, half = given.copy(), np.diag(octaves.variance)
     for number in range(12):
-        white = np.linalg.solve(half, both)
-        size = np.linalg.norm(white[:, :-1], axis=0)
-        found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
+        found = _solve_nonnegative(half, octaves.columns[:, indices], observed)
         if not (found.any() or fixed_square) or (
                 number and np.allclose(squares[list(indices)], found, rtol=1e-4, atol=0.0)):
             break
@@ -273,9 +277,7 @@ def _fit_with_process(best: _CombinationFit, kept_terms: tuple[int, ...],
         columns, squares, half = (octaves.process_columns(process), np.zeros(_FILTER_BEND + 1),
                                   best.cholesky_factor)
         for _ in range(2):
-            white = np.linalg.solve(half, np.column_stack([columns[:, places], octaves.variance]))
-            size = np.linalg.norm(white[:, :-1], axis=0)
-            squares[list(places)] = nnls(white[:, :-1] / size, white[:, -1])[0] / size
+            squares[list(places)] = _solve_nonnegative(half, columns[:, places], octaves.variance)
             model = np.maximum(columns @ squares, 1e-3 * octaves.variance)
             half = best.cholesky_factor * (model / known)[:, None]
         return _CombinationFit(replace(octaves, columns=columns), squares, half).deviance
