@@ -101,7 +101,7 @@ def forecasts(duration: float) -> list[CalibrationForecast]:
 
 def planned(place: str, duration: float) -> Motion:
     return find_best_motion(ABILITIES[place], forecasts(duration)[0], duration,
-                            np.random.default_rng(1)).motion
+                            np.random.default_rng(1))[0]
 
 
 def row(pool: Executor, runs: int, name: str, motion: Motion, late: float = 0.0,

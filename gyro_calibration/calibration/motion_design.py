@@ -270,21 +270,14 @@ class _MotionFamily:
         return _build_motion(robot, zip(angles.tolist(), rates.tolist(), rests.tolist()))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A motion and the expected accuracy of a calibration by it."""
-
-    motion: Motion
-    prediction: Prediction
-
-
 def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration: float,
-                     generator: np.random.Generator, generations: int = 60) -> Plan:
+                     generator: np.random.Generator,
+                     generations: int = 60) -> tuple[Motion, Prediction]:
     """
-    Return the motion of that length, s, with the least heading error in the forecast's drive.
+    Return the motion of a length, s, with the least heading error in the forecast's drive.
 
-    Each generation of the search tries 70 motions. `DataRefused` is raised where the robot cannot
-    make one, or none would calibrate well enough.
+    It comes with its prediction. Each generation of the search tries 70 motions. `DataRefused` is
+    raised where the robot cannot make one, or none would calibrate well enough.
     """
     _refuse_impossible(robot, duration)
     family = _MotionFamily(robot, duration)
@@ -297,9 +290,9 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     if (motion := family.motion_at(found.x)) is None:
         raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: '
                           'allow more seconds or a larger angle')
-    plan, limits = Plan(motion, forecast.predict(motion)), RunLimits()
+    prediction, limits = forecast.predict(motion), RunLimits()
     # a self-calibration by it would be refused
-    deviation = plan.prediction.scale_deviation
+    deviation = prediction.scale_deviation
     spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
     if deviation > limits.max_scale_deviation or spread < limits.min_rate_spread:
         raise DataRefused(
@@ -308,7 +301,7 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
             f'needed are {100.0 * limits.max_scale_deviation:g} % and '
             f'{limits.min_rate_spread / DEGREE:g} deg/s: allow more seconds, a larger angle or '
             'faster turns')
-    return plan
+    return motion, prediction
 
 
 def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
