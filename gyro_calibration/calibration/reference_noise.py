@@ -130,46 +130,43 @@ def _find_corners(time: Array, values: Array, step: float) -> tuple[Array, Array
 
 def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     """
-    Return a log whose reference is known at its own instants alone, and these.
+    Return a log whose one reference is known at its own instants alone, and these.
 
     Where instants lie between samples, the samples next to them get the values of a cubic spline.
     A rate that is held as a command is not slow. The instants next to samples have shape (n,),
-    with nan; None if no reference is slow.
+    with nan; None if the reference is not slow.
     """
-    kept = None
-    for name in ('reference_rate', 'reference_heading'):
-        given, is_heading = getattr(log, name), name == 'reference_heading'
-        known = np.flatnonzero(np.isfinite([] if given is None else given))
-        if log.time is None or len(known) <= _MIN_INSTANTS:
-            continue
-        stamps = log.time[known]
-        found = find_own_instants(stamps, given[known])
-        if found is None or not (found.interval <= _LONGEST_INTERVAL
-                                 or found.is_held and is_heading):
-            continue
-        if found.is_held and not is_heading:
-            assert log.output is not None
-            both = np.isfinite(given) & np.isfinite(log.output)
-            left = [(log.output - rate)[both] for rate in (
-                given, np.interp(log.time, found.time, found.values))]
-            steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
-            if steps < lines or output_delay(log, given) > 0.0:
-                continue
-        # not those in gaps
-        after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
-        inside = stamps[after] - stamps[after - 1] < found.interval
-        if found.is_held and is_heading:  # it may be lost where it stands
-            inside &= np.diff(found.values, prepend=np.nan) != 0.0
-        at, values, after = found.time[inside], found.values[inside], after[inside]
-        rows = known[after - (at - stamps[after - 1] < stamps[after] - at)]
-        kept = found._replace(time=np.full(len(log), np.nan), values=np.full(len(log), np.nan))
-        kept.time[rows], kept.values[rows] = at, values
-        own = kept.values.copy()
-        if np.abs(at - log.time[rows]).max(initial=0.0) > MIN_SAMPLE_INTERVAL:
-            own[rows] = CubicSpline(found.time, found.values)(log.time[rows])
-        log = (replace(log, reference_heading=own) if is_heading
-               else replace(log, reference_rate=own))
-    return log, kept
+    is_heading = log.reference_heading is not None
+    given = log.reference_heading if is_heading else log.reference_rate
+    known = np.flatnonzero(np.isfinite([] if given is None else given))
+    if log.time is None or given is None or len(known) <= _MIN_INSTANTS:
+        return log, None
+    stamps = log.time[known]
+    found = find_own_instants(stamps, given[known])
+    if found is None or not (found.interval <= _LONGEST_INTERVAL or found.is_held and is_heading):
+        return log, None
+    if found.is_held and not is_heading:
+        assert log.output is not None
+        both = np.isfinite(given) & np.isfinite(log.output)
+        left = [(log.output - rate)[both] for rate in (
+            given, np.interp(log.time, found.time, found.values))]
+        steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
+        if steps < lines or output_delay(log, given) > 0.0:
+            return log, None
+    # not those in gaps
+    after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
+    inside = stamps[after] - stamps[after - 1] < found.interval
+    if found.is_held and is_heading:  # it may be lost where it stands
+        inside &= np.diff(found.values, prepend=np.nan) != 0.0
+    at, values, after = found.time[inside], found.values[inside], after[inside]
+    rows = known[after - (at - stamps[after - 1] < stamps[after] - at)]
+    kept = found._replace(time=np.full(len(log), np.nan), values=np.full(len(log), np.nan))
+    kept.time[rows], kept.values[rows] = at, values
+    own = kept.values.copy()
+    if np.abs(at - log.time[rows]).max(initial=0.0) > MIN_SAMPLE_INTERVAL:
+        own[rows] = CubicSpline(found.time, found.values)(log.time[rows])
+    return (replace(log, reference_heading=own) if is_heading
+            else replace(log, reference_rate=own)), kept
 
 
 def output_delay(log: Log, rate: Array) -> float:
