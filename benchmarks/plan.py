@@ -15,7 +15,7 @@ Compare a planned motion of 20 s with plain ones, predicted and simulated, and w
 
 The robot turns at 60 deg/s at most, with 120 deg/s² (60 deg/s² with the short cable) and rests of
 1 s. The gyro has the noise of the Epson XV-3500 and a random scale factor error and bias for each
-run, of 3 % and 0.5 deg/s; 100 Hz. After the run it drives on at once for 160 s: the motion
+run, of 3 % and 0.5 deg/s; 100 Hz. After the run and its rest it drives on for 160 s: the motion
 `robot`, which turns up to 100 deg and comes back each time, or a steady turn of ten rounds. The
 noise of a run is one record, from before the motion to the end of the drive; each row uses the
 same records. Standard deviations of the bias are of its difference from the mean bias of the
@@ -36,14 +36,18 @@ import sys
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.motion_design import (
     CalibrationForecast, find_best_motion, plain_motion, RobotLimits)
+from gyro_calibration.calibration.self_calibration import check_rest, RunLimits, SETTLING_TIME
 from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, constant_rate_motion, Motion, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.model.presets import XV3500
 import numpy as np
 
 RATE, DRIVE = 100, 160.0
+#: Samples until the robot has settled after a run, and until the end of its rest.
+SETTLED = round(SETTLING_TIME * RATE)
+REST = SETTLED + round(RunLimits.rest_duration * RATE)
 #: Lengths of planned motions, s.
 LENGTHS = (20.0, 30.0, 60.0, 120.0)
 #: Flicker and its drift begin so long before the run, s.
@@ -70,18 +74,20 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
     s, b = 0.03 * generator.standard_normal(), 0.5 * DEGREE * generator.standard_normal()
     before, run, drive = (round(length * RATE) for length in (BEFORE, motion.duration, DRIVE))
     # the drive is at the end of the record: same noise for motions of any length
-    count = before + round(LENGTHS[-1] * RATE) + drive
+    count = before + round(LENGTHS[-1] * RATE) + REST + drive
     wander = simulate_noise(replace(XV3500.noise, angle_random_walk=0.0), count, 1.0 / RATE,
                             generator)
     noise = wander + simulate_noise(Noise(XV3500.noise.angle_random_walk), count, 1.0 / RATE,
                                     generator)
-    begin = count - drive - run
-    time = np.arange(run + 1) / RATE
-    output = (1.0 + s) * followed(motion, time, late, lag) + b + noise[begin:begin + run + 1]
-    fit = fit_likelihood(time, output, motion, 0.2)
-    bias = fit.bias - b - wander[begin + run:].mean()
+    begin = count - drive - REST - run
+    time = np.arange(run + REST + 1) / RATE
+    output = (1.0 + s) * followed(motion, time, late, lag) + b + noise[begin:count - drive + 1]
+    fit = fit_likelihood(time[:run + 1], output[:run + 1], motion, 0.2)
+    rest = slice(run + SETTLED, None)
+    fit = check_rest(time[rest], output[rest], fit, XV3500.noise).fit
+    bias = fit.bias - b - wander[count - drive:].mean()
     after = (np.arange(drive) + 1.0) / RATE
-    walked = np.cumsum(noise[begin + run:]) / RATE
+    walked = np.cumsum(noise[count - drive:]) / RATE
     headings = [((1.0 + s) * each.heading_at(after) + walked + (b - fit.bias) * after) / (
         1.0 + fit.scale_factor_error) - each.heading_at(after) for each in DRIVES.values()]
     return np.array([fit.scale_factor_error - s, bias,
@@ -89,13 +95,13 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
 
 
 def forecasts(duration: float) -> list[CalibrationForecast]:
-    return [CalibrationForecast(XV3500.noise, duration, drive, DRIVE, 0.0)
+    return [CalibrationForecast(XV3500.noise, duration, drive, DRIVE)
             for drive in DRIVES.values()]
 
 
 def planned(place: str, duration: float) -> Motion:
     return find_best_motion(ABILITIES[place], forecasts(duration)[0], duration,
-                            np.random.default_rng(1)).motion
+                            np.random.default_rng(1))[0]
 
 
 def row(pool: Executor, runs: int, name: str, motion: Motion, late: float = 0.0,

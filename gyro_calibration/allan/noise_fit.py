@@ -60,9 +60,6 @@ class _OctaveVariances:
     loss_factor: Array  # of the scatter of an Allan deviation by lost windows, shape (n,)
     variance: Array  # shape (n,)
     columns: Array  # of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
-    #: The covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or
-    #: (n, n, 6, 6) with a process.
-    forms: Array
     process: GaussMarkov | None = None  # of 1 rad/s
 
     @classmethod
@@ -71,9 +68,19 @@ class _OctaveVariances:
                                    np.zeros(len(chart.size)),
                                    -QUANTIZATION_NOISE.allan_variance(chart.size)])
         scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.difference_count)
-        forms = (_octave_covariance_forms(chart.samples, tuple(chart.size.tolist()))
-                 * np.outer(scarcity, scarcity)[:, :, None, None])
-        return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns, forms)
+        return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns)
+
+    @cached_property
+    def forms(self) -> Array:
+        """
+        Return the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5).
+
+        With a process it is (n, n, 6, 6).
+        """
+        sizes = self.size.tolist()
+        return np.array([[_symmetric_form(self.samples, *sorted((one, other)), self.process)
+                          for other in sizes] for one in sizes]) * np.outer(
+            self.loss_factor, self.loss_factor)[:, :, None, None]
 
     def process_columns(self, process: GaussMarkov) -> Array:
         """Return the columns with that of a process of 1 rad/s, its times in samples."""
@@ -83,9 +90,7 @@ class _OctaveVariances:
 
     def with_process(self, process: GaussMarkov) -> _OctaveVariances:
         """Add a process of 1 rad/s, and its part of the covariance."""
-        forms = _octave_covariance_forms(self.samples, tuple(self.size.tolist()), process)
-        return replace(self, columns=self.process_columns(process), process=process, forms=forms
-                       * np.outer(self.loss_factor, self.loss_factor)[:, :, None, None])
+        return replace(self, columns=self.process_columns(process), process=process)
 
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
@@ -97,15 +102,11 @@ class _OctaveVariances:
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
-@lru_cache(maxsize=64)
-def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
-                             process: GaussMarkov | None = None) -> Array:
-    """Return the covariances as forms of the squared coefficients, as `_OctaveVariances.forms`."""
-    forms = np.zeros((len(sizes),) * 2 + (len(NOISE_TERMS) + (process is not None),) * 2)
-    for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
-        form = covariance_form(samples, sizes[i], sizes[j], process)
-        forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
-    return forms
+@lru_cache(maxsize=4096)
+def _symmetric_form(samples: int, first: int, second: int, process: GaussMarkov | None) -> Array:
+    """Return `covariance_form` for products of coefficients in either order."""
+    form = covariance_form(samples, first, second, process)
+    return 0.5 * (form + form.T)
 
 
 @dataclass(frozen=True)
@@ -174,19 +175,23 @@ class _CombinationFit:
         return float(lower), float(upper)
 
 
+def _solve_nonnegative(half: Array, columns: Array, observed: Array) -> Array:
+    """Return squared coefficients, none negative, by a Cholesky factor of the covariance."""
+    white = np.linalg.solve(half, np.column_stack([columns, observed]))
+    size = np.linalg.norm(white[:, :-1], axis=0)
+    return nnls(white[:, :-1] / size, white[:, -1])[0] / size
+
+
 def _fit_combination(octaves: _OctaveVariances, indices: tuple[int, ...], misfit: float,
                      fixed_term: int = -1, fixed_square: float = 0.0) -> _CombinationFit:
     """Fit nonnegative terms, with the covariance of the fitted noise; one more may be fixed."""
     given = np.zeros(_FILTER_BEND + 1)
     if fixed_term >= 0:
         given[fixed_term] = fixed_square
-    both = np.column_stack([octaves.columns[:, indices],
-                            octaves.variance - octaves.columns @ given])
+    observed = octaves.variance - octaves.columns @ given
     squares, half = given.copy(), np.diag(octaves.variance)
     for number in range(12):
-        white = np.linalg.solve(half, both)
-        size = np.linalg.norm(white[:, :-1], axis=0)
-        found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
+        found = _solve_nonnegative(half, octaves.columns[:, indices], observed)
         if not (found.any() or fixed_square) or (
                 number and np.allclose(squares[list(indices)], found, rtol=1e-4, atol=0.0)):
             break
@@ -246,9 +251,8 @@ class _Ranking:
 
 def _rank_from_octave(octaves: _OctaveVariances, start: int, misfit: float) -> _Ranking:
     """Fit all combinations of terms to the octaves from one on."""
-    since = replace(octaves, forms=octaves.forms[start:, start:], **{
-        name: getattr(octaves, name)[start:]
-        for name in ('size', 'loss_factor', 'variance', 'columns')})
+    since = replace(octaves, **{name: getattr(octaves, name)[start:]
+                                for name in ('size', 'loss_factor', 'variance', 'columns')})
     descriptions = tuple(
         sorted((_fit_combination(since, places, misfit) for places in _COMBINATIONS),
                key=_CombinationFit.penalized_deviance))
@@ -273,9 +277,7 @@ def _fit_with_process(best: _CombinationFit, kept_terms: tuple[int, ...],
         columns, squares, half = (octaves.process_columns(process), np.zeros(_FILTER_BEND + 1),
                                   best.cholesky_factor)
         for _ in range(2):
-            white = np.linalg.solve(half, np.column_stack([columns[:, places], octaves.variance]))
-            size = np.linalg.norm(white[:, :-1], axis=0)
-            squares[list(places)] = nnls(white[:, :-1] / size, white[:, -1])[0] / size
+            squares[list(places)] = _solve_nonnegative(half, columns[:, places], octaves.variance)
             model = np.maximum(columns @ squares, 1e-3 * octaves.variance)
             half = best.cholesky_factor * (model / known)[:, None]
         return _CombinationFit(replace(octaves, columns=columns), squares, half).deviance

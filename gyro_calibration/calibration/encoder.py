@@ -35,20 +35,20 @@ from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
     ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
-    BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, HierarchicalPrior,
-    TridiagonalMatrix)
-from gyro_calibration.calibration.own_instants import keep_own_instants, MAX_ROUNDING_STEP
+    BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, GridFit,
+    HierarchicalPrior, TridiagonalMatrix)
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings, is_course, rate_noise_share)
+    drop_repeated_headings, is_course, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
     fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects, TECHNOLOGY_PRIORS)
 from gyro_calibration.calibration.self_calibration import (
-    DRIVE_DURATION, refuse_one_speed, refuse_scale, rounding_covariance, RunLimits)
+    DRIVE_DURATION, refuse_one_speed, refuse_scale, refuse_uncertain_scale, rounding_covariance,
+    RunLimits)
 from gyro_calibration.calibration.spans import (
-    COURSE_TREATMENT, lag_deviation, MAX_ENCODER_OFFSET, WANDER_COSINES)
+    COURSE_TREATMENT, lag_deviation, lay_out_spans, MAX_ENCODER_OFFSET, WANDER_COSINES)
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -59,7 +59,8 @@ from gyro_calibration.logs.quality import (
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import Motion, motion_from_headings, motion_from_rates
+from gyro_calibration.model.motion import (
+    Motion, motion_from_headings, motion_from_log, motion_from_rates)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -108,16 +109,17 @@ def calibrate_encoder(log: Log, method: str | None = None,
     refuse_wrapped(log)
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
-    if method is None:
-        if log.reference_heading is None:
-            method = 'course' if find_motion_errors(log) is not None else 'likelihood'
-        else:
-            method = 'course' if is_course(log) or is_noisy(log) else 'likelihood'
-            longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
-            if longest < 0.5 * motion.duration and (
-                    hole := _find_turn_in_hole(time, output, motion)):
-                method = 'course'
-                chosen.append(f'{hole}, over which they are not compared')
+    spans = None
+    if method is None and log.reference_heading is None:
+        method = 'course' if find_motion_errors(log) is not None else 'likelihood'
+    elif method is None:
+        spans = lay_out_spans(log, technology=technology)
+        method = 'course' if is_course(log) or is_noisy(log, spans) else 'likelihood'
+        longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
+        if longest < 0.5 * motion.duration and (
+                hole := _find_turn_in_hole(time, output, motion)):
+            method = 'course'
+            chosen.append(f'{hole}, over which they are not compared')
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps, _ = bridge_jumps(log)
@@ -126,7 +128,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
-        fit = fit_course(log, technology)
+        fit = fit_course(spans or lay_out_spans(log, technology=technology))
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
@@ -150,7 +152,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
 def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by the likelihood, or refuse it, and the bounds of its noise."""
-    limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET, max_heading_error=15.0 * DEGREE)
+    limits = RunLimits(max_heading_error=15.0 * DEGREE)
     if hole := _find_turn_in_hole(time, output, motion):
         raise DataRefused(f'{hole}: use --method course, or fit the log before or after it (--to, '
                           '--from), or correct the stamps')
@@ -177,33 +179,29 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
             1.0 + fit.scale_factor_error))
     elif fit.shaft_error.size:
         motion = replace(motion, heading=correct_shaft(motion.heading, fit.shaft_error))
-    drift = _estimate_drift(motion, _heading_residual(
+    drift, (least_walk, largest_walk) = _estimate_drift(motion, _heading_residual(
         time - fit.time_offset, corrected, motion), fit.bias, technology)
+    (bias,), (deviation,) = drift.values.tolist(), drift.deviations.tolist()
     # a bias within chance that could make a heading worse
-    if (drift.deviation * DRIVE_DURATION > limits.max_heading_error
-            and abs(drift.bias) < stats.norm.ppf(0.975) * drift.deviation):
-        raise DataRefused(f'the log shows a bias of {drift.bias / DEGREE:.3f} +- '
-                          f'{drift.deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
+    if (deviation * DRIVE_DURATION > limits.max_heading_error
+            and abs(bias) < NORMAL_QUANTILE_975 * deviation):
+        raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
+                          f'{deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
                           'heading: turn more slowly, with rests, or for longer')
     fit = _apply_drift(fit, drift, motion)
     # what the steps of the output cause is seen between a few rates only
     unseen = np.diag(rounding_covariance(time, output, fit)[0] - fit.covariance)
     fit = replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
-    response_variance = fit.response_deviation ** 2
-    deviation = math.sqrt(fit.covariance[0, 0])
-    if deviation > limits.max_scale_deviation:
-        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
-                          f'wanted {100 * limits.max_scale_deviation:g} %: '
-                          'turn further, faster, or more often')
-    fit = replace(fit, covariance=fit.covariance + np.diag([response_variance, 0.0]))
+    refuse_uncertain_scale(math.sqrt(fit.covariance[0, 0]), limits)
+    fit = replace(fit, covariance=fit.covariance + np.diag([fit.response_deviation ** 2, 0.0]))
     # the steps of an encoder hide white noise
     if has_steps:
-        return replace(fit, angle_random_walk=min(fit.angle_random_walk, drift.walk_bounds[1])), {}
+        return replace(fit, angle_random_walk=min(fit.angle_random_walk, largest_walk)), {}
     low, high = fit.angle_random_walk / np.sqrt(
         stats.chi2.ppf([0.975, 0.025], fit.dof) / fit.dof)
     # what repeats within a piece, as a wobble of the shaft does, is no random walk
-    if fit.angle_random_walk > drift.walk_bounds[1]:
-        low, fit = drift.walk_bounds[0], replace(fit, angle_random_walk=drift.walk_bounds[1])
+    if fit.angle_random_walk > largest_walk:
+        low, fit = least_walk, replace(fit, angle_random_walk=largest_walk)
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
@@ -333,15 +331,11 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
 
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
     """Return time and output of the gyro, motion and its cross rotation, without lost samples."""
-    heading, rate = log.reference_heading, log.reference_rate
-    if log.time is None or log.output is None or (heading is None and rate is None):
+    reference = log.reference_rate if log.reference_heading is None else log.reference_heading
+    if log.time is None or log.output is None or reference is None:
         raise DataRefused('the log holds no reference over time: it needs values of time_s, '
                           'gyro_dps and reference_heading_deg or reference_rate_dps')
-    if heading is None:
-        assert rate is not None
-        known, heading = np.isfinite(rate), np.full(len(log), np.nan)
-        heading[known] = integrate(log.time[known], rate[known])
-    output_known, reference_known = np.isfinite(log.output), np.isfinite(heading)
+    output_known, reference_known = np.isfinite(log.output), np.isfinite(reference)
     # a reference may come far less often than the gyro
     for known, name, fewest, remedy in (
             (output_known, 'gyro', max(100, len(log) // 10), 'repair its line and record again'),
@@ -350,12 +344,9 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
         if known.sum() < fewest:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               f'at least {fewest} are needed: {remedy}')
-    start = log.time[reference_known][0]
-    motion = motion_from_headings(log.time[reference_known], heading[reference_known])
-    if log.reference_heading is None and rate is not None and not rate_noise_share(log):
-        # a rate without noise may be a command, which the motion follows
-        motion = motion_from_rates(log.time[reference_known], rate[reference_known])
-    motion = replace(motion, name='reference')
+    motion, start = motion_from_log(log)
+    if motion.rate is not None and rate_noise_share(log):  # else it may be a command
+        motion = replace(motion, rate=None)
     # the last value stands for an interval too; the rounding of stamps, 1 us, is no lack
     duration = motion.duration + float(np.median(np.diff(motion.time)))
     if duration < 10.0 - 1e-6:
@@ -392,22 +383,13 @@ def _number_pieces(time: Array) -> NDArray[np.intp]:
     return np.minimum(since * count, count - 1).astype(np.intp)
 
 
-@dataclass(frozen=True)
-class _Drift:
-    """How a heading drifts after a fit."""
-
-    # mean bias over the log and its standard deviation, rad/s
-    bias: float
-    deviation: float
-    wander_deviation: float  # of the mean bias less the bias at the beginning, rad/s
-    # 95 % bounds of the angle random walk if nothing else moves the heading, rad/√s
-    walk_bounds: tuple[float, float]
-
-
-def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) -> _Drift:
+def _estimate_drift(motion: Motion, error: Array, bias: float,
+                    technology: str) -> tuple[GridFit, list[float]]:
     """
-    Find the mean bias over a log, and how it wanders, by the drifts between pieces of the log.
+    Return the fit of the mean bias over a log, rad/s, and 95 % bounds of the angle random walk.
 
+    By the drifts between pieces of the log. The bounds, rad/√s, hold if nothing else moves the
+    heading.
     What repeats itself with a motion within a piece is noise of the mean heading of that piece.
     The bias has a normal prior about zero, of a tenth of the size that the technology has up to
     all of it: a bias of many standard deviations stays; one that the log hardly shows would only
@@ -442,13 +424,11 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
-    return _Drift(float(found.values[0]), float(found.deviations[0]),
-                  math.sqrt(found.unobservable_variance),
-                  (math.sqrt(squares / stats.chi2.ppf(0.975, len(white) - 1)),
-                   math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))
+    walks = np.sqrt(squares / stats.chi2.ppf([0.975, 0.025], len(white) - 1))
+    return found, walks.tolist()
 
 
-def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasFit:
+def _apply_drift(fit: ScaleBiasFit, drift: GridFit, motion: Motion) -> ScaleBiasFit:
     """Return the fit with the mean bias of a drift, and covariances by scatter between pieces."""
     turned = np.interp(fit.influence[:, 2], motion.time, motion.heading) / (2.0 * math.pi)
     scatter = _scatter_between(_number_pieces(fit.influence[:, 2]), fit.influence, turned)
@@ -456,8 +436,8 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
     # the drift is that of a heading with the scale of the fit, whose error is one of the bias too
     own_variance = max(float(fit.covariance[0, 0]) - fit.response_deviation ** 2, 0.0)
     of_scale = fit.covariance[0, 1] / math.sqrt(own_variance) if own_variance else 0.0
-    widening = np.array([1.0, math.hypot(drift.deviation, drift.wander_deviation, of_scale)
-                         / math.sqrt(scatter[1, 1])])
+    widening = np.array([1.0, math.sqrt(
+        (drift.covariance[0, 0] + drift.unobservable_variance + of_scale ** 2) / scatter[1, 1])])
     covariance = scatter * np.outer(widening, widening)
     # 24 places in a revolution, whose errors are independent
     place = np.floor(np.mod(turned, 1.0) * 24.0).astype(np.intp) % 24
@@ -468,8 +448,9 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift, motion: Motion) -> ScaleBiasF
                                _scatter_between(place, fit.influence, turned)[0, 0])
     # the components of a misalignment scatter as the scale factor error does
     widening = covariance[0, 0] / fit.covariance[0, 0]
-    return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
-                   + float(slope) * (drift.bias - fit.bias), covariance=covariance,
+    bias = float(drift.values[0])
+    return replace(fit, bias=bias, scale_factor_error=fit.scale_factor_error
+                   + float(slope) * (bias - fit.bias), covariance=covariance,
                    misalignment_covariance=max(widening, 1.0) * fit.misalignment_covariance)
 
 

@@ -32,13 +32,12 @@ from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior)
-from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, MAX_ROUNDING_STEP
-from gyro_calibration.calibration.reference_noise import MIN_COURSE_NOISE
+from gyro_calibration.calibration.reference_noise import (
+    MAX_GYRO_LAG, MAX_ROUNDING_STEP, MIN_COURSE_NOISE)
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.spans import (
-    BASE_VALUES, CauseTerm, design_matrix, DRIFT_TERM, lay_out_spans, MISALIGNMENT_TERM, Spans,
-    WIDE_PRIOR)
+    BASE_VALUES, CauseTerm, design_matrix, DRIFT_TERM, MISALIGNMENT_TERM, Spans, WIDE_PRIOR)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
@@ -72,16 +71,19 @@ class SpanFit:
     effective_stretches: Array  # effective number of stretches that determine each value
     freedom: Array  # degrees of freedom of the deviation of each value
 
+    @property
+    def deviations(self) -> Array:
+        """Return the standard deviations of the values, shape (m,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+
     def half_width(self, value_index: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
-        deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
-        return float(student.ppf(0.975, self.freedom[value_index])) * deviation
+        return float(student.ppf(0.975, self.freedom[value_index]) * self.deviations[value_index])
 
     def p_value(self, value_index: int) -> float:
         """Return the probability by chance of a value as far from 0, two-sided."""
-        deviation = math.sqrt(max(self.covariance[value_index, value_index], 1e-300))
-        return 2.0 * float(student.sf(abs(self.values[value_index]) / deviation,
-                                      self.freedom[value_index]))
+        ratio = abs(self.values[value_index]) / self.deviations[value_index]
+        return 2.0 * float(student.sf(ratio, self.freedom[value_index]))
 
     @property
     def reference_drift(self) -> tuple[float, float] | None:
@@ -94,8 +96,7 @@ class SpanFit:
     @property
     def normal_covariance(self) -> Array:
         """Return the covariance whose normal intervals are as wide as Student's."""
-        widening = np.array([self.half_width(place) for place in range(len(self.values))]) / (
-            NORMAL_QUANTILE_975 * np.sqrt(np.diag(self.covariance)))
+        widening = student.ppf(0.975, self.freedom) / NORMAL_QUANTILE_975
         return self.covariance * np.outer(widening, widening)
 
     @property
@@ -407,14 +408,13 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
                               int(stretches.max()) + 1, cosines, noise)
 
 
-def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
+def fit_course(spans: Spans) -> ScaleBiasFit:
     """
-    Fit scale factor error, bias and time offset to a drive.
+    Fit scale factor error, bias and time offset to a drive with a course.
 
-    The log has output, time and a course. `DataRefused` is raised where the course is known for
-    too short a time, or the gyro does not follow it.
+    `DataRefused` is raised where the course is known for too short a time, or the gyro does not
+    follow it.
     """
-    spans = lay_out_spans(log, technology=technology)
     length = spans.treatment.min_span
     duration = len(spans.time) * length + spans.rest_durations[spans.stands].sum()
     if duration < _MIN_SPANS * length:
@@ -448,7 +448,7 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                         misalignment_covariance=covariance[axes, axes])
 
 
-def find_drift(log: Log) -> tuple[float, float] | None:
+def find_drift(spans: Spans) -> tuple[float, float] | None:
     """
     Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
 
@@ -458,7 +458,6 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     or in the ways from rest to rest, each compared with the rests around it, as the bias may
     wander (at 1 %).
     """
-    spans = lay_out_spans(log)
     rests = spans.rests[spans.stands]
     if len(rests) < 2:
         return None
@@ -572,15 +571,14 @@ def find_motion_errors(log: Log) -> tuple[float, float] | None:
             if errors ** 2 > 2.0 * usual ** 2 * fisher.isf(FALSE_ALARM_RATE, *freedom) else None)
 
 
-def is_noisy(log: Log) -> bool:
+def is_noisy(log: Log, spans: Spans) -> bool:
     """Tell whether a heading drifts in motion, or has no steps and is as noisy as a course."""
     assert log.reference_heading is not None
-    if find_drift(log) is not None:
+    if find_drift(spans) is not None:
         return True
     if cross_rotation(log).size or quantization_step(
             log.reference_heading[np.isfinite(log.reference_heading)]) > MAX_ROUNDING_STEP:
         return False
-    spans = lay_out_spans(log)
     count = len(spans.time) - 1
     if count < _MIN_SPANS:
         return False

@@ -129,8 +129,8 @@ class _ReferencePoints:
     heading: Array
     variance: Array
     shared: Array
-    shared_deviation: Array = field(default_factory=lambda: np.empty(0))
-    prior_factors: Array = field(default_factory=lambda: np.ones((1, 0)))
+    shared_deviation: Array
+    prior_factors: Array
 
 
 @dataclass(frozen=True)
@@ -289,18 +289,15 @@ def _select_reference_points(motion: Motion, block: float, slip_deviation: float
         ones = np.ones(cross_rotation.shape[1])
         return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
                                 cross_rotation, MISALIGNMENT_DEVIATION * ones, ones[None])
-    time, heading, variance, shared = (motion.time, motion.heading, np.ones(len(motion.time)),
-                                       np.empty((len(motion.time), 0)))
+    points = np.column_stack([motion.time, motion.heading, np.ones(len(motion.time))])
     if step:
-        step_crossings = _find_step_crossings(motion, step)
-        constant_readings = _find_constant_readings(motion, step, block)
-        order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
-        time, heading, variance, shared = (np.concatenate(
-            [getattr(points, name) for points in (step_crossings, constant_readings)])[order]
-                                           for name in ('time', 'heading', 'variance', 'shared'))
-    rests = np.ones(shared.shape[1])
+        points = np.concatenate([_find_step_crossings(motion, step),
+                                 _find_constant_readings(motion, step, block)])
+        points = points[np.argsort(points[:, 0], kind='stable')]
+    time, heading, variance, *shared = points.T
+    rests = np.ones(len(shared))
     return _ReferencePoints(
-        time, heading, variance, np.column_stack([_shaft_columns(heading), shared]),
+        time, heading, variance, np.column_stack([_shaft_columns(heading), *shared]),
         np.append(np.full(2, math.radians(1.0)), step / math.sqrt(12.0) * rests),
         np.array([[factor, factor, *rests] for factor in _PRIOR_FACTORS]))
 
@@ -374,12 +371,13 @@ def tracking_error_columns(motion: Motion, time: Array,
     return np.hstack(columns), np.concatenate(deviations), prior_factors
 
 
-def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
+def _find_step_crossings(motion: Motion, step: float) -> Array:
     """
     Return the middles between lasting readings one step apart, with variances in units of theirs.
 
     The error of a reading is constant; where it changes by one step, the heading is the edge
-    between the two, but for the turn between the samples.
+    between the two, but for the turn between the samples. The columns are those of
+    `_find_constant_readings`.
     """
     change = np.abs(np.diff(motion.heading))
     index = np.flatnonzero(change > 0.5 * step)
@@ -395,17 +393,17 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
                           if len(time) else relative_deviation)
     alone = np.diff(index, prepend=-1, append=len(change)) == 1
     edges = (change[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
-    return _ReferencePoints(time[edges], heading[edges], relative_deviation[edges] ** 2,
-                            np.zeros((int(edges.sum()), 2)))
+    return np.column_stack([time, heading, relative_deviation ** 2, np.zeros((len(time), 2))])[
+        edges]
 
 
-def _find_constant_readings(motion: Motion, step: float, block: float) -> _ReferencePoints:
+def _find_constant_readings(motion: Motion, step: float, block: float) -> Array:
     """
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
     All samples of a constant reading count as one, but for the first and the last if they last
     much longer than the readings next to them: then the gyro rests, and their samples share one
-    error.
+    error. The columns are time, heading, variance, and this error of the first and the last.
     """
     change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
     run = np.cumsum(change > 0.5 * step)
@@ -421,8 +419,7 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
             for end, next_to in ((0, 1), (-1, -2)))
     variance = np.where(rest_columns.any(axis=1) | ~is_used, 1.0, np.bincount(run))
     kept = is_used[run] | (change > 1.5 * step)
-    return _ReferencePoints(motion.time[kept], motion.heading[kept], variance[run[kept]],
-                            rest_columns[run[kept]])
+    return np.column_stack([motion.time, motion.heading, variance[run], rest_columns[run]])[kept]
 
 
 def _random_walk_covariance(time: Array, weight: Array,

@@ -95,13 +95,11 @@ class Prediction:
 
 
 class CalibrationForecast:
-    """Predictions for all motions of one length, one gyro and one later drive."""
+    """Predictions for all motions of one length, with a rest, one gyro and one later drive."""
 
-    def __init__(self, noise: Noise, duration: float, drive: Motion, drive_duration: float,
-                 rest_duration: float = RunLimits.rest_duration):
-        """Prepare for a gyro with noise; durations are in s, a rest of 0 is none."""
-        self._noise, self._duration, self._drive_duration, self._rest_duration = (
-            noise, duration, drive_duration, rest_duration)
+    def __init__(self, noise: Noise, duration: float, drive: Motion, drive_duration: float):
+        """Prepare for a gyro with noise; durations are in s."""
+        self._noise, self._duration, self._drive_duration = noise, duration, drive_duration
         cells = min(max(round(drive_duration), 1), 600)
         time = np.linspace(0.0, drive_duration, cells + 1)[1:]
         rounds = np.floor(time / drive.duration)  # the drive begins again where it ended
@@ -110,24 +108,20 @@ class CalibrationForecast:
         self.floor = (math.sqrt(2.0 / math.pi) * noise.angle_random_walk
                       * float(np.sqrt(time).mean()))
 
-    def predict(self, motion: Motion) -> Prediction:
-        """Return the prediction for a motion that turns and has the length of the forecast."""
-        return self._predict(motion, round(self._duration / block_duration(motion)), True)
-
-    def search_error(self, motion: Motion) -> float:
+    def predict(self, motion: Motion, in_search: bool = False) -> Prediction:
         """
-        Return the heading error, rad, by blocks of one length for all motions.
+        Return the prediction for a motion that turns and has the length of the forecast.
 
-        A fit takes shorter blocks where the motion is fast, which improves the bias by 0.3 %: a
-        search with these would prefer fast motions, at the cost of the scale; one with the
-        allowance for a difference between the senses of turning would prefer slow ones.
+        In a search the blocks have one length. A fit takes shorter blocks where the motion is
+        fast, which improves the bias by 0.3 %: a search with these would prefer fast motions, at
+        the cost of the scale; one with the allowance for a difference between the senses of
+        turning would prefer slow ones.
         """
-        blocks = math.ceil(self._duration / min(MAX_BLOCK_DURATION, self._duration / 40.0))
-        return self._predict(motion, blocks, False).heading_error
-
-    def _predict(self, motion: Motion, blocks: int, with_tracking_error: bool) -> Prediction:
+        longest = min(MAX_BLOCK_DURATION, self._duration / 40.0)
+        blocks = (math.ceil(self._duration / longest) if in_search
+                  else round(self._duration / block_duration(motion)))
         white_precision, of_run, of_both, of_drive = _noise_covariances(
-            self._noise, self._duration, blocks, self._rest_duration, self._drive_duration,
+            self._noise, self._duration, blocks, self._drive_duration,
             self._drive_columns.shape[1])
         # the weights of (s, b) on increments of the gyro's integral, (2, n), and the covariance by
         # errors of the robot that the fit does not determine, (2, 2)
@@ -136,7 +130,7 @@ class CalibrationForecast:
         rate = motion.rate_at(point)
         known = np.column_stack([motion.heading_at(point), point, rate, np.gradient(rate, point)])
         prior = np.array([math.inf, math.inf, DELAY_DEVIATION, LAG_DEVIATION])
-        if with_tracking_error:
+        if not in_search:
             columns, deviations, parts = tracking_error_columns(motion, point, 0.0)
             known, prior = np.hstack([known, columns]), np.append(prior, parts[0] * deviations)
         columns = np.diff(known.reshape(blocks, -1, len(prior)).mean(axis=1), axis=0)
@@ -145,20 +139,18 @@ class CalibrationForecast:
         weights = (covariance @ weighted.T)[:2]
         of_tracking = weights @ columns[:, 4:] * prior[4:]
         unweighed = of_tracking @ of_tracking.T
-        if self._rest_duration:
-            # the median rest: its halves differ by `_MEDIAN_SIGMA` deviations, twice that of the
-            # mean
-            white = self._noise.angle_random_walk / math.sqrt(self._rest_duration)
-            stated = covariance[:2, :2] + np.diag([0.0, self._noise.allan_floor ** 2])
-            expected, variance = (rest_variance(self._noise, self._rest_duration, white, change)
-                                  for change in (0.0, 2.0 * _MEDIAN_SIGMA * white))
-            gain, combined = combine_with_rest(
-                stated, _MEDIAN_SIGMA * math.sqrt(stated[1, 1] + expected), variance)
-            share = np.eye(2) - np.outer(gain, (0.0, 1.0))
-            weights = np.column_stack([share @ weights, gain])
-            # another turn of the robot is no noise, but part of the stated variance
-            unweighed = share @ (unweighed - stated) @ share.T + combined - variance * np.outer(
-                gain, gain)
+        # the median rest: its halves differ by `_MEDIAN_SIGMA` deviations, twice that of the mean
+        white = self._noise.angle_random_walk / math.sqrt(RunLimits.rest_duration)
+        stated = covariance[:2, :2] + np.diag([0.0, self._noise.allan_floor ** 2])
+        expected, variance = (rest_variance(self._noise, RunLimits.rest_duration, white, change)
+                              for change in (0.0, 2.0 * _MEDIAN_SIGMA * white))
+        gain, combined = combine_with_rest(
+            stated, _MEDIAN_SIGMA * math.sqrt(stated[1, 1] + expected), variance)
+        share = np.eye(2) - np.outer(gain, (0.0, 1.0))
+        weights = np.column_stack([share @ weights, gain])
+        # another turn of the robot is no noise, but part of the stated variance
+        unweighed = share @ (unweighed - stated) @ share.T + combined - variance * np.outer(
+            gain, gain)
 
         # the drive
         fit_covariance = unweighed + weights @ of_run @ weights.T
@@ -175,22 +167,20 @@ class CalibrationForecast:
 
 
 @lru_cache(maxsize=64)
-def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration: float,
-                       drive_duration: float, drive_cells: int
-                       ) -> tuple[Array, Array, Array, Array]:
+def _noise_covariances(noise: Noise, duration: float, blocks: int, drive_duration: float,
+                       drive_cells: int) -> tuple[Array, Array, Array, Array]:
     """
     Return the noise of the observations of a run and its rest, and of the heading of the drive.
 
     The n observations are the increments between the blocks of the run, rad, and the mean rate of
-    the rest, rad/s, if there is one. Returned are the inverse of the covariance of the increments
+    the rest, rad/s. Returned are the inverse of the covariance of the increments
     by white noise, rad⁻²; the covariance of the observations by all noise, (n, n), and that with
     the heading of the drive, (n, m); and the variance of that heading, rad², (m,).
     """
     cells = blocks * _CELLS_PER_BLOCK
-    rest_times = np.cumsum([SETTLING_TIME, rest_duration]) if rest_duration else np.zeros(0)
-    begin = duration + (rest_times[-1] if rest_duration else 0.0)
-    edges = np.concatenate([np.linspace(0.0, duration, cells + 1), duration + rest_times,
-                            begin + np.linspace(0.0, drive_duration, drive_cells + 1)[1:]])
+    rest = duration + np.cumsum([SETTLING_TIME, RunLimits.rest_duration])
+    edges = np.concatenate([np.linspace(0.0, duration, cells + 1), rest,
+                            rest[-1] + np.linspace(0.0, drive_duration, drive_cells + 1)[1:]])
     covariance = increment_covariance(noise, edges)
     # heading between blocks for a unit rate in each cell, s, shape (blocks - 1, cells)
     rising = (np.arange(_CELLS_PER_BLOCK) + 0.5) / _CELLS_PER_BLOCK
@@ -199,11 +189,9 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
               * (duration / blocks) / _CELLS_PER_BLOCK)
     sums = np.tril(np.full((drive_cells, drive_cells), drive_duration / drive_cells))
     white = spread @ spread.T * (noise.angle_random_walk ** 2 * cells / duration)
-    before = cells + len(rest_times)
-    observation_matrix = spread
-    if rest_duration:
-        observation_matrix = np.zeros((len(spread) + 1, before))
-        observation_matrix[:-1, :cells], observation_matrix[-1, -1] = spread, 1.0
+    before = cells + len(rest)
+    observation_matrix = np.zeros((len(spread) + 1, before))
+    observation_matrix[:-1, :cells], observation_matrix[-1, -1] = spread, 1.0
     return (np.linalg.inv(white),
             observation_matrix @ covariance[:before, :before] @ observation_matrix.T,
             observation_matrix @ covariance[:before, before:] @ sums.T,
@@ -282,36 +270,29 @@ class _MotionFamily:
         return _build_motion(robot, zip(angles.tolist(), rates.tolist(), rests.tolist()))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A motion and the expected accuracy of a calibration by it."""
-
-    motion: Motion
-    prediction: Prediction
-
-
 def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration: float,
-                     generator: np.random.Generator, generations: int = 60) -> Plan:
+                     generator: np.random.Generator,
+                     generations: int = 60) -> tuple[Motion, Prediction]:
     """
-    Return the motion of that length, s, with the least heading error in the forecast's drive.
+    Return the motion of a length, s, with the least heading error in the forecast's drive.
 
-    Each generation of the search tries 70 motions. `DataRefused` is raised where the robot cannot
-    make one, or none would calibrate well enough.
+    It comes with its prediction. Each generation of the search tries 70 motions. `DataRefused` is
+    raised where the robot cannot make one, or none would calibrate well enough.
     """
     _refuse_impossible(robot, duration)
     family = _MotionFamily(robot, duration)
 
     def cost(point: Array) -> float:
         motion = family.motion_at(point)
-        return math.inf if motion is None else forecast.search_error(motion)
+        return math.inf if motion is None else forecast.predict(motion, True).heading_error
     found = differential_evolution(cost, [(0.0, 1.0)] * 7, maxiter=generations, popsize=10,
                                    tol=0.0, seed=generator, polish=False)
     if (motion := family.motion_at(found.x)) is None:
         raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: '
                           'allow more seconds or a larger angle')
-    plan, limits = Plan(motion, forecast.predict(motion)), RunLimits()
+    prediction, limits = forecast.predict(motion), RunLimits()
     # a self-calibration by it would be refused
-    deviation = plan.prediction.scale_deviation
+    deviation = prediction.scale_deviation
     spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
     if deviation > limits.max_scale_deviation or spread < limits.min_rate_spread:
         raise DataRefused(
@@ -320,7 +301,7 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
             f'needed are {100.0 * limits.max_scale_deviation:g} % and '
             f'{limits.min_rate_spread / DEGREE:g} deg/s: allow more seconds, a larger angle or '
             'faster turns')
-    return plan
+    return motion, prediction
 
 
 def _refuse_impossible(robot: RobotLimits, duration: float) -> None:

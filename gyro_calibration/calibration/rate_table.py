@@ -89,7 +89,7 @@ class Calibration:
     def uncertainty(self) -> Uncertainty:
         """Return the distribution of the fitted values, of more dwells than there are values."""
         model, channels = GyroModel(self.terms), channels_of(self.used)
-        columns = sensitivity_columns(self.used, self.terms)
+        columns = sensitivity_columns(channels, self.terms)
         residual = self.residual[self.scatter.inliers]
         if model.uses_channel('output'):
             # The polynomial depends on the output. With the measured one in the columns, a scale
@@ -101,9 +101,8 @@ class Calibration:
             below, here, above = (channels.with_rate(channels.rate, expected + change)
                                   for change in (-step, 0.0, step))
             slope = (model.error(above) - model.error(below)) / (2.0 * step)
-            columns = np.column_stack([row for term in self.terms
-                                       for row in term.sensitivity(here)])
-            columns /= np.maximum(1.0 - slope, 0.1)[:, None]
+            columns = (sensitivity_columns(here, self.terms)
+                       / np.maximum(1.0 - slope, 0.1)[:, None])
             residual = self.used.output - expected
         return Uncertainty.from_fit(self.used, self.scatter, columns, residual)
 
@@ -121,14 +120,10 @@ class Calibration:
             return model
         sweeps = self.uncertainty.sweep_scatter
         scatter = replace(self.scatter, sweep_bias=float(sweeps[0]), sweep_scale=float(sweeps[1]))
-
-        def columns(rate: Array, warm: Array) -> Array:
-            channels = Channels(rate, rate, warm)
-            return np.column_stack([row for term in self.terms
-                                    for row in term.sensitivity(channels)])
-
         return replace(model, tolerance=estimate_tolerance(
-            self.used, Whitener(self.used, scatter), sweeps, columns, model.covariance))
+            self.used, Whitener(self.used, scatter), sweeps,
+            lambda rate, warm: sensitivity_columns(Channels(rate, rate, warm), self.terms),
+            model.covariance))
 
     def last_index(self, effect: Effect) -> int:
         """Return the index of the last value of an effect among all fitted values."""
@@ -150,7 +145,8 @@ class Calibration:
         # the whole effect, not its derivative by a shape, which vanishes near zero for a sine
         change = self.change(effect)
         others = [each for each in self.terms if each.effect is not effect]
-        return self.test(change[:, None], sensitivity_columns(self.used, others), change).p_value
+        known = sensitivity_columns(channels_of(self.used), others)
+        return self.test(change[:, None], known, change).p_value
 
     def change(self, effect: Effect) -> Array:
         """Return the error of an effect less that of the given model, of fitted dwells, rad/s."""
@@ -214,12 +210,14 @@ class Calibration:
         chosen = [place for place, owner in enumerate(value_owners(self.given.terms))
                   if owner in known]
         sizes, directions = np.linalg.eigh(covariance[np.ix_(chosen, chosen)])
-        return (sensitivity_columns(self.used, known, self.given.reference_temperature)
+        channels = channels_of(self.used, self.given.reference_temperature)
+        return (sensitivity_columns(channels, known)
                 @ (directions * np.sqrt(np.maximum(sizes, 0.0))))
 
     def prediction_covariance(self, dwells: Dwells) -> Array:
         """Return the covariance of the errors of other dwells, of one sweep, (rad/s)², (n, n)."""
-        rows, shared = sensitivity_columns(dwells, self.terms), self.scatter.sweep_columns(dwells)
+        rows = sensitivity_columns(channels_of(dwells), self.terms)
+        shared = self.scatter.sweep_columns(dwells)
         of_fit = 0.0 if self.model.covariance is None else rows @ self.model.covariance @ rows.T
         return np.asarray(of_fit + np.diag(self.scatter.deviation(dwells) ** 2)
                           + shared @ shared.T)
@@ -360,12 +358,11 @@ def _unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
     return dwells.output - dwells.rate - sum(term.error(channels) for term in terms)
 
 
-def sensitivity_columns(dwells: Dwells, terms: Sequence[Term],
-                        temperature: float = math.nan) -> Array:
+def sensitivity_columns(channels: Channels, terms: Sequence[Term]) -> Array:
     """Return the derivatives of the error by each fitted value, shape (n, m)."""
-    channels = channels_of(dwells, temperature)
-    return np.column_stack([np.empty((len(dwells), 0)), *(
-        row + np.zeros(len(dwells)) for term in terms for row in term.sensitivity(channels))])
+    zeros = np.zeros(len(np.asarray(channels.rate)))
+    return np.column_stack([np.empty((len(zeros), 0)), *(
+        row + zeros for term in terms for row in term.sensitivity(channels))])
 
 
 def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
@@ -401,7 +398,7 @@ def _replace_value(term: Term, index: int, value: float) -> Term:
 def _factor_columns(dwells: Dwells, terms: Sequence[Term],
                     whitener: Whitener) -> tuple[Array, Array, Array]:
     """Return Q and R of the whitened columns, each of length one, and their lengths before."""
-    columns = whitener.whiten(sensitivity_columns(dwells, terms))
+    columns = whitener.whiten(sensitivity_columns(channels_of(dwells), terms))
     lengths = np.linalg.norm(columns, axis=0)
     orthogonal, triangle = np.linalg.qr(columns / np.where(lengths > 0.0, lengths, 1.0))
     if np.linalg.cond(triangle) < _MAX_CONDITION_NUMBER:

@@ -259,6 +259,14 @@ def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None
                           f'(scale {1 + scale_factor_error:.2f}): {remedy}')
 
 
+def refuse_uncertain_scale(deviation: float, limits: RunLimits, more: str = '') -> None:
+    """Refuse a scale factor error whose standard deviation is beyond the limit."""
+    if deviation > limits.max_scale_deviation:
+        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
+                          f'wanted {100 * limits.max_scale_deviation:g} %: turn further, faster, '
+                          f'or more often{more}')
+
+
 def refuse_one_speed(motion: Motion, limits: RunLimits) -> None:
     """Refuse a motion whose rate varies too little to separate scale and bias."""
     # over whole periods of a swing it does not turn: two lengths, s, of which few are multiples
@@ -320,12 +328,8 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
                           f'and the unit of the {motion.name}')
     refuse_bias(fit.bias, limits, 'do not turn the robot by hand')
-    if deviation > limits.max_scale_deviation:
-        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
-                          f'wanted {100 * limits.max_scale_deviation:g} %: turn further, faster, '
-                          'or more often'
-                          + (', and check that the profile is the one that was driven'
-                             if motion.name == 'profile' else ''))
+    refuse_uncertain_scale(deviation, limits, ', and check that the profile is the one that was '
+                           'driven' if motion.name == 'profile' else '')
     if strays:
         known = 'the model states' if fit.goodness else 'its samples show'
         raise DataRefused(f'the run is {noise_ratio:.1f} times as noisy as {known}, at most '

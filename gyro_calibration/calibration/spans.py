@@ -37,9 +37,8 @@ from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.noise_grid import bias_wander_columns, SharedNoise
-from gyro_calibration.calibration.own_instants import is_slow, keep_own_instants, OwnInstants
 from gyro_calibration.calibration.reference_noise import (
-    find_rests, heading_difference, rate_noise_share)
+    find_rests, heading_difference, is_slow, keep_own_instants, OwnInstants, rate_noise_share)
 from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
@@ -515,9 +514,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         log, instants = keep_own_instants(log)
     assert log.time is not None and log.output is not None
     measured_type = np.full(2, math.inf) if prior is None else prior
-    scale, bias = np.minimum(treatment.prior[:2], measured_type)
-    if not treatment.is_fine:
-        scale, bias = np.minimum((scale, bias), TECHNOLOGY_PRIORS[technology])
+    scale, bias = np.minimum(
+        treatment.prior[:2] if treatment.is_fine else TECHNOLOGY_PRIORS[technology], measured_type)
     treatment = replace(treatment, prior=(float(scale), float(bias), treatment.prior[2]),
                         wide_prior=(WIDE_PRIOR[0], min(WIDE_PRIOR[1], float(measured_type[1]))))
     time, measured = log.time - log.time[0], log.output
@@ -556,13 +554,9 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
     if len(known) < 2:
         raise DataRefused(f'the reference has {len(known)} values outside of rests in which it '
                           'stands, 2 are needed: give a reference of this motion')
-    stamps = at[known]
-    length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
+    length = max(treatment.min_span, float(np.ptp(at[known])) / treatment.max_spans,
                  2.0 * float(np.median(np.diff(time))))
-    # a gap begins a new point
-    number = np.floor((stamps - stamps[0]) / length + 1e-6)
-    place = np.cumsum(
-        (np.diff(number, prepend=number[0]) > 0.0) | (np.diff(stamps, prepend=stamps[0]) > length))
+    place = _number_points(at[known], length)
     if not treatment.errs_as_heading:
         # means of an integrated rate would not err independently
         known = known[np.diff(place, prepend=-1) > 0]
@@ -575,6 +569,13 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
                  find_holes(time[measured_rows], length), step,
                  not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
+
+
+def _number_points(stamps: Array, length: float) -> NDArray[np.intp]:
+    """Return the point of each value: that of its span, s; a gap begins a new point."""
+    number = np.floor((stamps - stamps[0]) / length + 1e-6)
+    return np.cumsum((np.diff(number, prepend=number[0]) > 0.0)
+                     | (np.diff(stamps, prepend=stamps[0]) > length))
 
 
 def _find_code_changes(time: Array, output: Array, codes: Array) -> tuple[Array, Array]:

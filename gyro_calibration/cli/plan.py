@@ -24,9 +24,9 @@ from gyro_calibration.calibration.self_calibration import default_reference_erro
 from gyro_calibration.cli.verb import Answer, non_negative_integer, positive_number, show_progress
 from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_by_name, NAMED_MOTIONS
-from gyro_calibration.model.presets import XV3500
 from gyro_calibration.model.settings_file import (
     InvalidValue, parse_number, read_settings, validate)
 import numpy as np
@@ -77,20 +77,20 @@ def run(given: argparse.Namespace) -> Answer:
     given.drive = given.drive or drive.duration
     with show_progress(f'search for the best motion of {given.seconds:g} s'):
         forecast = CalibrationForecast(noise, given.seconds, drive, given.drive)
-        plan = find_best_motion(robot, forecast, given.seconds, np.random.default_rng(given.seed),
-                                60)
+        motion, prediction = find_best_motion(
+            robot, forecast, given.seconds, np.random.default_rng(given.seed), 60)
     built_in = CalibrationForecast(noise, CALIBRATION_MOTION.duration, drive, given.drive).predict(
         CALIBRATION_MOTION)
-    rows = {'planned': plan.prediction,
+    rows = {'planned': prediction,
             'plain': forecast.predict(plain_motion(robot, given.seconds)), 'built_in': built_in}
     if given.out:
-        write_motion(given.out, plan.motion)
+        write_motion(given.out, motion)
     is_built_in_feasible = can_follow(robot, CALIBRATION_MOTION)
-    angle, time = plan.motion.heading / DEGREE, plan.motion.time
-    rate, planned, plain = plan.motion.rate_at(time), rows['planned'], rows['plain']
+    angle, time = motion.heading / DEGREE, motion.time
+    rate, planned, plain = motion.rate_at(time), rows['planned'], rows['plain']
     scale_gain = plain.scale_deviation / planned.scale_deviation
     heading_gain = 1.0 - planned.heading_error / plain.heading_error
-    wheels = default_reference_errors(plan.motion).scale_deviation
+    wheels = default_reference_errors(motion).scale_deviation
     labels = {'planned': 'planned', 'plain': 'one turn there and back',
               'built_in': 'built-in profile, 20 s' + (
                   '' if is_built_in_feasible else ', beyond the limits')}
@@ -109,7 +109,7 @@ def run(given: argparse.Namespace) -> Answer:
              'independent of the calibration.',
              'The scale is that by an exact reference. For wheels that follow the profile, '
              f'self-calibrate adds {100 * wheels:.2f} %, or --reference-scale-deviation.']
-    data = {'duration_s': plan.motion.duration, 'time_s': time.tolist(),
+    data = {'duration_s': motion.duration, 'time_s': time.tolist(),
             'rate_rad_s': rate.tolist(), **{name: asdict(row) for name, row in rows.items()},
             'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,
             'heading_gain': heading_gain, 'drive_s': given.drive, 'seed': given.seed,

@@ -30,13 +30,12 @@ from gyro_calibration.calibration.dwells import (
     few_values_remedy, find_lost_reference, require_output)
 from gyro_calibration.calibration.encoder import choose_reference
 from gyro_calibration.calibration.heading_regression import find_drift, find_motion_errors
-from gyro_calibration.calibration.own_instants import (
-    interpolate_by_splines, is_slow, MAX_GYRO_LAG, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.reference_noise import (
-    heading_difference, heading_noise_share, is_course, MAX_ROUNDING_RATIO, rate_noise_share,
-    step_evenness)
+    heading_difference, heading_noise_share, interpolate_by_splines, is_course, is_slow,
+    MAX_GYRO_LAG, MAX_ROUNDING_RATIO, MAX_ROUNDING_STEP, rate_noise_share, step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
+from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -737,7 +736,7 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
         lost = 100.0 * float(find_lost_reference(np.isfinite(heading)).mean())
         return Reference('course', f'the heading is lost for {lost:.2g} % of the log, as '
                          'for a course at low speed, and its errors exceed those of the gyro')
-    if (drift := find_drift(log)) is not None:
+    if (drift := find_drift(lay_out_spans(log))) is not None:
         return Reference('odometry', 'it stands in the rests, and in motion drifts by '
                          f'{drift[0] / DEGREE:.2g} +- {drift[1] / DEGREE:.2g} deg/s against them')
     step = encoder_step(heading)

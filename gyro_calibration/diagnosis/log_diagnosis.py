@@ -21,8 +21,8 @@ from typing import Any
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
-from gyro_calibration.calibration.own_instants import keep_own_instants, OwnInstants
-from gyro_calibration.calibration.reference_noise import drop_repeated_headings
+from gyro_calibration.calibration.reference_noise import (
+    drop_repeated_headings, keep_own_instants, OwnInstants)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,

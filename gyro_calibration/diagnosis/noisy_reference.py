@@ -30,7 +30,7 @@ from typing import NamedTuple
 from gyro_calibration.calibration.heading_regression import (
     effective_clusters, fit_spans, MIN_STRETCHES, SpanFit, whiten_regression, WhitenedRegression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
-from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, OwnInstants
+from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.calibration.spans import (
     BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
     Spans)

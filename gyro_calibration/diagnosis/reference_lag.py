@@ -25,7 +25,7 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
-from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG
+from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG
 from gyro_calibration.calibration.spans import HEADING_TREATMENT
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.causes import CAUSES, value_finding

@@ -304,7 +304,7 @@ def _find_structure(fit: Calibration) -> tuple[tuple[Unexplained, ...], dict[str
             [np.zeros((len(dwells), 0)), *(rate ** i * temperature ** j for i in (1, 2, 3)
                                            for j in range(1, min(slow, 2) + 1))])
     curves = {name: columns for name, columns in curves.items() if columns.shape[1]}
-    known, curve_count = sensitivity_columns(dwells, fit.terms), len(curves)
+    known, curve_count = sensitivity_columns(channels_of(dwells), fit.terms), len(curves)
     found, gains = [], {}
     while curves:
         tests = {name: fit.test(columns, known) for name, columns in curves.items()}
@@ -486,7 +486,7 @@ def _find_alternatives(fit: Calibration, effect: Effect) -> tuple[dict[str, floa
             np.clip(dwells.rate, -limit, limit) - dwells.rate
             for limit in (fastest * np.linspace(0.5, 0.98, 25)).tolist()])
     others, change = [each for each in fit.terms if each.effect is not effect], fit.change(effect)
-    known = sensitivity_columns(dwells, others)
+    known = sensitivity_columns(channels_of(dwells), others)
     lacks = {name: 0.5 * (fit.largest_gain(change[:, None], known, change)
                           - fit.largest_gain(columns, known, change))
              for name, columns in tried.items()}

@@ -53,7 +53,8 @@ from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES
 from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
 from gyro_calibration.logs.recording import read_file
 from gyro_calibration.logs.ros_bag import list_recording_files
-from gyro_calibration.model.effects import BIAS
+from gyro_calibration.model.channels import channels_from_log
+from gyro_calibration.model.effects import BIAS, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -307,16 +308,15 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, 
     edges, fit = _fit_spans(log, time_offset, heading)
     if len(edges) < 10:
         return {}
-    # name, unit and integral over time, to some constant
-    elapsed = edges - log.time[0]
-    effects = [('rate_ramp', 'rad/s²', 0.5 * (elapsed - 0.5 * elapsed[-1]) ** 2)]
-    for constant in (60.0, 300.0):  # s; the same for all logs, as they are pooled
-        effects.append((f'warm_up_{constant:.0f}s', 'rad/s',
-                        -constant * np.exp(-elapsed / constant)))
-    if log.temperature is not None and np.ptp(log.temperature) > 0.0:  # False with nan
-        angle = integrate(log.time, log.temperature - log.temperature.mean())
-        effects.append(('bias_temperature', 'rad/s/K', np.interp(edges, log.time, angle)))
-    fits = {name: _value_record(*fit(np.diff(angle)), unit) for name, unit, angle in effects}
+    channels, fits = channels_from_log(log), {}
+    for name, cause, *shapes in (  # the same time constants, s, for all logs, as they are pooled
+            ('rate_ramp', 'rate_ramp'), ('warm_up_60s', 'warm_up', 60.0),
+            ('warm_up_300s', 'warm_up', 300.0), ('bias_temperature', 'bias_temperature', 25.0)):
+        effect = CATALOGUE[cause]
+        (column,) = effect.columns(channels, *shapes)
+        if np.ptp(column) > 0.0:  # False with nan
+            angle = np.interp(edges, log.time, integrate(log.time, column))
+            fits[name] = _value_record(*fit(np.diff(angle)), effect.coefficients[0].unit)
     return {name: each for name, each in fits.items()
             if math.isfinite(each['deviation']) and each['deviation'] > 0.0}
 

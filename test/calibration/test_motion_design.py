@@ -20,7 +20,7 @@ from gyro_calibration.calibration.self_calibration import (
     check_rest, find_rest_after, ReferenceErrors, self_calibrate)
 from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.logs.log import DataRefused, DEGREE
-from gyro_calibration.model import presets
+from gyro_calibration.model import gyro_model
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, motion_from_rates, read_motion, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 import yaml
 
-XV3500 = presets.XV3500.noise
+XV3500 = gyro_model.XV3500.noise
 WHITE = Noise(XV3500.angle_random_walk)
 TIME = np.arange(2001) / 100.0
 ABILITIES = {
@@ -53,7 +53,7 @@ def planned(name):
 
 @pytest.mark.parametrize('name', ABILITIES)
 def test_a_planned_motion_can_be_driven_tells_the_scale_better_and_calibrates(name, tmp_path):
-    motion, ability = planned(name).motion, ABILITIES[name]
+    motion, ability = planned(name)[0], ABILITIES[name]
     simple = plain_motion(ability, 20.0)
     for each in (motion, simple):
         assert (can_follow(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
@@ -67,8 +67,7 @@ def test_a_planned_motion_can_be_driven_tells_the_scale_better_and_calibrates(na
     jerk = np.diff(np.diff(motion.rate) / step) / (0.5 * (step[1:] + step[:-1]))
     assert np.abs(jerk).max() <= 1.01 * ability.jerk
     forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
-    assert (planned(name).prediction.scale_deviation
-            < 0.75 * forecast.predict(simple).scale_deviation)
+    assert planned(name)[1].scale_deviation < 0.75 * forecast.predict(simple).scale_deviation
     write_motion(tmp_path / 'profile.csv', motion)
     noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(0))
     fit = self_calibrate(TIME, 1.03 * motion.rate_at(TIME) + 0.001 + noise,

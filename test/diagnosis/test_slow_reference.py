@@ -16,8 +16,8 @@ import re
 from chance import seeds
 from diagnosed import established, estimates, limited
 from gyro_calibration.calibration.encoder import calibrate_encoder, choose_reference
-from gyro_calibration.calibration.own_instants import find_own_instants, keep_own_instants
-from gyro_calibration.calibration.reference_noise import drop_repeated_headings, rate_noise_share
+from gyro_calibration.calibration.reference_noise import (
+    drop_repeated_headings, find_own_instants, keep_own_instants, rate_noise_share)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
 import numpy as np
