@@ -18,10 +18,9 @@ from functools import partial
 
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import GOOD_MEMS, Preset, RD2100, XV3500
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,40 +28,6 @@ from numpy.typing import NDArray
 STEP, GRID = 0.01, 0.1
 
 
-@dataclass(frozen=True)
-class Preset:
-    """A gyro by published figures, in the units of data sheets."""
-
-    name: str
-    source: str  # of the figures
-    angle_random_walk: float  # deg/√h
-    bias_instability: float = 0.0  # deg/h
-    scale_factor_error: float = 0.0  # 1
-    bias: float = 0.0  # deg/s
-    interval: float = 0.01  # between samples, s
-
-    @property
-    def noise(self) -> Noise:
-        """Return the noise figures in SI."""
-        return Noise(self.angle_random_walk * DEGREE / 60.0,
-                     self.bias_instability * DEGREE / 3600.0)
-
-    @property
-    def model(self) -> GyroModel:
-        """Return a model with scale factor error, bias and noise."""
-        return GyroModel((Term(SCALE_FACTOR_ERROR, (self.scale_factor_error,)),
-                          Term(BIAS, (self.bias * DEGREE,))), noise=self.noise)
-
-
-XV3500 = Preset('XV3500', 'Epson XV-3500CB by Hong and Park 2008, sections 1, 2.1 and 4.2; their '
-                'bias is printed in deg/s, but only deg/min explains the drift',
-                2.5, 18.0, 0.0373, 0.75 / 60.0)
-RD2100 = Preset('RD2100', 'KVH E-Core RD2100, open-loop fibre-optic, by Ojeda et al. 2000, '
-                'Table I and section 5: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; '
-                'half of 2 % and of 0.2 deg/s, both over the range of temperatures',
-                5.0 / 60.0, 7.2, 0.01, 0.1, 0.1)
-GOOD_MEMS = Preset('good MEMS', 'round figures of the better ones, such as the ADIS16488',
-                   0.3, 6.0, 0.01, 0.2)
 GYROS = {each.name: each for each in (XV3500, RD2100, GOOD_MEMS)}
 
 

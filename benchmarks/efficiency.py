@@ -45,9 +45,9 @@ from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading
 from gyro_calibration.calibration.self_calibration import METHODS as SELF_CALIBRATIONS
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_from_headings
 from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 from scipy.signal import lfilter
 
@@ -156,13 +156,13 @@ def compare_methods(runs: int = 200, lag: float = 0.2) -> str:
         'encoder, 0.5 deg, 20 Hz': (RATE, encoder)}
     lines = ['| run | method | rms error of s | rms error of b |', '|---|---|---|---|']
     for case, (rate, reference) in cases.items():
-        outputs = [XV3500.output(rate, 25.0) + simulate_noise(
+        outputs = [XV3500.model.output(rate, 25.0) + simulate_noise(
             XV3500.noise, len(TIME), INTERVAL, np.random.default_rng(run)) for run in range(runs)]
         for name, method in SELF_CALIBRATIONS.items():
             fits = [method(TIME, output, reference(run)) for run, output in enumerate(outputs)]
             s, b = np.sqrt(np.mean(np.square(
                 [(fit.scale_factor_error, fit.bias) for fit in fits]
-                - np.array([term.values[0] for term in XV3500.terms])), axis=0))
+                - np.array([XV3500.scale_factor_error, XV3500.bias * DEGREE])), axis=0))
             lines.append(f'| {case} | `{name}` | {100 * s:.3f} % | {b / DEGREE:.4f} deg/s |')
     return '\n'.join(lines)
 

@@ -33,7 +33,7 @@ import os
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from drives import begun_any_time, GYROS, of_motion, Preset, random_path, STEP
+from drives import begun_any_time, GYROS, of_motion, random_path, STEP
 from gyro_calibration.calibration.self_calibration import self_calibrate, to_model_record
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
@@ -44,6 +44,7 @@ from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_co
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import Preset
 from heading_track import track
 import numpy as np
 

@@ -31,10 +31,10 @@ import sys
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, constant_rate_motion, Motion, motion_from_rates)
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 from scipy.signal import lfilter
 

@@ -42,7 +42,7 @@ from multiprocessing import get_context
 import re
 
 import bounds
-from drives import Course, COURSES, Drive, GYROS, Preset, simulate, slow_path
+from drives import Course, COURSES, Drive, GYROS, simulate, slow_path
 from gyro_calibration.calibration.self_calibration import (
     fit_heading, self_calibrate, to_model_record)
 from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
@@ -53,6 +53,7 @@ from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_co
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.presets import Preset
 import numpy as np
 from peers import PEERS, tuned
 

@@ -38,10 +38,10 @@ from gyro_calibration.calibration.motion_design import (
     CalibrationForecast, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.calibration.self_calibration import check_rest, RunLimits, SETTLING_TIME
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, constant_rate_motion, Motion, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 
 RATE, DRIVE = 100, 160.0

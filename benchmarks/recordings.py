@@ -44,14 +44,14 @@ from gyro_calibration.calibration.self_calibration import fit_heading, self_cali
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_headings
-from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.presets import MPU6050
 from heading_track import follow
 import numpy as np
 
 FOLLOWED = 300.0
 #: The gyro is mounted upside down against the encoder in two of them.
 RECORDINGS = {'yaw_slow': -1.0, 'pitch_slow': 1.0, 'yaw_fast': -1.0}
-NOISE = Noise(0.64 * DEGREE / 60.0)  # of the MPU-6050, as measured at rest
+NOISE = MPU6050.noise
 #: Length of the increments, s, and delays that are tried, s.
 BLOCK, LAGS = 0.5, np.arange(-20, 21) * 0.004
 

@@ -24,10 +24,10 @@ from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, to_model_record
 from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, Motion, motion_from_rates, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.finding import (
     Comparison, Contradiction, from_own_figures, Reproduction)
 import numpy as np
@@ -209,8 +209,7 @@ def _exchanged_columns() -> Contradiction:
 
 def drift_in_half_an_hour() -> tuple[float, float]:
     """Return the drift in 30 min by bias instability and by angle random walk, deg."""
-    return (XV3500.noise.bias_instability / DEGREE * 1800.0,
-            XV3500.noise.angle_random_walk / DEGREE * math.sqrt(1800.0))
+    return XV3500.bias_instability * 0.5, XV3500.angle_random_walk * math.sqrt(0.5)
 
 
 def _compare_own_figures() -> list[Comparison]:
@@ -281,7 +280,7 @@ def noisy_output(motion: Motion, noise: Noise,
                  generator: np.random.Generator) -> tuple[Array, Array]:
     """Return time, s, and output, rad/s, of the gyro of section 4."""
     time = np.arange(round(motion.duration * GYRO_SAMPLE_RATE) + 1) / GYRO_SAMPLE_RATE
-    return time, XV3500.output(motion.rate_at(time), 25.0) + simulate_noise(
+    return time, XV3500.model.output(motion.rate_at(time), 25.0) + simulate_noise(
         noise, len(time), 1.0 / GYRO_SAMPLE_RATE, generator)
 
 

@@ -38,10 +38,11 @@ from gyro_calibration.driver.protocols import find_protocol, Sample
 from gyro_calibration.files import InputError, write_atomically
 from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
 from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
-from gyro_calibration.model.gyro_model import GyroModel, XV3500
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.hong_park import TABLE_1
 import numpy as np
 
@@ -59,7 +60,6 @@ except ImportError as error:
 _PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
 _MAX_ATTEMPTS = 3  # to calibrate
-_INTERVAL = 0.01  # between samples, s
 _DRIVE_MOTION = constant_rate_motion([
     *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
@@ -93,8 +93,8 @@ def run(given: argparse.Namespace) -> Answer:
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
-    robot = _SimulatedRobot(XV3500, simulate_noise(
-        XV3500.noise, 30000, _INTERVAL, np.random.default_rng(given.seed)))
+    robot = _SimulatedRobot(XV3500.model, simulate_noise(
+        XV3500.noise, 30000, XV3500.interval, np.random.default_rng(given.seed)))
     with ExitStack() as stack:
         stack.enter_context(Emulator(find_protocol(_PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
@@ -130,17 +130,17 @@ class _SimulatedRobot:
         # where this process is delayed they are late, but the robot has turned meanwhile
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
         for number, noise in enumerate(self.noise):
-            due = begin + number * _INTERVAL
+            due = begin + number * XV3500.interval
             time.sleep(max(0.0, due - time.monotonic()))
             while self.commands and self.commands[0][0] <= due:
                 command = self.commands.popleft()[1]
-            largest = 3.0 * _INTERVAL
+            largest = 3.0 * XV3500.interval
             change = min(max(command - rate, -largest), largest)
-            heading += _INTERVAL * (rate + 0.5 * change)
+            heading += XV3500.interval * (rate + 0.5 * change)
             rate += change
             self.true_headings.append((time.time() - (time.monotonic() - due), heading))
             yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
-                         time=number * _INTERVAL)
+                         time=number * XV3500.interval)
 
 
 class _DemoClient:

@@ -24,9 +24,9 @@ from gyro_calibration.calibration.self_calibration import default_reference_erro
 from gyro_calibration.cli.verb import Answer, non_negative_integer, positive_number, show_progress
 from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.gyro_model import XV3500
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_by_name, NAMED_MOTIONS
+from gyro_calibration.model.presets import XV3500
 from gyro_calibration.model.settings_file import (
     InvalidValue, parse_number, read_settings, validate)
 import numpy as np

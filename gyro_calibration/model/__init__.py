@@ -11,6 +11,6 @@
 """
 Models of gyros: effects with values, and noise; simulation and compensation.
 
-Reading order: `effects`, `channels`, `noise`, `gyro_model`, `settings_file`,
+Reading order: `effects`, `channels`, `noise`, `gyro_model`, `presets`, `settings_file`,
 `model_file`, `motion`, `simulator_export`, `compensation`.
 """

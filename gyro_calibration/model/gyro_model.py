@@ -20,8 +20,7 @@ from typing import Any
 from gyro_calibration.logs.columns import PLAUSIBLE_TEMPERATURES
 from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.channels import ChannelHistory
-from gyro_calibration.model.effects import (
-    BIAS, Channels, Effect, Parameter, SCALE_FACTOR_ERROR)
+from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
@@ -411,9 +410,3 @@ def have_same_effects(model: GyroModel, other: GyroModel) -> bool:
     first, second = ([(term.effect.name, term.values) for term in each.terms]
                      for each in (model, other))
     return first == second
-
-
-#: The Epson XV-3500CB by Hong and Park 2008, sections 1, 2.1 and 4.2, for simulations and plans:
-#: 2.5 deg/√h and 18 deg/h. Their bias is printed in deg/s, but only deg/min explains the drift.
-XV3500 = GyroModel((Term(SCALE_FACTOR_ERROR, (0.0373,)), Term(BIAS, (0.75 / 60.0 * DEGREE,))),
-                   noise=Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0))

@@ -20,7 +20,7 @@ from gyro_calibration.calibration.self_calibration import (
     check_rest, find_rest_after, ReferenceErrors, self_calibrate)
 from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.logs.log import DataRefused, DEGREE
-from gyro_calibration.model import gyro_model
+from gyro_calibration.model import presets
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, motion_from_rates, read_motion, ROBOT_MOTION)
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 import yaml
 
-XV3500 = gyro_model.XV3500.noise
+XV3500 = presets.XV3500.noise
 WHITE = Noise(XV3500.angle_random_walk)
 TIME = np.arange(2001) / 100.0
 ABILITIES = {

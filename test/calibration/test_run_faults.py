@@ -29,12 +29,13 @@ from gyro_calibration.calibration.self_calibration import (
     self_calibrate)
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
-from gyro_calibration.model.gyro_model import GyroModel, XV3500
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, constant_rate_motion, motion_from_headings, motion_from_log,
     motion_from_rates)
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 

@@ -25,6 +25,7 @@ from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.motion import motion_from_headings
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import MPU6050
 from gyro_calibration.ros.calibration_session import ODOMETRY
 from gyro_calibration.ros.inputs import Velocity
 from heading_track import follow
@@ -227,7 +228,7 @@ def calibrated(path, seconds, noise=Noise()):
 def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(
         recording, seconds):
     name, found = name_of(recording), calibrated(recording, seconds)
-    errors = [(*follow(*run, Noise(0.64 * DEGREE / 60.0)), rms(integrate(run[1], run[2]) - run[3]))
+    errors = [(*follow(*run, MPU6050.noise), rms(integrate(run[1], run[2]) - run[3]))
               for run in found if run[0] is not None]
     for error, deviation, raw in errors:
         inside = np.mean(np.abs(error) <= 1.96 * deviation)

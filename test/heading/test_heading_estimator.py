@@ -24,8 +24,9 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, CATALOGUE, rate_temperature_polynomial, SCALE_FACTOR_ERROR)
-from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, XV3500
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 

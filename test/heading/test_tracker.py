@@ -23,7 +23,7 @@ from gyro_calibration.heading.stationary import (
     SCATTER_CORRELATIONS, SCATTER_RATIOS, sum_ratios, update_scatter)
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE, Log
-from gyro_calibration.model import gyro_model
+from gyro_calibration.model import presets
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -32,7 +32,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, poisson
 
-XV3500 = gyro_model.XV3500.noise
+XV3500 = presets.XV3500.noise
 #: Standard deviations of scale factor error and bias after 20 s of it.
 SCALE, BIAS = 3e-4, 2.5 * DEGREE / 60.0 / math.sqrt(20.0)
 KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.allan_floor ** 2])

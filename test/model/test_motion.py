@@ -17,11 +17,12 @@ from chance import mean_bound
 from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term, XV3500
+from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, MotionError, NAMED_MOTIONS, read_motion, ROBOT_MOTION, simulate)
 from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 
@@ -149,4 +150,4 @@ def test_the_xv3500_walks_2_5_degrees_in_an_hour_and_11_where_hong_and_park_say_
             == pytest.approx(11.0, abs=1.0))
     model = read_model(Path(__file__).parents[2] / 'config/xv3500.yaml')
     assert vars(model.noise) == pytest.approx(vars(XV3500.noise), rel=1e-4)
-    assert model.output(0.5, 25.0) == pytest.approx(XV3500.output(0.5, 25.0), rel=1e-6)
+    assert model.output(0.5, 25.0) == pytest.approx(XV3500.model.output(0.5, 25.0), rel=1e-6)
