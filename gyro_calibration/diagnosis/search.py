@@ -27,7 +27,7 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, depends_on_rate, effect_candidate, fitted_shape_indices,
+    Candidate, candidate_transforms, effect_candidate, fitted_shape_indices,
     gaussian_pulse, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
@@ -108,20 +108,13 @@ class Search:
         key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
-            deviation = self.problem.deviation
-            if self.columns_cache:  # those for another rate
-                known = self.columns_cache.popitem()[1]
-                columns, groups = known.columns, known.groups
-                for each, own in zip(self.candidates, groups):
-                    if depends_on_rate(each):
-                        columns[own] = candidate_transforms(each, fit.distorted) / deviation
-            else:
-                parts = [candidate_transforms(each, fit.distorted) / deviation
-                         for each in self.candidates]
-                columns = np.concatenate([np.empty((0, len(deviation))), *parts])
-                ends = np.cumsum([len(part) for part in parts]).tolist()
-                groups = [range(end - len(part), end) for end, part in zip(ends, parts)]
-            self.columns_cache[key] = group_columns(self.problem, columns, groups)
+            self.columns_cache.clear()
+            parts = [candidate_transforms(each, fit.distorted) / self.problem.deviation
+                     for each in self.candidates]
+            ends = np.cumsum([len(part) for part in parts]).tolist()
+            self.columns_cache[key] = group_columns(
+                self.problem, np.concatenate([np.empty((0, len(self.problem.deviation))), *parts]),
+                [range(end - len(part), end) for end, part in zip(ends, parts)])
         known = self.columns_cache[key]
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in known.groups])
         return column_evidence(fit, known) - penalty
