@@ -72,6 +72,12 @@ class Candidate:
         """Return its columns of a log."""
         return self.function(log, *self.shapes)
 
+    @property
+    def distorts(self) -> bool:
+        """Tell whether it distorts the rate before errors are added to it."""
+        return (self.amplitude is not None and self.cause in CATALOGUE
+                and CATALOGUE[self.cause].stage == 'rate')
+
 
 def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
     """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""

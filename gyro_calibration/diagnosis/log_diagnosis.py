@@ -45,14 +45,14 @@ from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_referen
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference, follows_rate, HIDDEN_CAUSES, is_late)
 from gyro_calibration.diagnosis.regression import (
-    average_filtered_noise, build_problem, fit_causes, forget_fits, is_single_event, RegressionFit,
-    SMOOTHED_RATIO, Value)
+    average_filtered_noise, build_problem, complexity_penalty, fit_causes, forget_fits,
+    is_single_event, RegressionFit, SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, model_residuals, residual_curves)
 from gyro_calibration.diagnosis.search import (
-    complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
-    refine_shape, Search, search_causes, Selection, start_search)
+    confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly, refine_shape,
+    Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.significance import (
     DETECTION_POWER, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
@@ -137,16 +137,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         raise DataRefused(
             f'the errors of the reference of {where} are larger than those of the gyro, and such '
             'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
-    if limiting_logs:
-        found = diagnose_by_noisy_reference(logs[0], references[0], model, FALSE_ALARM_RATE,
-                                            on_progress, instants[0])
-    else:
-        try:
-            found = _diagnose_by_exact_reference(
-                logs, generator, model, FALSE_ALARM_RATE, names, on_progress,
-                references, reference_kind == 'rate_command')
-        finally:
-            forget_fits()
+    try:
+        found = (diagnose_by_noisy_reference(logs[0], references[0], model, FALSE_ALARM_RATE,
+                                             on_progress, instants[0])
+                 if limiting_logs else _diagnose_by_exact_reference(
+                     logs, generator, model, FALSE_ALARM_RATE, names, on_progress, references,
+                     reference_kind == 'rate_command'))
+    finally:
+        forget_fits()
     found = _keep_unextended_model(found, given_model)
     findings = found.findings if len(logs) > 1 else mark_parts_of_log(found.findings)
     return complete_diagnosis(replace(

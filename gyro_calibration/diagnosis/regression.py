@@ -27,10 +27,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 import math
+from typing import Any, Protocol
 
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, fitted_shape_indices, MAX_STEP_TIME_LACK, MAX_STEP_TIMES,
-    smooth_shapes, with_shape)
+    Candidate, candidate_transforms, effect_candidate, fitted_shape_indices, is_named,
+    MAX_STEP_TIME_LACK, MAX_STEP_TIMES, smooth_shapes, with_shape)
 from gyro_calibration.diagnosis.replay import (
     band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
     stated_shapes)
@@ -38,6 +39,7 @@ from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fft
 from scipy.linalg import block_diag
 from scipy.optimize import bisect
 from scipy.special import logsumexp
@@ -46,9 +48,56 @@ from scipy.special import logsumexp
 Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
+#: Penalty in log-likelihood of a fitted shape, at least, and of each column beyond the first.
+VALUE_PENALTY = 1.2
 #: Largest ratio of the power of noise in the last to that in the second quarter of the frequencies
 #: of a smoothed record before causes are fitted (jumps have 0.18, noise not less).
 SMOOTHED_RATIO = 0.05
+
+
+class Problem(Protocol):
+    """What is regressed on causes, under the noises that are tried: logs, or spans of a log."""
+
+    log_determinants: Array  # of the noises, and of their prior probability, shape (g,)
+
+    @property
+    def durations(self) -> list[float]:
+        """Return the length of each log, s."""
+
+    def distorted(self, causes: Sequence[Candidate]) -> tuple[Any, ...]:
+        """Return the logs with the rate that the gyro senses, distorted by causes."""
+
+    def base_rows(self, logs: tuple[Any, ...]) -> Array:
+        """Return what is always fitted, and last the residual, whitened, shape (q + 1, m)."""
+
+    def rows(self, candidate: Candidate, logs: tuple[Any, ...]) -> Array:
+        """Return the columns of a candidate, whitened by the first noise, shape (k, m)."""
+
+    def products(self, one: Array, other: Array) -> Array:
+        """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
+
+    def candidate(self, name: str, *shapes: float, log_index: int, half_width: float) -> Candidate:
+        """Return the candidate of a single event."""
+
+    def with_white_noise(self) -> Problem:
+        """Return the problem without a wander of the bias."""
+
+    def step_evidence(self, fit: RegressionFit) -> list[tuple[Array, Array]]:
+        """Return times of steps of the bias in each log, s, and evidence by the best noise."""
+
+    def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
+        """Return what a fit leaves, whitened by the likeliest noise of another, shape (n,)."""
+
+    @property
+    def stretches(self) -> tuple[Indices, Indices]:
+        """Return the stretch of each of these, shape (n,), and the fold of each stretch."""
+
+    @property
+    def may_repeat_events(self) -> bool:
+        """Tell whether a single event is also held out."""
+
+    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
+        """Return evidence that does not rely on one noise for all, and a ratio of variances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +144,84 @@ class RegressionProblem:
         return np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
                          for begin, end in zip(edges, edges[1:])])
 
+    # as of `Problem`
+
+    @property
+    def durations(self) -> list[float]:
+        return [each.duration for each in self.replays]
+
+    def distorted(self, causes: Sequence[Candidate]) -> tuple[Replay, ...]:
+        distortions = tuple((each.cause, each.shapes) for each in causes if each.distorts)
+        return tuple(_with_distorted_rate(each, distortions) for each in self.replays)
+
+    def base_rows(self, logs: tuple[Replay, ...]) -> Array:
+        residual, rate = _transforms_without_causes(self.replays, logs)
+        return np.array([rate, residual]) / self.deviation
+
+    def rows(self, candidate: Candidate, logs: tuple[Replay, ...]) -> Array:
+        return _transforms(candidate, logs) / self.deviation
+
     def products(self, one: Array, other: Array) -> Array:
-        """Return the products of rows under each noise, shape (g, rows, rows of the other)."""
         return np.tensordot(self.weights, self.band_products(one, other), 1)
+
+    def candidate(self, name: str, *shapes: float, log_index: int, half_width: float) -> Candidate:
+        return effect_candidate(name, *shapes, log_index=log_index, half_width=half_width)
+
+    def with_white_noise(self) -> RegressionProblem:
+        return replace(self, noise_shapes=self.noise_shapes[:1], weights=self.weights[:1],
+                       log_determinants=self.log_determinants[:1])
+
+    def step_evidence(self, fit: RegressionFit) -> list[tuple[Array, Array]]:
+        # Beside a random walk that soon exceeds the white noise, a step shows for a short time.
+        best, found = fit.best_noise, []
+        covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
+            fit.degrees_of_freedom)
+        # under that noise, as the factors are
+        residual = fit.rows[-1] - fit.inverse_information[best] @ fit.scores[best] @ fit.columns
+        for replay, factor, deviation, *rows in zip(
+                self.replays, fit.whitening_factors(), self.split_by_log(self.deviation),
+                *map(self.split_by_log, (residual, *fit.columns))):
+            count, interval = replay.point_count, replay.point_interval
+            # products of a step at each point with the residual, the columns, and itself
+            pull, *products = [np.cumsum(inverse_cosine_transform(
+                factor ** 2 / deviation * each)[::-1])[::-1] for each in rows]
+            power = (factor / deviation / np.sin(0.5 * coefficient_angles(count))) ** 2 / (
+                2.0 * count)
+            whole = 0.5 * (power.sum() - fft(np.append(0.0, power)).real)
+            crossing = np.reshape(products, (len(products), count))
+            left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
+            shown = left > MIN_INDEPENDENT_SHARE * whole
+            # as far from the ends as the first of equally spaced times
+            margin = max(count // (MAX_STEP_TIMES + 1), 1)
+            begin = float(replay.channels.time[replay.valid][0])
+            found.append((begin + interval * np.arange(margin, count - margin), np.where(
+                shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[margin:-margin]))
+        return found
+
+    def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
+        return np.concatenate(fit.whitened_series(noise_fit))
+
+    @property
+    def stretches(self) -> tuple[Indices, Indices]:
+        count = max(64 // len(self.replays), 1)
+        return np.concatenate([run * count + np.arange(each.point_count) * count
+                               // each.point_count for run, each in enumerate(self.replays)]
+                              ), np.arange(count * len(self.replays))
+
+    @property
+    def may_repeat_events(self) -> bool:
+        # errors of a response to a command are events of the motion
+        return any(each.command is not None for each in self.replays)
+
+    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
+        # The slow noise of a log may be larger than that of the others.
+        if len(self.replays) == 1 or candidate.log_index is None or not is_named(candidate):
+            return math.inf, 1.0
+        own, left = self.replays[candidate.log_index], rest.residuals[candidate.log_index]
+        alone = fit_causes(build_problem([replace(own, channels=replace(
+            own.channels, output=own.reference + left))]), [])
+        return (likelihood_with(alone, replace(candidate, log_index=0)) - alone.log_likelihood
+                - complexity_penalty(candidate)), 1.0
 
 
 def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
@@ -177,9 +301,9 @@ class Value:
 class RegressionFit:
     """A regression with some causes."""
 
-    problem: RegressionProblem  # the logs and noises
+    problem: Any  # the logs and noises, as of `Problem`
     # the logs with the rate that the gyro senses, distorted by causes
-    distorted: tuple[Replay, ...]
+    distorted: tuple[Any, ...]
     causes: tuple[Candidate, ...]  # causes
     # whitened, shape (q + 1, m): the independent columns of scale factor error, causes, and
     # derivatives with respect to their shapes; the residual less the causes of fixed amplitude
@@ -329,12 +453,12 @@ class RegressionFit:
         found: dict[str, Array] = {}
         new = replay
         for known in self.causes:
-            if is_rate_distortion(known.cause):
+            if known.distorts:
                 before, new = new, _with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.causes):
-            if (is_rate_distortion(known.cause) or known.log_index not in (None, log_index)
+            if (known.distorts or known.log_index not in (None, log_index)
                     or not self.is_included(place)):
                 continue
             values = ([known.amplitude] if known.amplitude is not None
@@ -394,11 +518,6 @@ def is_single_event(cause: Candidate) -> bool:
     return cause.log_index is not None and cause.cause in CATALOGUE
 
 
-def is_rate_distortion(name: str) -> bool:
-    """Tell whether a cause distorts the rate before errors are added to it."""
-    return name in CATALOGUE and CATALOGUE[name].stage == 'rate'
-
-
 @lru_cache(maxsize=16)
 def _with_distorted_rate(replay: Replay,
                          distortions: tuple[tuple[str, tuple[float, ...]], ...]) -> Replay:
@@ -435,36 +554,34 @@ def forget_fits() -> None:
 
 # fits
 
-def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> RegressionFit:
+def fit_causes(problem: Any, causes: Sequence[Candidate]) -> RegressionFit:
     """Fit causes to logs, and the shapes of those that have values to first order."""
     return _fit_causes(problem, tuple(causes))
 
 
 @lru_cache(maxsize=16)
-def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> RegressionFit:
-    distortions = tuple((each.cause, each.shapes)
-                        for each in causes if is_rate_distortion(each.cause))
-    distorted = tuple(_with_distorted_rate(each, distortions) for each in problem.replays)
-    residual, rate = _transforms_without_causes(problem.replays, distorted)
-    columns, owners, widths = [rate[None]], [(-1, 0)], []
+def _fit_causes(problem: Any, causes: tuple[Candidate, ...]) -> RegressionFit:
+    distorted = problem.distorted(causes)
+    *base, residual = problem.base_rows(distorted)
+    columns, owners, widths = [np.array(base)], [(-1, place) for place in range(len(base))], []
     for place, known in enumerate(causes):
-        distorts = is_rate_distortion(known.cause)
-        replays = problem.replays if distorts else distorted
-        own = _transforms(known, replays) if known.values or not distorts else rate[:0]
+        logs = problem.distorted(()) if known.distorts else distorted
+        own = (problem.rows(known, logs) if known.values or not known.distorts
+               else columns[0][:0])
         widths.append(len(own) if known.amplitude is None else 0)
         if known.amplitude is None:
             columns.append(own)
             owners += [(place, number) for number in range(len(own))]
-        elif not distorts:
+        elif not known.distorts:
             residual = residual - known.amplitude * own[0]
         for shape in smooth_shapes(known) if known.values else ():
-            columns.append(_shape_derivative(known, shape, replays)[None])
+            columns.append(_shape_derivative(problem, known, shape, logs)[None])
             owners.append((place, -1 - shape))
-    rows = np.concatenate([*columns, residual[None]]) / problem.deviation
-    of_bands = problem.band_products(rows, rows)
-    kept = [*_independent_columns(of_bands.sum(axis=0)[:-1, :-1]), len(rows) - 1]
+    rows = np.concatenate([*columns, residual[None]])
+    sums = problem.products(rows, rows)
+    kept = [*_independent_columns((rows @ rows.T)[:-1, :-1]), len(rows) - 1]
     rows = rows if len(kept) == len(rows) else rows[kept]
-    sums = np.tensordot(problem.weights, of_bands[:, kept][:, :, kept], 1)[:, :, :-1]
+    sums = sums[:, kept][:, :, kept[:-1]]
     information, scores = sums[:, :-1], sums[:, -1]
     # of what the values for one noise leave, as the difference of the whole sums is rounded
     left = np.append(-np.linalg.solve(information[0], scores[0]), 1.0) @ rows
@@ -479,7 +596,8 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
 
 
 @lru_cache(maxsize=32)
-def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay, ...]) -> Array:
+def _shape_derivative(problem: Problem, cause: Candidate, shape_index: int,
+                      logs: tuple[Any, ...]) -> Array:
     """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
     shape = cause.shapes[shape_index]
     # so small that the phase of a wave changes little up to the end of a log
@@ -487,8 +605,7 @@ def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay,
     moved = with_shape(cause, shape_index, shape + step)
     if moved.shapes[shape_index] == shape:  # at its upper bound
         moved = with_shape(cause, shape_index, shape - step)
-    change = np.tensordot(
-        cause.values, candidate_transforms(moved, replays) - _transforms(cause, replays), 1)
+    change = np.tensordot(cause.values, problem.rows(moved, logs) - problem.rows(cause, logs), 1)
     return np.asarray(change / (moved.shapes[shape_index] - shape))
 
 
@@ -524,17 +641,16 @@ class ColumnGroups:
     of_width: list[tuple[Indices, Indices, Array]]
 
 
-def group_columns(problem: RegressionProblem, columns: Array,
+def group_columns(problem: Problem, columns: Array,
                   groups: Sequence[Sequence[int]]) -> ColumnGroups:
     """Return groups of whitened columns, shape (p, m)."""
     of_width = []
     for width in sorted({len(group) for group in groups}):
         places = np.array([place for place, group in enumerate(groups) if len(group) == width])
         members = np.array([groups[place] for place in places])
-        edges = [*problem.band_starts, columns.shape[1]]
-        of_bands = [part @ np.swapaxes(part, 1, 2) for part in (
-            columns[:, begin:end][members] for begin, end in zip(edges, edges[1:]))]
-        of_width.append((places, members, np.tensordot(problem.weights, np.array(of_bands), 1)))
+        parts = np.array_split(members, math.ceil(len(members) / 32))  # for the memory
+        of_width.append((places, members, np.concatenate(
+            [problem.products(columns[part], columns[part]) for part in parts], axis=1)))
     return ColumnGroups(columns, groups, of_width)
 
 
@@ -569,6 +685,12 @@ def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
     return found
 
 
+def complexity_penalty(cause: Candidate) -> float:
+    """Return the penalty of shapes and columns of a cause, in log-likelihood."""
+    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause)))
+    return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
+
+
 def likelihood_with(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the log-likelihood of a fit with one more cause, whose shapes are fixed."""
     return fit_causes(fit.problem, [*fit.causes, candidate]).log_likelihood
@@ -587,13 +709,13 @@ def _profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -
     half_range = candidate.half_width
     while half_range:  # a time: by all times that are about as likely
         shifts = np.linspace(-half_range, half_range, 2 * MAX_STEP_TIMES + 1)
-        columns = np.concatenate([candidate_transforms(moved(by), rest.distorted)
-                                  for by in shifts.tolist()]) / problem.deviation
+        columns = np.concatenate([problem.rows(moved(by), rest.distorted)
+                                  for by in shifts.tolist()])
         evidence = column_evidence(rest, group_columns(
             problem, columns, np.arange(len(shifts))[:, None].tolist()))
         likely = evidence >= evidence[len(shifts) // 2] - MAX_STEP_TIME_LACK
         largest = float(np.abs(shifts[likely]).max() + shifts[1] - shifts[0])
-        if largest < half_range or half_range > max(each.duration for each in problem.replays):
+        if largest < half_range or half_range > max(problem.durations):
             return largest / NORMAL_QUANTILE_975
         half_range *= 2.0
     least = likelihood_with(rest, moved(0.0)) - 0.5 * NORMAL_QUANTILE_975 ** 2

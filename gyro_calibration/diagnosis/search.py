@@ -27,30 +27,28 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, effect_candidate, fitted_shape_indices,
-    gaussian_pulse, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
-    propose_candidates, smooth_shapes, unnamed_variable, with_shape)
+    Candidate, effect_candidate, fitted_shape_indices, gaussian_pulse, generic_terms,
+    indices_by_cause, is_named, MAX_STEP_TIMES, propose_candidates, smooth_shapes,
+    unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import OnProgress
 from gyro_calibration.diagnosis.regression import (
-    build_problem, column_evidence, ColumnGroups, fit_causes, group_columns, Indices,
-    is_rate_distortion, likelihood_with, MIN_INDEPENDENT_SHARE, RegressionFit, RegressionProblem)
+    build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, group_columns,
+    Indices, likelihood_with, RegressionFit, VALUE_PENALTY)
 from gyro_calibration.diagnosis.replay import (
-    coefficient_angles, cosine_transform, inverse_cosine_transform, Replay)
+    cosine_transform, inverse_cosine_transform, Replay)
 from gyro_calibration.diagnosis.significance import (
     MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
-from scipy.fft import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
-#: Penalties in log-likelihood: of a fitted shape, at least, and of each column beyond the first;
-#: and of a structure without a name.
-VALUE_PENALTY, _UNNAMED_PENALTY = 1.2, 4.0
+#: Penalty in log-likelihood of a structure without a name.
+_UNNAMED_PENALTY = 4.0
 #: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
 #: a disturbance that is not periodic.
 _MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
@@ -88,7 +86,7 @@ def p_value(cause: str, evidence: float) -> float:
 class Search:
     """State of a search."""
 
-    problem: RegressionProblem  # the logs
+    problem: Any  # the logs, as of `Problem`
     candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
     # causes that are scanned for over all frequencies or times
@@ -101,19 +99,19 @@ class Search:
         default_factory=dict)
     # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
+    finds_several: bool = True  # whether several steps are searched for at once
 
     def candidate_evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
         # for the rate that the gyro senses, with shapes to two digits
         key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
-                    for each in fit.causes if is_rate_distortion(each.cause))
+                    for each in fit.causes if each.distorts)
         if key not in self.columns_cache:
             self.columns_cache.clear()
-            parts = [candidate_transforms(each, fit.distorted) / self.problem.deviation
-                     for each in self.candidates]
+            parts = [self.problem.rows(each, fit.distorted) for each in self.candidates]
             ends = np.cumsum([len(part) for part in parts]).tolist()
             self.columns_cache[key] = group_columns(
-                self.problem, np.concatenate([np.empty((0, len(self.problem.deviation))), *parts]),
+                self.problem, np.concatenate([fit.rows[:0], *parts]),
                 [range(end - len(part), end) for end, part in zip(ends, parts)])
         known = self.columns_cache[key]
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in known.groups])
@@ -182,7 +180,8 @@ def _find_strongest(search: Search, causes: Sequence[Candidate],
         # less than its penalty.
         steps = [(each, score) for each, score in steps if score > fit.log_likelihood]
         best = next((each for each, score in steps if p_value(each.cause, min(
-            score - fit.log_likelihood, _evidence_alone(fit, each))) < search.rate), None)
+            score - fit.log_likelihood, search.problem.robust_evidence(fit, each)[0]))
+            < search.rate), None)
     search.step_cache[key] = best, steps
     return best, steps
 
@@ -236,13 +235,13 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
             lambda by: -likelihood_with(fit, moved(by)), bounds=(-half_range, half_range),
             method='bounded', options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    more = max(_free_column_count(candidate, fit.problem) - 1, 0)
+    more = max(_free_column_count(candidate, fit) - 1, 0)
     return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * more
                        - candidate.penalty - (0.0 if is_named(candidate) else _UNNAMED_PENALTY))
 
 
-def _free_column_count(candidate: Candidate, problem: RegressionProblem) -> int:
-    return 0 if candidate.amplitude is not None else len(candidate.columns(problem.replays[0]))
+def _free_column_count(candidate: Candidate, fit: RegressionFit) -> int:
+    return 0 if candidate.amplitude is not None else len(candidate.columns(fit.distorted[0]))
 
 
 def _is_lasting(candidate: Candidate) -> bool:
@@ -289,39 +288,15 @@ def _find_tones(fit: RegressionFit) -> list[Scored]:
 
 
 def _find_steps(fit: RegressionFit) -> list[Scored]:
-    """
-    Return the clearest step of the bias of each log at any time, under the likeliest noise.
-
-    Beside a random walk that soon exceeds the white noise, a step shows for a short time only.
-    """
-    best, split_by_log = fit.best_noise, fit.problem.split_by_log
-    covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
-        fit.degrees_of_freedom)
-    # under that noise, as the factors are
-    residual = fit.rows[-1] - fit.inverse_information[best] @ fit.scores[best] @ fit.columns
+    """Return the clearest step of the bias of each log at any time, under the likeliest noise."""
     found, evidence = [], []
-    for run, (replay, factor, deviation, *rows) in enumerate(zip(
-            fit.problem.replays, fit.whitening_factors(), split_by_log(fit.problem.deviation),
-            *map(split_by_log, (residual, *fit.columns)))):
-        count, interval = replay.point_count, replay.point_interval
-        # products of a step at each point with the residual, the columns, and itself
-        pull, *products = [
-            np.cumsum(inverse_cosine_transform(factor ** 2 / deviation * each)[::-1])[::-1]
-            for each in rows]
-        power = (factor / deviation / np.sin(0.5 * coefficient_angles(count))) ** 2 / (2.0 * count)
-        whole = 0.5 * (power.sum() - fft(np.append(0.0, power)).real)
-        crossing = np.reshape(products, (len(products), count))
-        left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
-        shown = left > MIN_INDEPENDENT_SHARE * whole
-        # as far from the ends as the first of equally spaced times
-        margin = max(count // (MAX_STEP_TIMES + 1), 1)
-        own = np.where(shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[margin:-margin]
+    for run, (times, own) in enumerate(fit.problem.step_evidence(fit)):
         top = int(own.argmax())
         # number of points that are about as likely
-        width = min(float(np.exp(logsumexp(own - own[top]))), margin)
-        time = float(replay.channels.time[replay.valid][0]) + (margin + top) * interval
-        found.append(effect_candidate('bias_step', time, log_index=run,
-                                      half_width=1.5 * width * interval))
+        width = min(float(np.exp(logsumexp(own - own[top]))), max(len(own) // MAX_STEP_TIMES, 1))
+        found.append(fit.problem.candidate(
+            'bias_step', float(times[top]), log_index=run,
+            half_width=1.5 * width * float(np.median(np.diff(times)))))
         evidence.append(own)
     every = np.concatenate(evidence)
     mean = float(logsumexp(every)) - math.log(len(every))
@@ -401,8 +376,9 @@ def search_causes(search: Search) -> Causes:
     everything = _select_forward(search)
     if all(is_named(each) for each in everything):
         return everything
+    # without generic terms nothing tells a part from another structure in time
     named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates)),
-                                    columns_cache={}, step_cache={}))
+                                    columns_cache={}, step_cache={}, finds_several=False))
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
                    complexity_penalty(each)
@@ -430,15 +406,13 @@ def _with_several(search: Search, causes: Causes) -> Causes:
     they are looked for in white noise, and must be significant together. A drift replaces the
     steps that follow it.
     """
-    # without generic terms nothing tells a part from another structure in time
-    if 'bias_step' not in search.scanned_causes or all(map(is_named, search.candidates)):
+    if 'bias_step' not in search.scanned_causes or not search.finds_several:
         return ()
     problem, grown, tried = search.problem, causes, []
     white = replace(
         search, columns_cache={}, step_cache={}, scanned_causes=frozenset(),
-        candidates=tuple(filter(_is_lasting, search.candidates)), problem=replace(
-            problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
-            log_determinants=problem.log_determinants[:1]))
+        candidates=tuple(filter(_is_lasting, search.candidates)),
+        problem=problem.with_white_noise())
     while len(grown) < MAX_CAUSES:
         step, evidence = max(_find_steps(fit_causes(white.problem, grown)),
                              key=lambda each: each[1] - each[0].penalty)
@@ -465,7 +439,7 @@ def _with_several(search: Search, causes: Causes) -> Causes:
         steps = [each for each in several if each.cause == 'bias_step']
         return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
                    or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
-                   >= problem.replays[one.log_index or 0].duration
+                   >= problem.durations[one.log_index or 0]
                    for one, other in combinations(steps, 2))
 
     best = max(filter(are_apart, tried), key=evidence_of, default=())
@@ -504,12 +478,6 @@ def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
     return tuple(current)
 
 
-def complexity_penalty(cause: Candidate) -> float:
-    """Return the penalty of shapes and columns of a cause, in log-likelihood."""
-    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause)))
-    return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
-
-
 def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
     """
     Return the evidence for one of the causes given the others.
@@ -517,30 +485,14 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
     Of two distortions of the rate, such as a delay and a lag, one may stand in for the other:
     without one, the shape of the other is refined.
     """
-    fit = fit_causes(search.problem, causes)
-    rest = _without(causes, cause_index)
-    without = fit_causes(search.problem, rest).log_likelihood
-    if is_rate_distortion(causes[cause_index].cause) and any(
-            is_rate_distortion(each.cause) for each in rest):
+    known, rest = causes[cause_index], _without(causes, cause_index)
+    fit, rest_fit = (fit_causes(search.problem, some) for some in (causes, rest))
+    without = rest_fit.log_likelihood
+    if known.distorts and any(each.distorts for each in rest):
         without = max(without, fit_causes(
             search.problem, refine_jointly(search, rest)).log_likelihood)
-    evidence = fit.log_likelihood - without - complexity_penalty(causes[cause_index])
-    return min(evidence, _evidence_alone(fit_causes(search.problem, rest), causes[cause_index]))
-
-
-def _evidence_alone(rest: RegressionFit, event: Candidate) -> float:
-    """
-    Return the evidence for a single event by the noise of its log alone, given other causes.
-
-    The slow noise of a log may be larger than that of the others. Infinite for lasting causes.
-    """
-    if len(rest.problem.replays) == 1 or event.log_index is None or not is_named(event):
-        return math.inf
-    own, left = rest.problem.replays[event.log_index], rest.residuals[event.log_index]
-    alone = fit_causes(build_problem([replace(own, channels=replace(
-        own.channels, output=own.reference + left))]), [])
-    return (likelihood_with(alone, replace(event, log_index=0)) - alone.log_likelihood
-            - complexity_penalty(event))
+    return min(fit.log_likelihood - without - complexity_penalty(known),
+               search.problem.robust_evidence(rest_fit, known)[0])
 
 
 def _eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Causes:
@@ -575,7 +527,7 @@ def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
             continue
         # as far as it is one along a temperature, with its own size in each log but the last
         alone = [replace(each, log_index=run, values=()) for run in range(
-            len(problem.replays) - 1) if each.amplitude is None
+            len(problem.durations) - 1) if each.amplitude is None
             and CAUSES[each.cause].along in ('temperature', 'temperature_rate')]
         more = 2.0 * (fit_causes(problem, [*causes, *alone]).log_likelihood
                       - fit_causes(problem, causes).log_likelihood) if alone else 0.0
@@ -615,10 +567,12 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
     if not suspected:  # one more cause at a higher rate, if there is one
         selected = (*named, *unnamed)
         _, steps = _find_strongest(search, selected)
-        score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
+        rest = fit_causes(search.problem, selected)
+        score = rest.log_likelihood
         suspected = tuple(each for each, likelihood in steps if _is_lasting(each)
                           and each.cause not in {other.cause for other in selected} and p_value(
-                              each.cause, likelihood - score)
+                              each.cause, min(likelihood - score, search.problem.robust_evidence(
+                                  rest, each)[0]))
                           < SUSPECTED_RATE_FACTOR * search.rate)[:1]
     return Selection(named, alternatives, unnamed, suspected)
 
@@ -658,29 +612,25 @@ def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """
     Return the gain of each cause on held-out stretches in standard deviations.
 
-    Given the others, it is scaled to fit best without each stretch in turn. No other stretch
+    Given the others, it is scaled to fit best without each fold in turn. No other stretch
     shows a single event: slips, and a step of the bias that a random walk soon hides.
     """
-    full, found = fit_causes(search.problem, causes), []
-    left = full.whitened_series()
-    count = max(64 // len(left), 1)  # stretches of each log
-    stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
-                              for run, each in enumerate(left)])
-    off = np.concatenate(left)
+    problem = search.problem
+    full, found = fit_causes(problem, causes), []
+    off, (stretch, fold) = problem.whitened(full, full), problem.stretches
     for place, known in enumerate(causes):
         if known.cause == 'reference_slip':
             found.append(math.inf)
             continue
-        rest = fit_causes(search.problem, _without(causes, place))
-        before = np.concatenate(rest.whitened_series(full))
+        before = problem.whitened(fit_causes(problem, _without(causes, place)), full)
         added = before - off
         score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
-        # errors of a response to a command are events of the motion
         if (known.log_index is not None and information.max() > 0.5 * information.sum()
-                and search.problem.replays[known.log_index].command is None):
+                and not problem.may_repeat_events):
             found.append(math.inf)
             continue
-        size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
+        score, known_there = (np.bincount(fold, each)[fold] for each in (score, information))
+        size = 1.0 - score / np.maximum(information.sum() - known_there, 1e-300)
         found.append(prediction_sigmas(
             0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
     return found
@@ -708,13 +658,15 @@ def _alternatives(search: Search, named: Causes, place: int,
     """Return the simplest alternative of a cause, or itself, and all with their deficits."""
     def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
-        return len(fitted_shape_indices(known)) + _free_column_count(known, search.problem)
+        return len(fitted_shape_indices(known)) + _free_column_count(known, rest)
 
-    own = named[place]
-    _, steps = _find_strongest(search, (*_without(named, place), *unnamed))
+    own, others = named[place], (*_without(named, place), *unnamed)
+    _, steps = _find_strongest(search, others)
     mine = max((score for each, score in steps if each.cause == own.cause), default=math.inf)
-    members = [(each, mine - score) for each, score in steps
-               if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(own, 0.0)]
+    rest = fit_causes(search.problem, others)
+    _, ratio = search.problem.robust_evidence(rest, own)
+    members = [(each, lack) for each, score in steps if is_named(each)
+               and (lack := (mine - score) / ratio) < RULED_OUT_DEFICIT] or [(own, 0.0)]
     simplest = min((each for each, _ in members), key=size)
     return (simplest if size(simplest) < size(own) else own,
             {each.cause: lack for each, lack in members})
