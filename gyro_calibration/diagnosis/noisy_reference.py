@@ -12,30 +12,24 @@
 The diagnosis of a log whose reference has errors of its own, such as a course over ground.
 
 Causes are searched for as beside an exact reference, under the noise of gyro and reference that is
-found with a column of each cause, and under any wander of the bias. The score of a cause is also
-summed over stretches. Its variance is that by the noise or that by the scatter of the stretches,
-whichever is larger, and its distribution is Fisher's, with the effective number of stretches less
-that of the columns as the degrees of freedom. The evidence is at most that of this test.
+found with a column of each cause, and under any wander of the bias. The evidence is at most that
+by the scatter of stretches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import product
 import math
 
 from gyro_calibration.calibration.heading_regression import (
     fit_spans, MIN_STRETCHES, SpanFit, whiten_regression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
-from gyro_calibration.calibration.noise_grid import GridFit
 from gyro_calibration.calibration.own_instants import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.calibration.spans import (
-    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
-    Spans)
+    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM)
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, indices_by_cause, lasting_shapes, MAX_STEP_TIMES, MIN_CHANNEL_RANGE, observed_range)
+    indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
     Cause, cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, sized_finding,
     untestable_causes, value_finding)
@@ -46,20 +40,19 @@ from gyro_calibration.diagnosis.extended_model import (
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress, Reference,
     TIME_LIMIT_REMARK)
-from gyro_calibration.diagnosis.regression import fit_causes, RegressionFit, Value
+from gyro_calibration.diagnosis.regression import fit_causes, Value
 from gyro_calibration.diagnosis.search import (
     confirm_causes, evidence_for, held_out_sigmas, p_value, refine_jointly, Search, search_causes)
 from gyro_calibration.diagnosis.significance import (
     detectable_sigmas, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
+from gyro_calibration.diagnosis.span_problem import (
+    find_span_steps, span_candidate, SpanProblem)
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
@@ -79,8 +72,6 @@ _METHOD_TEXT = (
 #: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropped_samples',
                   'unit_error', 'quantization', 'saturation'}
-#: Correlation of the columns of two steps of the bias above which spans do not distinguish them.
-_MAX_ALIKENESS = 0.999
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
@@ -427,185 +418,6 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
 
 # the search
 
-@dataclass(frozen=True, eq=False)
-class SpanProblem:
-    """A log as spans, a `Problem` of the search, under each size of a wander of the bias."""
-
-    spans: Spans  # with the rate as corrected so far
-    noise: GridFit  # of gyro and reference, which whitens
-    wander: Array  # columns of the wandering bias, whitened, shape (w, m)
-    deviations: Array  # of the wander, under each noise, shape (g, w)
-    log_determinants: Array  # shape (g,)
-    cosine_count: int  # number of the columns that are cosines
-
-    @classmethod
-    def of(cls, spans: Spans, noise: GridFit) -> SpanProblem:
-        """Return the problem of a log under a noise, with wanders of all sizes that may be."""
-        waves, parts = spans.bias_wander()
-        axes = [np.geomspace(*part.size_range, 1 if len({*part.size_range}) == 1 else 12)
-                for part in parts]
-        variances = np.array([*product(*axes)]) ** 2 @ np.array([each.variance for each in parts])
-        problem = cls(spans, noise, np.empty((0, 0)), np.sqrt(variances), np.empty(0),
-                      int(np.count_nonzero(parts[0].variance)))
-        wander = problem._whiten(waves)
-        scaled = problem.deviations[:, :, None] * (wander @ wander.T) * problem.deviations[:, None]
-        return replace(problem, wander=wander, log_determinants=np.linalg.slogdet(
-            np.eye(len(wander)) + scaled)[1])
-
-    @property
-    def _prior(self) -> Array:
-        """Return the prior of what is always fitted as rows, each of one value."""
-        deviations = self.spans.prior_deviations(())
-        return np.diag(1.0 / deviations)[np.isfinite(deviations)]
-
-    def _whiten(self, columns: Array) -> Array:
-        """Return columns, shape (n + r, k), in units of the noise, with the prior, (k, m)."""
-        return np.pad(self.noise.whiten(columns).T, ((0, 0), (0, len(self._prior))))
-
-    @cached_property
-    def _reduction(self) -> Array:
-        """Return the matrices by which the wander reduces products, shape (g, w, w)."""
-        sizes, gram = self.deviations, self.wander @ self.wander.T
-        inverse = np.linalg.inv(np.eye(len(gram)) + sizes[:, :, None] * gram * sizes[:, None])
-        return np.asarray(sizes[:, :, None] * inverse * sizes[:, None])
-
-    # as of `Problem`
-
-    @property
-    def durations(self) -> list[float]:
-        return [float(np.ptp(self.spans.time))]
-
-    def distorted(self, causes: Sequence[Candidate]) -> tuple[Spans, ...]:
-        return (self.spans,)
-
-    @cached_property
-    def _base_rows(self) -> Array:
-        rows = self._whiten(np.column_stack([design_matrix(self.spans, ()), self.spans.observed]))
-        rows[:-1, rows.shape[1] - len(self._prior):] = self._prior.T
-        return rows
-
-    def base_rows(self, logs: tuple[Spans, ...]) -> Array:
-        return self._base_rows
-
-    def rows(self, candidate: Candidate, logs: tuple[Spans, ...]) -> Array:
-        return self._whiten(np.transpose(candidate.columns(self.spans)))
-
-    def products(self, one: Array, other: Array) -> Array:
-        of_one, of_other = (each @ self.wander.T for each in (one, other))
-        return one @ np.swapaxes(other, -1, -2) - np.einsum(
-            '...rw,gwv,...sv->g...rs', of_one, self._reduction, of_other, optimize=True)
-
-    def candidate(self, name: str, *shapes: float, log_index: int, half_width: float) -> Candidate:
-        return replace(span_candidate(CauseTerm(name, shapes)), log_index=log_index,
-                       half_width=half_width)
-
-    def _with_noise(self, place: int) -> SpanProblem:
-        return replace(self, deviations=self.deviations[place:place + 1],
-                       log_determinants=self.log_determinants[place:place + 1])
-
-    def with_white_noise(self) -> SpanProblem:
-        return self._with_noise(0)
-
-    def step_evidence(self, fit: RegressionFit) -> list[tuple[Array, Array]]:
-        times, best = self.spans.time[2:-2], fit.best_noise
-        steps, only = self._whiten(self.spans.step_columns(times)), self._with_noise(best)
-        crossing = only.products(steps, fit.rows)[0]
-        of_wander = steps @ self.wander.T
-        whole = np.sum(steps ** 2, axis=1) - np.sum(
-            (of_wander @ only._reduction[0]) * of_wander, axis=1)
-        towards = crossing[:, :-1] @ fit.inverse_information[best]
-        pull = crossing[:, -1] - towards @ fit.scores[best]
-        left = whole - np.sum(towards * crossing[:, :-1], axis=1)
-        # a step that these spans do not distinguish from another explains nothing
-        distinct = left > (1.0 - _MAX_ALIKENESS ** 2) * whole
-        size = fit.degrees_of_freedom / fit.residual_squares[best]
-        return [(times, distinct * 0.5 * size * pull ** 2 / np.where(distinct, left, 1.0))]
-
-    def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
-        best = noise_fit.best_noise
-        left = fit.rows[-1] - fit.estimates[0] @ fit.columns
-        sizes = self._reduction[best] @ (self.wander @ left)
-        return np.append(left - sizes @ self.wander, sizes / self.deviations[best]) * math.sqrt(
-            noise_fit.degrees_of_freedom / noise_fit.residual_squares[best])
-
-    def _clusters(self) -> list[NDArray[np.intp]]:
-        """Return the stretch of each row and cosine, and of an encoder the place of the shaft."""
-        more = len(self._prior) + len(self.wander)
-        of_rows = [self.spans.stretch_numbers]
-        of_rows += [self.spans.shaft_sectors] if self.spans.uses_code_changes else []
-        return [np.append(each, each.max() + 1 + np.arange(more)) for each in of_rows]
-
-    @property
-    def stretches(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        stretch, count = self._clusters()[0], int(self.spans.stretch_numbers.max()) + 1
-        every = np.arange(stretch.max() + 1)
-        # errors of a course are correlated, so that distant stretches must be predicted
-        return stretch, every if self.spans.treatment.is_fine else np.where(
-            every < count, every * 5 // count, every)
-
-    @property
-    def may_repeat_events(self) -> bool:
-        return False
-
-    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
-        # the noise without a slow cause has its wander
-        best = fit_causes(self, [*rest.causes, candidate]).best_noise
-        count = len(self.wander)
-        wander = np.hstack([self.wander, np.diag(1.0 / self.deviations[best])])
-        base, _ = np.linalg.qr(np.vstack([np.pad(rest.columns, ((0, 0), (0, count))), wander]).T)
-        whole = np.pad(np.vstack([self.rows(candidate, rest.distorted), rest.rows[-1]]),
-                       ((0, 0), (0, count))).T
-        left = whole - base @ (base.T @ whole)
-        clusters = self._clusters()
-        # along the motion they are similar to errors of an encoder that repeat with its position
-        along = CAUSES[candidate.cause].along in ('rate', 'heading')
-        chance, ratio = _cluster_robust_chance(
-            left[:, :-1], left[:, -1], clusters if along else clusters[:1],
-            slice(-count, self.cosine_count - count or None))
-        return 0.5 * float(chi2.isf(max(chance, 1e-300), 1)) - candidate.penalty, ratio
-
-
-def span_candidate(term: CauseTerm) -> Candidate:
-    """Return a cause for the search, whose columns are those of spans."""
-    name = term.cause
-
-    def columns(spans: Spans, *shapes: float) -> Sequence[Array]:
-        found: Array = (spans.step_columns(np.array(shapes)) if name == 'bias_step'
-                        else spans.cause_columns(CauseTerm(name, shapes)))
-        return [*found.T]
-
-    return Candidate(name, term.shapes, columns,
-                     amplitude=1.0 if name == SINE_RESPONSE.name else None)
-
-
-def _cluster_robust_chance(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
-                           cosines: slice) -> tuple[float, float]:
-    """
-    Return the largest p-value of columns by any of the clusterings, and the ratio of variances.
-
-    It is the variance by the scatter of the clusters over that by the noise, at least 1. Evidence
-    against a wander of the bias counts as that of all its cosines, since all of them show its
-    size, although a slow cause is in few of them. Fewer clusters than `MIN_STRETCHES` show none.
-    """
-    information = x.T @ x
-    size = np.sqrt(np.diag(information)) + 1e-300
-    # by the residual with the candidate: scores that contain the effect would overestimate scatter
-    off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
-    count, found = x.shape[1], []
-    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size ** 2)))
-    square = float(np.sum((root @ x.T @ residual) ** 2))
-    for cluster in clusters:
-        scores = np.array([np.bincount(cluster, part * off) for part in x.T])
-        shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
-        shares[cosines] = shares[cosines].mean()
-        effective = float(shares.sum() ** 2 / (shares ** 2).sum())
-        scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
-        ratio = max(float(np.linalg.eigvalsh(root @ scatter @ root.T).max()), 1.0)
-        found.append((1.0 if effective < MIN_STRETCHES else float(fisher.sf(
-            square / ratio / count, count, max(effective - count, 1.0))), ratio))
-    return max(found)
-
-
 @dataclass(frozen=True)
 class FoundCause:
     """A cause that the search found."""
@@ -652,17 +464,13 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
     # noise given one column of each cause, so that it does not absorb their contributions
     rich = [*{each.cause: each for each in terms if each.cause != SINE_RESPONSE.name}.values()]
     # of a log with fewer spans than columns, the noise is that without them
-    noise = (fit_spans(fit.spans, rich)
-             if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit).fit
-    at, time = fit, fit.spans.time
-    moments = np.linspace(time[0], time[-1], MAX_STEP_TIMES + 2)[1:-1].tolist()
-    candidates = (*map(span_candidate, terms), *(replace(span_candidate(
-        CauseTerm('bias_step', (moment,))), log_index=0, half_width=1.5 * (moments[1] - moments[0])
-        ) for moment in moments))
+    noise_fit = (fit_spans(fit.spans, rich)
+                 if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
+    candidates, at = tuple(span_candidate(each.cause, *each.shapes) for each in terms), fit
     for _ in range(2):
-        search = Search(SpanProblem.of(at.spans, noise), candidates,
-                        false_alarm_rate / len(indices_by_cause(candidates)),
-                        scanned_causes=frozenset({'bias_step'}), on_progress=on_progress)
+        search = Search(SpanProblem.of(at, noise_fit), candidates,
+                        false_alarm_rate / (1 + len(indices_by_cause(candidates))),
+                        {'bias_step': find_span_steps}, on_progress=on_progress)
         causes = search_causes(search)
         # once more, at the rate without these causes: similar ones differ in higher order
         of_rate = [CauseTerm(each.cause, each.shapes) for each in causes

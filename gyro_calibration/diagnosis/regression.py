@@ -30,8 +30,8 @@ import math
 from typing import Any, Protocol
 
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, effect_candidate, fitted_shape_indices, is_named,
-    MAX_STEP_TIME_LACK, MAX_STEP_TIMES, smooth_shapes, with_shape)
+    Candidate, candidate_transforms, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK,
+    MAX_STEP_TIMES, smooth_shapes, with_shape)
 from gyro_calibration.diagnosis.replay import (
     band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
     stated_shapes)
@@ -39,7 +39,6 @@ from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fft
 from scipy.linalg import block_diag
 from scipy.optimize import bisect
 from scipy.special import logsumexp
@@ -76,14 +75,8 @@ class Problem(Protocol):
     def products(self, one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
 
-    def candidate(self, name: str, *shapes: float, log_index: int, half_width: float) -> Candidate:
-        """Return the candidate of a single event."""
-
     def with_white_noise(self) -> Problem:
         """Return the problem without a wander of the bias."""
-
-    def step_evidence(self, fit: RegressionFit) -> list[tuple[Array, Array]]:
-        """Return times of steps of the bias in each log, s, and evidence by the best noise."""
 
     def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
         """Return what a fit leaves, whitened by the likeliest noise of another, shape (n,)."""
@@ -164,39 +157,9 @@ class RegressionProblem:
     def products(self, one: Array, other: Array) -> Array:
         return np.tensordot(self.weights, self.band_products(one, other), 1)
 
-    def candidate(self, name: str, *shapes: float, log_index: int, half_width: float) -> Candidate:
-        return effect_candidate(name, *shapes, log_index=log_index, half_width=half_width)
-
     def with_white_noise(self) -> RegressionProblem:
         return replace(self, noise_shapes=self.noise_shapes[:1], weights=self.weights[:1],
                        log_determinants=self.log_determinants[:1])
-
-    def step_evidence(self, fit: RegressionFit) -> list[tuple[Array, Array]]:
-        # Beside a random walk that soon exceeds the white noise, a step shows for a short time.
-        best, found = fit.best_noise, []
-        covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
-            fit.degrees_of_freedom)
-        # under that noise, as the factors are
-        residual = fit.rows[-1] - fit.inverse_information[best] @ fit.scores[best] @ fit.columns
-        for replay, factor, deviation, *rows in zip(
-                self.replays, fit.whitening_factors(), self.split_by_log(self.deviation),
-                *map(self.split_by_log, (residual, *fit.columns))):
-            count, interval = replay.point_count, replay.point_interval
-            # products of a step at each point with the residual, the columns, and itself
-            pull, *products = [np.cumsum(inverse_cosine_transform(
-                factor ** 2 / deviation * each)[::-1])[::-1] for each in rows]
-            power = (factor / deviation / np.sin(0.5 * coefficient_angles(count))) ** 2 / (
-                2.0 * count)
-            whole = 0.5 * (power.sum() - fft(np.append(0.0, power)).real)
-            crossing = np.reshape(products, (len(products), count))
-            left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
-            shown = left > MIN_INDEPENDENT_SHARE * whole
-            # as far from the ends as the first of equally spaced times
-            margin = max(count // (MAX_STEP_TIMES + 1), 1)
-            begin = float(replay.channels.time[replay.valid][0])
-            found.append((begin + interval * np.arange(margin, count - margin), np.where(
-                shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[margin:-margin]))
-        return found
 
     def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
         return np.concatenate(fit.whitened_series(noise_fit))

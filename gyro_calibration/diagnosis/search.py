@@ -19,7 +19,7 @@ that are held out, and if the interval of its size excludes 0.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 import math
@@ -27,46 +27,35 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, effect_candidate, fitted_shape_indices, gaussian_pulse, generic_terms,
-    indices_by_cause, is_named, MAX_STEP_TIMES, propose_candidates, smooth_shapes,
-    unnamed_variable, with_shape)
+    Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
+    propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import OnProgress
 from gyro_calibration.diagnosis.regression import (
     build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, group_columns,
-    Indices, likelihood_with, RegressionFit, VALUE_PENALTY)
-from gyro_calibration.diagnosis.replay import (
-    cosine_transform, inverse_cosine_transform, Replay)
+    likelihood_with, RegressionFit, VALUE_PENALTY)
+from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.diagnosis.scans import (
+    find_slips, find_steps, find_tones, MAX_PER_LOG, Scored)
 from gyro_calibration.diagnosis.significance import (
     MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
-from scipy.signal import correlate
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
 #: Penalty in log-likelihood of a structure without a name.
 _UNNAMED_PENALTY = 4.0
-#: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
-#: a disturbance that is not periodic.
-_MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
-#: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
-_SLIP_DURATIONS, _MAX_SLIPS = (0.0, 0.1, 0.4), 20
-#: Least time between two slips, and between a slip and a gap where the heading is rounded, s.
-_SLIP_INTERVAL = 1.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
 _MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 
 Causes = tuple[Candidate, ...]
-#: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
-Scored = tuple[Candidate, float]
 
 
 def evidence_threshold(cause: str, rate: float) -> float:
     """Return the evidence that noise alone exceeds with a given probability: see `p_value`."""
-    return -math.log(rate) if cause in _MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
+    return -math.log(rate) if cause in MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
 
 
 def p_value(cause: str, evidence: float) -> float:
@@ -79,7 +68,7 @@ def p_value(cause: str, evidence: float) -> float:
     degrees of freedom less the logarithm of their number.
     """
     evidence = max(evidence, 0.0)
-    return math.exp(-evidence) if cause in _MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
+    return math.exp(-evidence) if cause in MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
 
 
 @dataclass(frozen=True)
@@ -89,8 +78,8 @@ class Search:
     problem: Any  # the logs, as of `Problem`
     candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
-    # causes that are scanned for over all frequencies or times
-    scanned_causes: frozenset[str] = frozenset({'bias_step', *_MAX_PER_LOG})
+    # causes that are scanned for over all frequencies or times -> their candidates, given a fit
+    scans: Mapping[str, Callable[[RegressionFit], list[Scored]]]
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
     # columns_cache, step_cache: caches of columns and of steps, by the named causes
@@ -130,8 +119,10 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
-    search = Search(problem, found, rate / len(places), on_progress=on_progress,
-                    scanned_causes=Search.scanned_causes.difference(without))
+    scans = {'bias_step': find_steps, 'interference_tone': find_tones,
+             'reference_slip': find_slips}
+    search = Search(problem, found, rate / len(places), on_progress=on_progress, scans={
+        cause: scan for cause, scan in scans.items() if cause not in without})
     shown = search.candidate_evidence(fit)
     return replace(search, unidentifiable=frozenset(
         cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
@@ -142,7 +133,7 @@ def restrict_search(search: Search, replays: Sequence[Replay], causes: Collectio
     """Return a silent search for some causes in other parts of the logs, at another rate."""
     return replace(search, problem=build_problem(replays), rate=rate,
                    columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
-                   scanned_causes=search.scanned_causes & frozenset(causes),
+                   scans={each: scan for each, scan in search.scans.items() if each in causes},
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
 
 
@@ -202,9 +193,7 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
             mean = float(logsumexp(found[own])) - math.log(len(own))
             first.append((replace(search.candidates[best], penalty=float(found[best]) - mean),
                           float(found[best])))
-    scans = {'interference_tone': _find_tones, 'reference_slip': _find_slips,
-             'bias_step': _find_steps}
-    first += [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
+    first += [each for scan in search.scans.values() for each in scan(fit)
               if math.isfinite(each[1])]
     return list({each.cause: (each, evidence) for each, evidence in sorted(
         first, key=lambda scored: scored[1] - scored[0].penalty)}.values())
@@ -253,116 +242,6 @@ def _is_lasting(candidate: Candidate) -> bool:
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
 
-# scans over all frequencies and times
-
-def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
-    """Return the logs that may contain one more instance of a cause."""
-    taken = [known.log_index for known in fit.causes if known.cause == cause]
-    return [run
-            for run in range(len(fit.problem.replays)) if taken.count(run) < _MAX_PER_LOG[cause]]
-
-
-def _find_tones(fit: RegressionFit) -> list[Scored]:
-    """Return the strongest tone of each log, which has its own size and phase."""
-    found, left = [], fit.whitened_series()
-    for run in _logs_to_scan(fit, 'interference_tone'):
-        each, white = fit.problem.replays[run], left[run]
-        # Zero padding: a tone between two frequencies of the log would lose half of its power.
-        power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
-        lowest = 40  # of 20 periods in the log; slower variations are bias wander
-        if len(power) > 2 * lowest:
-            best = lowest + int(power[lowest:-2].argmax())
-            frequency = 0.5 * best / each.duration
-            # of all frequencies that are this one in means over some samples
-            places = np.arange(each.decimation // 2 + 1) / each.point_interval
-            aliases = np.concatenate([places + frequency, places[1:] - frequency])
-            error = (each.channels.output - each.reference)[each.valid]
-            time = each.channels.time[each.valid]
-            frequency = max(aliases.tolist(), key=lambda at: float(np.abs(
-                np.mean(error * np.exp(-2.0j * np.pi * at * time)))))
-            found.append((replace(
-                effect_candidate('interference_tone', frequency, log_index=run,
-                                 half_width=1.0 / each.duration),
-                penalty=math.log(len(power) * len(left))), float(power[best]) - VALUE_PENALTY))
-    return found
-
-
-def _find_steps(fit: RegressionFit) -> list[Scored]:
-    """Return the clearest step of the bias of each log at any time, under the likeliest noise."""
-    found, evidence = [], []
-    for run, (times, own) in enumerate(fit.problem.step_evidence(fit)):
-        top = int(own.argmax())
-        # number of points that are about as likely
-        width = min(float(np.exp(logsumexp(own - own[top]))), max(len(own) // MAX_STEP_TIMES, 1))
-        found.append(fit.problem.candidate(
-            'bias_step', float(times[top]), log_index=run,
-            half_width=1.5 * width * float(np.median(np.diff(times)))))
-        evidence.append(own)
-    every = np.concatenate(evidence)
-    mean = float(logsumexp(every)) - math.log(len(every))
-    return [(replace(each, penalty=float(own.max()) - mean), float(own.max()))
-            for each, own in zip(found, evidence)]
-
-
-def _find_slips(fit: RegressionFit) -> list[Scored]:
-    """Return the clearest jumps of the heading of each reference, where it accelerates."""
-    found, left = [], fit.whitened_series()
-    factors = [own / each for own, each in zip(fit.whitening_factors(), fit.problem.split_by_log(
-        fit.problem.deviation))]
-    for run in _logs_to_scan(fit, 'reference_slip'):
-        each = fit.problem.replays[run]
-        acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
-        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
-        if acceleration.max() > 0.0 and len(moments):
-            tried = [_fit_slips(each, run, left[run], factors[run], moments,
-                                max(width, 0.5 * each.point_interval))
-                     for width in _SLIP_DURATIONS]
-            # The largest number indicates a continuous disturbance, not slips.
-            if max(len(slips.shapes) - 1 for slips, _ in tried) < _MAX_SLIPS:
-                found += tried
-    return found
-
-
-def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
-               width: float) -> Scored:
-    """Return slips of one duration, apart from each other, with evidence for the times scanned."""
-    time = np.arange(replay.point_count) * replay.point_interval
-    likely = math.log(len(indices) * len(_SLIP_DURATIONS))
-    size, deviation = _matched_filter(white, factor, time, width)
-    wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
-    value = 0.5 * (size[indices] / deviation) ** 2 - likely - VALUE_PENALTY
-    # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
-    # of an encoder is constant at rest, and differs by up to a step between two rests. What the
-    # gyro turns in a gap is not known, nor is the rounding error there.
-    is_temporary = wide[indices] / size[indices] < 0.3
-    unknown = _SLIP_INTERVAL if replay.heading_step else 2.0 * width
-    near_gap = maximum_filter1d(replay.filled_points,
-                                2 * math.ceil(unknown / replay.point_interval) + 1)
-    value[is_temporary | near_gap[indices]
-          | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
-    chosen: list[float] = []
-    total = 0.0
-    for place in np.argsort(-value)[:200]:
-        if (value[place] <= 0.0 and chosen) or len(chosen) == _MAX_SLIPS:
-            break
-        at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
-        if all(abs(at - other) > _SLIP_INTERVAL for other in chosen):
-            chosen.append(at)
-            total += float(value[place])
-    penalty = likely * len(chosen)
-    slips = effect_candidate('reference_slip', width, *chosen, log_index=log_index)
-    return replace(slips, penalty=penalty), total + penalty
-
-
-def _matched_filter(white: Array, whitening_factor: Array, time: Array,
-                    width: float) -> tuple[Array, float]:
-    """Return the size of a pulse at each time, rad, and its standard deviation."""
-    kernel = inverse_cosine_transform(
-        cosine_transform(gaussian_pulse(time, time[len(time) // 2], width)) * whitening_factor)
-    return (correlate(white, kernel, 'same') / (kernel @ kernel),
-            float(1.0 / np.sqrt(kernel @ kernel)))
-
-
 # the growing search
 
 def search_causes(search: Search) -> Causes:
@@ -406,15 +285,15 @@ def _with_several(search: Search, causes: Causes) -> Causes:
     they are looked for in white noise, and must be significant together. A drift replaces the
     steps that follow it.
     """
-    if 'bias_step' not in search.scanned_causes or not search.finds_several:
+    if 'bias_step' not in search.scans or not search.finds_several:
         return ()
     problem, grown, tried = search.problem, causes, []
     white = replace(
-        search, columns_cache={}, step_cache={}, scanned_causes=frozenset(),
+        search, columns_cache={}, step_cache={}, scans={},
         candidates=tuple(filter(_is_lasting, search.candidates)),
         problem=problem.with_white_noise())
     while len(grown) < MAX_CAUSES:
-        step, evidence = max(_find_steps(fit_causes(white.problem, grown)),
+        step, evidence = max(search.scans['bias_step'](fit_causes(white.problem, grown)),
                              key=lambda each: each[1] - each[0].penalty)
         # the first of a pair may not be significant alone
         if len(grown) > len(causes) + 1 and p_value(
@@ -519,7 +398,7 @@ def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     variables = {unnamed_variable(each) for each in causes if not is_named(each)}
     exceeded = {name for variable in variables for name in variable.split(' and ')}
     tones = [each.log_index for each in causes if each.cause == 'interference_tone']
-    if any(tones.count(run) >= _MAX_PER_LOG['interference_tone'] for run in tones):
+    if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
         exceeded.add('frequency')
     kept, problem = [], search.problem
     for each in causes:
