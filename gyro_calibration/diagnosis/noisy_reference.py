@@ -42,7 +42,7 @@ from gyro_calibration.diagnosis.findings import (
     TIME_LIMIT_REMARK)
 from gyro_calibration.diagnosis.regression import fit_causes, Value
 from gyro_calibration.diagnosis.search import (
-    confirm_causes, evidence_for, held_out_sigmas, p_value, refine_jointly, Search, search_causes)
+    confirm_causes, explain_selection, held_out_sigmas, p_value, Search, search_causes)
 from gyro_calibration.diagnosis.significance import (
     detectable_sigmas, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.span_problem import (
@@ -478,18 +478,14 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
         if not of_rate:
             break
         at = fit_spans(fit.spans, of_rate)
-    found, selection = [], confirm_causes(search, causes)
-    for known, deficits in [*zip(selection.named, selection.alternatives),
-                            *((each, {}) for each in selection.suspected)]:
-        is_named = known in selection.named
-        every = selection.named if is_named else (*selection.named, known)
-        every = refine_jointly(search, every)
-        place = selection.named.index(known) if is_named else len(every) - 1
+    found: list[FoundCause] = []
+    selection = confirm_causes(search, causes)
+    for causes, place, evidence, deficits in explain_selection(search, selection):
+        known = causes[place]
         found.append(FoundCause(
-            CauseTerm(known.cause, every[place].shapes),
-            p_value(known.cause, evidence_for(search, every, place)),
-            held_out_sigmas(search, every)[place], is_named, deficits,
-            next(iter(fit_causes(search.problem, every).shapes(place).values()), None)))
+            CauseTerm(known.cause, known.shapes), p_value(known.cause, evidence),
+            held_out_sigmas(search, causes)[place], len(found) < len(selection.named), deficits,
+            next(iter(fit_causes(search.problem, causes).shapes(place).values()), None)))
     while established := [each.cause_term for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)
         worst = max(established,

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 import math
-from typing import Any, Protocol
+from typing import Any
 
 from gyro_calibration.diagnosis.candidates import (
     Candidate, candidate_transforms, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK,
@@ -54,48 +54,9 @@ VALUE_PENALTY = 1.2
 SMOOTHED_RATIO = 0.05
 
 
-class Problem(Protocol):
-    """What is regressed on causes, under the noises that are tried: logs, or spans of a log."""
-
-    log_determinants: Array  # of the noises, and of their prior probability, shape (g,)
-
-    @property
-    def durations(self) -> list[float]:
-        """Return the length of each log, s."""
-
-    def distorted(self, causes: Sequence[Candidate]) -> tuple[Any, ...]:
-        """Return the logs with the rate that the gyro senses, distorted by causes."""
-
-    def base_rows(self, logs: tuple[Any, ...]) -> Array:
-        """Return what is always fitted, and last the residual, whitened, shape (q + 1, m)."""
-
-    def rows(self, candidate: Candidate, logs: tuple[Any, ...]) -> Array:
-        """Return the columns of a candidate, whitened by the first noise, shape (k, m)."""
-
-    def products(self, one: Array, other: Array) -> Array:
-        """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
-
-    def with_white_noise(self) -> Problem:
-        """Return the problem without a wander of the bias."""
-
-    def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
-        """Return what a fit leaves, whitened by the likeliest noise of another, shape (n,)."""
-
-    @property
-    def stretches(self) -> tuple[Indices, Indices]:
-        """Return the stretch of each of these, shape (n,), and the fold of each stretch."""
-
-    @property
-    def may_repeat_events(self) -> bool:
-        """Tell whether a single event is also held out."""
-
-    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
-        """Return evidence that does not rely on one noise for all, and a ratio of variances."""
-
-
 @dataclass(frozen=True, eq=False)
 class RegressionProblem:
-    """The logs and the noises that are tried."""
+    """The logs and the noises that are tried; `SpanProblem` is the same for a log as spans."""
 
     replays: tuple[Replay, ...]  # the logs, with the reference rate
     # standard deviation of each coefficient by the first noise, relative to that of white noise,
@@ -137,47 +98,67 @@ class RegressionProblem:
         return np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
                          for begin, end in zip(edges, edges[1:])])
 
-    # as of `Problem`
+    # what a search needs
 
     @property
     def durations(self) -> list[float]:
+        """Return the length of each log, s."""
         return [each.duration for each in self.replays]
 
     def distorted(self, causes: Sequence[Candidate]) -> tuple[Replay, ...]:
+        """Return the logs with the rate that the gyro senses, distorted by causes."""
         distortions = tuple((each.cause, each.shapes) for each in causes if each.distorts)
         return tuple(_with_distorted_rate(each, distortions) for each in self.replays)
 
     def base_rows(self, logs: tuple[Replay, ...]) -> Array:
+        """Return what is always fitted, and last the residual, whitened, shape (q + 1, m)."""
         residual, rate = _transforms_without_causes(self.replays, logs)
         return np.array([rate, residual]) / self.deviation
 
     def rows(self, candidate: Candidate, logs: tuple[Replay, ...]) -> Array:
+        """Return the columns of a candidate, whitened by the first noise, shape (k, m)."""
         return _transforms(candidate, logs) / self.deviation
 
     def products(self, one: Array, other: Array) -> Array:
+        """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
         return np.tensordot(self.weights, self.band_products(one, other), 1)
 
     def with_white_noise(self) -> RegressionProblem:
+        """Return the problem without a wander of the bias."""
         return replace(self, noise_shapes=self.noise_shapes[:1], weights=self.weights[:1],
                        log_determinants=self.log_determinants[:1])
 
-    def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
-        return np.concatenate(fit.whitened_series(noise_fit))
+    def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
+                       known: Candidate) -> Array | None:
+        """
+        Return by how much a fit predicts held-out stretches better than one without a cause.
 
-    @property
-    def stretches(self) -> tuple[Indices, Indices]:
-        count = max(64 // len(self.replays), 1)
-        return np.concatenate([run * count + np.arange(each.point_count) * count
-                               // each.point_count for run, each in enumerate(self.replays)]
-                              ), np.arange(count * len(self.replays))
-
-    @property
-    def may_repeat_events(self) -> bool:
-        # errors of a response to a command are events of the motion
-        return any(each.command is not None for each in self.replays)
+        In log-likelihood; given the others, the cause is scaled to fit best without each stretch
+        in turn. None for a single event that no other stretch shows: slips, and a step of the bias
+        that a random walk soon hides. Errors of a response to a command are events of the motion.
+        """
+        if known.cause == 'reference_slip':
+            return None
+        count = max(64 // len(self.replays), 1)  # stretches of each log
+        stretch = np.concatenate([run * count + np.arange(each.point_count) * count
+                                  // each.point_count for run, each in enumerate(self.replays)])
+        off, before = (np.concatenate(each.whitened_series(full)) for each in (full, rest))
+        added = before - off
+        score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
+        if (known.log_index is not None and information.max() > 0.5 * information.sum()
+                and self.replays[known.log_index].command is None):
+            return None
+        size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
+        return 0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)
 
     def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
-        # The slow noise of a log may be larger than that of the others.
+        """
+        Return an upper bound of the evidence for one more cause, and a ratio of variances.
+
+        The bound for a single event is by the noise of its log alone, whose slow noise may be
+        larger than that of the others. The ratio is of the variance by the scatter of stretches
+        to that by the noise, at least 1.
+        """
         if len(self.replays) == 1 or candidate.log_index is None or not is_named(candidate):
             return math.inf, 1.0
         own, left = self.replays[candidate.log_index], rest.residuals[candidate.log_index]
@@ -264,7 +245,7 @@ class Value:
 class RegressionFit:
     """A regression with some causes."""
 
-    problem: Any  # the logs and noises, as of `Problem`
+    problem: Any  # the logs and noises, as of `RegressionProblem`
     # the logs with the rate that the gyro senses, distorted by causes
     distorted: tuple[Any, ...]
     causes: tuple[Candidate, ...]  # causes
@@ -559,7 +540,7 @@ def _fit_causes(problem: Any, causes: tuple[Candidate, ...]) -> RegressionFit:
 
 
 @lru_cache(maxsize=32)
-def _shape_derivative(problem: Problem, cause: Candidate, shape_index: int,
+def _shape_derivative(problem: Any, cause: Candidate, shape_index: int,
                       logs: tuple[Any, ...]) -> Array:
     """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
     shape = cause.shapes[shape_index]
@@ -604,7 +585,7 @@ class ColumnGroups:
     of_width: list[tuple[Indices, Indices, Array]]
 
 
-def group_columns(problem: Problem, columns: Array,
+def group_columns(problem: Any, columns: Array,
                   groups: Sequence[Sequence[int]]) -> ColumnGroups:
     """Return groups of whitened columns, shape (p, m)."""
     of_width = []

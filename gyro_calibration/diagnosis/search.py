@@ -19,8 +19,9 @@ that are held out, and if the interval of its size excludes 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 import math
 from typing import Any
@@ -32,7 +33,8 @@ from gyro_calibration.diagnosis.candidates import (
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import OnProgress
 from gyro_calibration.diagnosis.regression import (
-    build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, group_columns,
+    build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, forget_fits,
+    group_columns,
     likelihood_with, RegressionFit, VALUE_PENALTY)
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.scans import (
@@ -71,21 +73,17 @@ def p_value(cause: str, evidence: float) -> float:
     return math.exp(-evidence) if cause in MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """State of a search."""
 
-    problem: Any  # the logs, as of `Problem`
+    problem: Any  # the logs, as of `RegressionProblem`
     candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
     # causes that are scanned for over all frequencies or times -> their candidates, given a fit
     scans: Mapping[str, Callable[[RegressionFit], list[Scored]]]
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
-    # columns_cache, step_cache: caches of columns and of steps, by the named causes
-    columns_cache: dict[tuple[Any, ...], ColumnGroups] = field(default_factory=dict)
-    step_cache: dict[tuple[Any, ...], tuple[Candidate | None, list[Scored]]] = field(
-        default_factory=dict)
     # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
     finds_several: bool = True  # whether several steps are searched for at once
@@ -93,18 +91,21 @@ class Search:
     def candidate_evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
         # for the rate that the gyro senses, with shapes to two digits
-        key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
-                    for each in fit.causes if each.distorts)
-        if key not in self.columns_cache:
-            self.columns_cache.clear()
-            parts = [self.problem.rows(each, fit.distorted) for each in self.candidates]
-            ends = np.cumsum([len(part) for part in parts]).tolist()
-            self.columns_cache[key] = group_columns(
-                self.problem, np.concatenate([fit.rows[:0], *parts]),
-                [range(end - len(part), end) for end, part in zip(ends, parts)])
-        known = self.columns_cache[key]
+        logs = self.problem.distorted([
+            replace(each, shapes=tuple(float(f'{shape:.2g}') for shape in each.shapes))
+            for each in fit.causes if each.distorts])
+        known = _candidate_columns(self.problem, self.candidates, logs)
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in known.groups])
         return column_evidence(fit, known) - penalty
+
+
+@lru_cache(maxsize=2)
+def _candidate_columns(problem: Any, candidates: tuple[Candidate, ...],
+                       logs: tuple[Any, ...]) -> ColumnGroups:
+    parts = [problem.rows(each, logs) for each in candidates]
+    ends = np.cumsum([len(part) for part in parts]).tolist()
+    return group_columns(problem, np.concatenate(parts or [np.empty((0, 1))]), [
+        range(end - len(part), end) for end, part in zip(ends, parts)])
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
@@ -132,24 +133,28 @@ def restrict_search(search: Search, replays: Sequence[Replay], causes: Collectio
                     rate: float) -> Search:
     """Return a silent search for some causes in other parts of the logs, at another rate."""
     return replace(search, problem=build_problem(replays), rate=rate,
-                   columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
+                   on_progress=lambda share, words: None,
                    scans={each: scan for each, scan in search.scans.items() if each in causes},
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
 
 
+def forget_searches() -> None:
+    """Release the columns and fits that searches keep for the next ones."""
+    for kept in (_candidate_columns, _find_strongest):
+        kept.cache_clear()
+    forget_fits()
+
+
 # one more cause
 
-def _find_strongest(search: Search, causes: Sequence[Candidate],
-                    ) -> tuple[Candidate | None, list[Scored]]:
+@lru_cache(maxsize=32)
+def _find_strongest(search: Search, causes: Causes) -> tuple[Candidate | None, list[Scored]]:
     """
     Search for one more cause.
 
     Return the best cause, None if none is significant, and all that were refined with their
     log-likelihoods, the best first; if none is significant, those that are suspected.
     """
-    key = tuple((each.cause, each.log_index, *each.shapes) for each in causes)
-    if key in search.step_cache:
-        return search.step_cache[key]
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit)
     significant = [each for each, evidence in first
@@ -173,7 +178,6 @@ def _find_strongest(search: Search, causes: Sequence[Candidate],
         best = next((each for each, score in steps if p_value(each.cause, min(
             score - fit.log_likelihood, search.problem.robust_evidence(fit, each)[0]))
             < search.rate), None)
-    search.step_cache[key] = best, steps
     return best, steps
 
 
@@ -257,7 +261,7 @@ def search_causes(search: Search) -> Causes:
         return everything
     # without generic terms nothing tells a part from another structure in time
     named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates)),
-                                    columns_cache={}, step_cache={}, finds_several=False))
+                                    finds_several=False))
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
                    complexity_penalty(each)
@@ -289,8 +293,7 @@ def _with_several(search: Search, causes: Causes) -> Causes:
         return ()
     problem, grown, tried = search.problem, causes, []
     white = replace(
-        search, columns_cache={}, step_cache={}, scans={},
-        candidates=tuple(filter(_is_lasting, search.candidates)),
+        search, scans={}, candidates=tuple(filter(_is_lasting, search.candidates)),
         problem=problem.with_white_noise())
     while len(grown) < MAX_CAUSES:
         step, evidence = max(search.scans['bias_step'](fit_causes(white.problem, grown)),
@@ -456,6 +459,22 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
     return Selection(named, alternatives, unnamed, suspected)
 
 
+def explain_selection(search: Search, selection: Selection
+                      ) -> Iterator[tuple[Causes, int, float, Mapping[str, float]]]:
+    """
+    Give the causes of a selection, the named ones first, then those that are suspected.
+
+    Each is given as its place among all causes, with its evidence given the others and its
+    alternatives.
+    """
+    causes = (*selection.named, *selection.unnamed)
+    for place, deficits in enumerate(selection.alternatives):
+        yield causes, place, evidence_for(search, causes, place), deficits
+    for known in selection.suspected:
+        every = refine_jointly(search, (*causes, known))
+        yield every, len(causes), evidence_for(search, every, len(causes)), {}
+
+
 def _remove_unconfirmed(search: Search, causes: Causes,
                         unnamed: Causes) -> tuple[Causes, Causes]:
     """
@@ -488,30 +507,12 @@ def _remove_unconfirmed(search: Search, causes: Causes,
 
 
 def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
-    """
-    Return the gain of each cause on held-out stretches in standard deviations.
-
-    Given the others, it is scaled to fit best without each fold in turn. No other stretch
-    shows a single event: slips, and a step of the bias that a random walk soon hides.
-    """
-    problem = search.problem
-    full, found = fit_causes(problem, causes), []
-    off, (stretch, fold) = problem.whitened(full, full), problem.stretches
+    """Return the gain of each cause on held-out stretches in standard deviations."""
+    full, found = fit_causes(search.problem, causes), []
     for place, known in enumerate(causes):
-        if known.cause == 'reference_slip':
-            found.append(math.inf)
-            continue
-        before = problem.whitened(fit_causes(problem, _without(causes, place)), full)
-        added = before - off
-        score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
-        if (known.log_index is not None and information.max() > 0.5 * information.sum()
-                and not problem.may_repeat_events):
-            found.append(math.inf)
-            continue
-        score, known_there = (np.bincount(fold, each)[fold] for each in (score, information))
-        size = 1.0 - score / np.maximum(information.sum() - known_there, 1e-300)
-        found.append(prediction_sigmas(
-            0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
+        rest = fit_causes(search.problem, _without(causes, place))
+        gains = search.problem.held_out_gains(full, rest, known)
+        found.append(math.inf if gains is None else prediction_sigmas(gains))
     return found
 
 

@@ -48,7 +48,7 @@ _SIZES, _STEP_TIMES = 8, 400
 
 @dataclass(frozen=True, eq=False)
 class SpanProblem:
-    """A log as spans, a `Problem` of the search, under each size of a wander of the bias."""
+    """A log as spans, as a `RegressionProblem`, under each size of a wander of the bias."""
 
     spans: Spans  # with the rate as corrected so far
     noise: GridFit  # of gyro and reference, which whitens
@@ -88,7 +88,7 @@ class SpanProblem:
         return np.asarray(self.deviations[:, :, None] * np.linalg.inv(self._scaled)
                           * self.deviations[:, None])
 
-    # as of `Problem`
+    # as of `RegressionProblem`
 
     @cached_property
     def log_determinants(self) -> Array:
@@ -115,32 +115,36 @@ class SpanProblem:
     def with_white_noise(self) -> SpanProblem:
         return replace(self, deviations=self.deviations[:1])
 
-    def whitened(self, fit: RegressionFit, noise_fit: RegressionFit) -> Array:
-        best = noise_fit.best_noise
-        left = fit.rows[-1] - fit.estimates[0] @ fit.columns
-        sizes = self._reduction[best] @ (self.wander @ left)
-        return np.append(left - sizes @ self.wander, sizes / self.deviations[best]) * math.sqrt(
-            noise_fit.degrees_of_freedom / noise_fit.residual_squares[best])
+    def _with_wander(self, rows: Array, noise: int) -> tuple[Array, Array]:
+        """Return rows, shape (k, m), and the wander with its prior under a noise, (w, m + w)."""
+        prior = np.diag(1.0 / self.deviations[noise])
+        return np.pad(rows, ((0, 0), (0, len(prior)))), np.hstack([self.wander, prior])
 
-    @property
-    def stretches(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
+                       known: Candidate) -> Array | None:
+        # all values are fitted without each of five parts of the log, or of its stretches: errors
+        # of a course are correlated, so that distant stretches must be predicted
+        if known.log_index is not None:
+            return None
         stretch, count = self.data.clusters[0], self.data.stretch_count
-        every = np.arange(stretch.max() + 1)
-        # errors of a course are correlated, so that distant stretches must be predicted
-        return stretch, every if self.spans.treatment.is_fine else np.where(
-            every < count, every * 5 // count, every)
-
-    @property
-    def may_repeat_events(self) -> bool:
-        return False
+        fold = stretch % 5 if self.spans.treatment.is_fine else stretch * 5 // count
+        losses = []
+        for fit in (rest, full):
+            rows, wander = self._with_wander(fit.rows, full.best_noise)
+            design, observed = np.vstack([rows[:-1], wander]).T, rows[-1]
+            left: Array = np.zeros(len(observed))
+            for held in (np.equal(fold, part) & (stretch < count) for part in range(5)):
+                values = np.linalg.lstsq(design[~held], observed[~held], rcond=None)[0]
+                left[held] = observed[held] - design[held] @ values
+            losses.append(0.5 * np.bincount(stretch, left ** 2)[:count])
+        return np.asarray(losses[0] - losses[1])
 
     def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
         # the noise without a slow cause has its wander
         best, count = fit_causes(self, [*rest.causes, candidate]).best_noise, len(self.wander)
-        rows = np.pad(np.vstack([rest.columns, self.rows(candidate, rest.distorted),
-                                 rest.rows[-1]]), ((0, 0), (0, count)))
+        rows, wander = self._with_wander(np.vstack([
+            rest.columns, self.rows(candidate, rest.distorted), rest.rows[-1]]), best)
         given, sought = np.split(rows, [len(rest.columns)])
-        wander = np.hstack([self.wander, np.diag(1.0 / self.deviations[best])])
         base, _ = np.linalg.qr(np.vstack([given, wander]).T)
         left = sought.T - base @ (base.T @ sought.T)
         # along the motion they are similar to errors of an encoder that repeat with its position
