@@ -42,7 +42,7 @@ from gyro_calibration.diagnosis.findings import (
     TIME_LIMIT_REMARK)
 from gyro_calibration.diagnosis.regression import fit_causes, Value
 from gyro_calibration.diagnosis.search import (
-    confirm_causes, explain_selection, held_out_sigmas, p_value, Search, search_causes)
+    confirm_causes, explain_selection, p_value, Search, search_causes)
 from gyro_calibration.diagnosis.significance import (
     detectable_sigmas, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.span_problem import (
@@ -231,8 +231,6 @@ def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Findin
            else fit_spans(spans, [*extended.causes, term]))
     places, effect, shapes = fit.value_slice(term), CATALOGUE.get(term.cause), {}
     values, covariance = fit.values[places], fit.normal_covariance[places, places]
-    evidence = ({} if term.is_single_event else {
-        'evidence': f'it predicts held-out stretches better by {found.sigmas:.1f} sigma'})
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
@@ -247,7 +245,7 @@ def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Findin
         found.deficits, found.is_established, observed_range(
             [np.asarray(spans.channels.rate)], [each for each in [log.temperature]
                                                 if each is not None], float(spans.time[-1])),
-        detectable_sigmas(level), **evidence,
+        detectable_sigmas(level),
         where=(term.shapes[0], float(spans.time[-1])) if term.is_single_event else None,
         remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
 
@@ -424,7 +422,6 @@ class FoundCause:
 
     cause_term: CauseTerm  # the cause
     p_value: float  # that noise alone shows as much
-    sigmas: float  # by which it predicts held-out stretches better
     is_established: bool  # whether it is confirmed
     # what it and its alternatives lack in log-likelihood, the best first
     deficits: Mapping[str, float]
@@ -484,7 +481,7 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
         known = causes[place]
         found.append(FoundCause(
             CauseTerm(known.cause, known.shapes), p_value(known.cause, evidence),
-            held_out_sigmas(search, causes)[place], len(found) < len(selection.named), deficits,
+            len(found) < len(selection.named), deficits,
             next(iter(fit_causes(search.problem, causes).shapes(place).values()), None)))
     while established := [each.cause_term for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)

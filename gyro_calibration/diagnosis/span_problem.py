@@ -35,6 +35,7 @@ from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.regression import (
     column_evidence, fit_causes, group_columns, RegressionFit)
 from gyro_calibration.diagnosis.scans import best_steps, Scored
+from gyro_calibration.diagnosis.significance import prediction_sigmas
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import SINE_RESPONSE
 import numpy as np
@@ -122,22 +123,25 @@ class SpanProblem:
 
     def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
                        known: Candidate) -> Array | None:
-        # all values are fitted without each of five parts of the log, or of its stretches: errors
-        # of a course are correlated, so that distant stretches must be predicted
+        # all values are fitted without each fifth of the log, or every fifth stretch, where slow
+        # causes are also predicted by the wander of neighbouring ones; errors of a course are
+        # correlated, so that distant stretches must be predicted
         if known.log_index is not None:
             return None
         stretch, count = self.data.clusters[0], self.data.stretch_count
-        fold = stretch % 5 if self.spans.treatment.is_fine else stretch * 5 // count
-        losses = []
-        for fit in (rest, full):
-            rows, wander = self._with_wander(fit.rows, full.best_noise)
-            design, observed = np.vstack([rows[:-1], wander]).T, rows[-1]
-            left: Array = np.zeros(len(observed))
-            for held in (np.equal(fold, part) & (stretch < count) for part in range(5)):
-                values = np.linalg.lstsq(design[~held], observed[~held], rcond=None)[0]
-                left[held] = observed[held] - design[held] @ values
-            losses.append(0.5 * np.bincount(stretch, left ** 2)[:count])
-        return np.asarray(losses[0] - losses[1])
+        gains = []
+        for fold in [stretch * 5 // count, stretch % 5][:1 + self.spans.treatment.is_fine]:
+            losses = []
+            for fit in (rest, full):
+                rows, wander = self._with_wander(fit.rows, full.best_noise)
+                design, observed = np.vstack([rows[:-1], wander]).T, rows[-1]
+                left: Array = np.zeros(len(observed))
+                for held in (np.equal(fold, part) & (stretch < count) for part in range(5)):
+                    values = np.linalg.lstsq(design[~held], observed[~held], rcond=None)[0]
+                    left[held] = observed[held] - design[held] @ values
+                losses.append(0.5 * np.bincount(stretch, left ** 2)[:count])
+            gains.append(losses[0] - losses[1])
+        return max(gains, key=prediction_sigmas)
 
     def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
         # the noise without a slow cause has its wander
