@@ -370,42 +370,26 @@ class WhitenedRegression:
     # numbers of the stretch of each row, and, of an encoder, of the place of the shaft
     clusters: tuple[NDArray[np.intp], ...]
     stretch_count: int  # number of stretches of the log; those after them are priors
-    cosines: slice  # of the clusters, those of the cosines of the wandering bias
-    noise: GridFit  # that whitens
-
-    def whiten_columns(self, columns: Array) -> Array:
-        """Return more columns, shape (n + r, k), in units of the noise, (n + r + m, k)."""
-        more = len(self.observed) - len(columns)
-        return np.pad(self.noise.whiten(columns), ((0, more), (0, 0)))
 
 
-def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: SpanFit | None = None,
-                      use_max_random_walk: bool = False) -> WhitenedRegression:
-    """
-    Return the regression of a log on causes, under the noise of a fit of the same log.
-
-    The random walk may be its upper 95 % limit, as slow bias wander may pass for a cause
-    otherwise.
-    """
+def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm],
+                      noise_fit: SpanFit | None = None) -> WhitenedRegression:
+    """Return the regression of a log on causes, under the noise of a fit of the same log."""
     spans, noise = fit.spans, (noise_fit or fit).fit
     waves, shared = spans.bias_wander()
     variance: Array = np.zeros(waves.shape[1])
     for part in shared:
-        use_max = use_max_random_walk and part.name == 'rate_random_walk'
-        size = noise.sizes[part.name][2] if use_max else noise.likeliest_sizes[part.name]
-        variance += size ** 2 * part.variance
+        variance += noise.likeliest_sizes[part.name] ** 2 * part.variance
     columns = np.column_stack([design_matrix(spans, causes), waves])
     deviation = np.append(spans.prior_deviations(causes), np.sqrt(variance))
     prior = np.diag(1.0 / deviation)[np.isfinite(deviation)]
-    first = -waves.shape[1]
-    cosines = slice(first, (first + np.count_nonzero(shared[0].variance)) or None)
     stretches = spans.stretch_numbers
     sectors = [spans.shaft_sectors] if spans.uses_code_changes else []
     clusters = tuple(np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
                      for each in (stretches, *sectors))
     return WhitenedRegression(np.append(noise.whiten(spans.observed), np.zeros(len(prior))),
                               np.concatenate([noise.whiten(columns), prior]), clusters,
-                              int(stretches.max()) + 1, cosines, noise)
+                              int(stretches.max()) + 1)
 
 
 def fit_course(spans: Spans) -> ScaleBiasFit:

@@ -137,7 +137,7 @@ _CLOCK_TERM, DRIFT_TERM, MISALIGNMENT_TERM = map(
     CauseTerm, ('clock_rate', 'reference_drift', 'axis_misalignment'))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Spans:
     """One log as n spans between n + 1 points, and r rests."""
 

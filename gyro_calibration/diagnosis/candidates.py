@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
 import math
+from typing import Any
 
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.heading.integration import integrate
@@ -44,8 +45,8 @@ MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 _UNNAMED_PREFIX = '~'
 PART_OF_LOG = f'{_UNNAMED_PREFIX}rate and time'
 
-#: Columns of one log: (replay) -> arrays of shape (n,); and a variable that they are of.
-_ColumnFunction = Callable[[Replay], Sequence[Array]]
+#: Columns of one log: (replay, *shapes) -> arrays of shape (n,); and a variable that they are of.
+_ColumnFunction = Callable[..., Sequence[Array]]
 _Variable = Callable[[Replay], Array]
 
 
@@ -55,7 +56,7 @@ class Candidate:
 
     cause: str  # its name
     shapes: tuple[float, ...]  # their values, in the order of the effect
-    columns: _ColumnFunction  # of a log
+    function: _ColumnFunction  # of a log and the shapes
     # number of the log for a single event; None for a cause in all logs
     log_index: int | None = None
     # fixed coefficient of its column if only shapes are fitted; None if it is free
@@ -66,6 +67,16 @@ class Candidate:
     # coefficients of its columns; empty before a fit, and its shapes are then fixed
     values: tuple[float, ...] = ()
     penalty: float = 0.0  # penalty for the choice of its first shapes, in log-likelihood
+
+    def columns(self, log: Any) -> Sequence[Array]:
+        """Return its columns of a log."""
+        return self.function(log, *self.shapes)
+
+    @property
+    def distorts(self) -> bool:
+        """Tell whether it distorts the rate before errors are added to it."""
+        return (self.amplitude is not None and self.cause in CATALOGUE
+                and CATALOGUE[self.cause].stage == 'rate')
 
 
 def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
@@ -80,18 +91,17 @@ def effect_candidate(name: str, *shapes: float, log_index: int | None = None,
                      half_width: float | None = None) -> Candidate:
     """Return the candidate of an effect of the gyro, or of the reference."""
     if name in _REFERENCE_EFFECTS:
-        columns = _REFERENCE_EFFECTS[name]
-        return Candidate(name, shapes, lambda each: columns(each, *shapes), log_index)
+        return Candidate(name, shapes, _REFERENCE_EFFECTS[name], log_index)
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
         # change of the rate by a delay, a lag, a clock rate or a limit
-        def rate_change(each: Replay) -> Sequence[Array]:
+        def rate_change(each: Replay, *sizes: float) -> Sequence[Array]:
             rate = each.channels.rate
-            return (distortion(rate, each.channels.time, *shapes) - rate,)
+            return (distortion(rate, each.channels.time, *sizes) - rate,)
         return Candidate(name, shapes, rate_change, log_index, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
-    return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), log_index,
-                     amplitude, half_width)
+    return Candidate(name, shapes, lambda each, *sizes: known.columns(each.channels, *sizes),
+                     log_index, amplitude, half_width)
 
 
 def gaussian_pulse(time: Array, middle: float, width: float) -> Array:
@@ -131,18 +141,7 @@ def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidat
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
     shapes = (*candidate.shapes[:shape_index], value, *candidate.shapes[shape_index + 1:])
-    moved = (_part_of_log(*shapes) if candidate.cause == PART_OF_LOG
-             else effect_candidate(candidate.cause, *shapes))
-    return replace(moved, log_index=candidate.log_index, half_width=candidate.half_width,
-                   penalty=candidate.penalty)
-
-
-def depends_on_rate(candidate: Candidate) -> bool:
-    """Tell whether the columns of a candidate depend on the rate that the gyro senses."""
-    if not is_named(candidate):
-        return bool({'rate', 'rate_change'} & {*unnamed_variable(candidate).split(' and ')})
-    effect = CATALOGUE.get(candidate.cause)
-    return effect is None or effect.distortion is not None or 'rate' in effect.inputs
+    return replace(candidate, shapes=shapes, values=())
 
 
 def common_channels(replays: Sequence[Replay]) -> frozenset[str]:
@@ -276,7 +275,7 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give the generic terms that these logs may show."""
     def unnamed(name: str, columns: Callable[..., Sequence[Array]], *variables: _Variable,
                 shapes: tuple[float, ...] = (), log_index: int | None = None) -> Candidate:
-        return Candidate(_UNNAMED_PREFIX + name, shapes, lambda each: columns(
+        return Candidate(_UNNAMED_PREFIX + name, shapes, lambda each, *_: columns(
             *(of(each) for of in variables)), log_index)
 
     def heading(each: Replay) -> Array:
@@ -334,8 +333,8 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
         if 'rate' in variables:
             for part in combinations(begin + duration * np.linspace(0.0, 1.0, ends_count), 2):
                 if part[1] - part[0] < 0.99 * duration:
-                    yield replace(_part_of_log(*part), log_index=run,
-                                  half_width=duration / (ends_count - 1))
+                    yield Candidate(PART_OF_LOG, part, _part_of_log, run,
+                                    half_width=duration / (ends_count - 1))
         for width in _BUMP_WIDTHS:
             number = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + duration * np.linspace(0.0, 1.0, number)[1:-1]:
@@ -355,6 +354,6 @@ def _bump(middle: float, width: float, time: Array) -> Sequence[Array]:
     return (np.exp(-0.5 * ((time - middle) / width) ** 2),)
 
 
-def _part_of_log(first: float, last: float) -> Candidate:
-    return Candidate(PART_OF_LOG, (first, last), lambda each: (each.channels.rate * (
-        (each.channels.time >= first) & (each.channels.time < last)),))
+def _part_of_log(each: Replay, first: float, last: float) -> Sequence[Array]:
+    time = each.channels.time
+    return (each.channels.rate * ((time >= first) & (time < last)),)

@@ -45,13 +45,13 @@ from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_referen
 from gyro_calibration.diagnosis.reference_lag import (
     follow_reference, follows_rate, HIDDEN_CAUSES, is_late)
 from gyro_calibration.diagnosis.regression import (
-    average_filtered_noise, build_problem, fit_causes, forget_fits, is_single_event, RegressionFit,
-    SMOOTHED_RATIO, Value)
+    average_filtered_noise, build_problem, complexity_penalty, fit_causes, is_single_event,
+    RegressionFit, SMOOTHED_RATIO, Value)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, model_residuals, residual_curves)
 from gyro_calibration.diagnosis.search import (
-    complexity_penalty, confirm_causes, evidence_for, evidence_threshold, p_value, refine_jointly,
+    confirm_causes, evidence_for, evidence_threshold, explain_selection, forget_searches, p_value,
     refine_shape, Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.significance import (
     DETECTION_POWER, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
@@ -137,16 +137,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         raise DataRefused(
             f'the errors of the reference of {where} are larger than those of the gyro, and such '
             'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
-    if limiting_logs:
-        found = diagnose_by_noisy_reference(logs[0], references[0], model, FALSE_ALARM_RATE,
-                                            on_progress, instants[0])
-    else:
-        try:
-            found = _diagnose_by_exact_reference(
-                logs, generator, model, FALSE_ALARM_RATE, names, on_progress,
-                references, reference_kind == 'rate_command')
-        finally:
-            forget_fits()
+    try:
+        found = (diagnose_by_noisy_reference(logs[0], references[0], model, FALSE_ALARM_RATE,
+                                             on_progress, instants[0])
+                 if limiting_logs else _diagnose_by_exact_reference(
+                     logs, generator, model, FALSE_ALARM_RATE, names, on_progress, references,
+                     reference_kind == 'rate_command'))
+    finally:
+        forget_searches()
     found = _keep_unextended_model(found, given_model)
     findings = found.findings if len(logs) > 1 else mark_parts_of_log(found.findings)
     return complete_diagnosis(replace(
@@ -385,17 +383,15 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
 
     A cause that is not significant where the noise has a random walk of any size may be that.
     """
-    causes = (*fit.causes, *selection.unnamed)
     walking = replace(search, problem=search.problem.with_random_walks())
-    for place, deficits in enumerate(selection.alternatives):
-        by_walk = p_value(causes[place].cause, evidence_for(walking, causes, place)) >= search.rate
-        yield _cause_finding(search, fit, place, evidence_for(search, causes, place), deficits,
-                             ['rate_random_walk'] * by_walk)
-    for known in selection.suspected:
-        everything = refine_jointly(search, (*fit.causes, *selection.unnamed, known))
-        place = len(everything) - 1
-        yield _cause_finding(search, fit_causes(search.problem, everything), place,
-                             evidence_for(search, everything, place), {}, is_established=False)
+    for place, (causes, number, evidence, deficits) in enumerate(
+            explain_selection(search, selection)):
+        is_established = place < len(selection.named)
+        by_walk = is_established and p_value(
+            causes[number].cause, evidence_for(walking, causes, number)) >= search.rate
+        yield _cause_finding(search, fit if is_established else fit_causes(search.problem, causes),
+                             number, evidence, deficits, ['rate_random_walk'] * by_walk,
+                             is_established)
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:

@@ -11,31 +11,25 @@
 """
 The diagnosis of a log whose reference has errors of its own, such as a course over ground.
 
-The score of a candidate is summed over stretches. Its variance is that by the noise or that by the
-scatter of the stretches, whichever is larger, and its distribution is Student's, with the
-effective number of stretches less one as the degrees of freedom. The p-value of the best candidate
-is that of a single one times their number. A cause is established if it is also selected without
-each fold, and predicts the stretches of the folds better than no cause; otherwise it is suspected.
-Steps of the bias are searched for at all times.
+Causes are searched for as beside an exact reference, under the noise of gyro and reference that is
+found with a column of each cause, and under any wander of the bias. The evidence is at most that
+by the scatter of stretches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 import math
-from typing import NamedTuple
 
 from gyro_calibration.calibration.heading_regression import (
-    effective_clusters, fit_spans, MIN_STRETCHES, SpanFit, whiten_regression, WhitenedRegression)
+    fit_spans, MIN_STRETCHES, SpanFit, whiten_regression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.calibration.spans import (
-    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
-    Spans)
+    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM)
 from gyro_calibration.diagnosis.candidates import (
-    lasting_shapes, MAX_STEP_TIME_LACK, MIN_CHANNEL_RANGE, observed_range)
+    indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
     Cause, cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, sized_finding,
     untestable_causes, value_finding)
@@ -46,21 +40,19 @@ from gyro_calibration.diagnosis.extended_model import (
 from gyro_calibration.diagnosis.findings import (
     Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress, Reference,
     TIME_LIMIT_REMARK)
-from gyro_calibration.diagnosis.search import MAX_CAUSES
+from gyro_calibration.diagnosis.regression import fit_causes, Value
+from gyro_calibration.diagnosis.search import (
+    confirm_causes, explain_selection, p_value, Search, search_causes)
 from gyro_calibration.diagnosis.significance import (
-    detectable_sigmas, MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT,
-    SEARCH_ALARM_SHARE, SUSPECTED_RATE_FACTOR, VALUE_ALARM_SHARE)
+    detectable_sigmas, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
+from gyro_calibration.diagnosis.span_problem import (
+    find_span_steps, span_candidate, SpanProblem)
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize_scalar
-from scipy.special import softmax
-from scipy.stats import f as fisher
-from scipy.stats import t as student
 
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
@@ -74,14 +66,12 @@ _REFERENCE_PHRASES = {
 _METHOD_TEXT = (
     'The heading by {} was compared with the integral of the output over spans of a second or '
     'more, under noise of gyro and reference that was found together with the causes. A cause is '
-    'established if its evidence holds beyond the scatter between stretches, and if choice and '
-    'fit on some stretches predict the others; else it is suspected. Only established causes are '
+    'established if its evidence holds beyond the scatter between stretches, and if its size on '
+    'some stretches predicts the others; else it is suspected. Only established causes are '
     'in the model. Intervals are of 95 %.')
 #: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropped_samples',
                   'unit_error', 'quantization', 'saturation'}
-#: Correlation of the columns of two steps of the bias above which spans do not distinguish them.
-_MAX_ALIKENESS = 0.999
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
@@ -241,55 +231,23 @@ def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Findin
            else fit_spans(spans, [*extended.causes, term]))
     places, effect, shapes = fit.value_slice(term), CATALOGUE.get(term.cause), {}
     values, covariance = fit.values[places], fit.normal_covariance[places, places]
-    evidence = {'evidence': f'it adds {found.prediction_gain:.1f} to the log-likelihood of '
-                'held-out stretches, and is selected in '
-                f'{100.0 * found.selection_share:.0f} % of the folds'}
-    if term.is_single_event:
-        evidence = {}
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
         values, covariance = values[1:], covariance[1:, 1:]
-    elif term.cause == 'bias_step':
-        by_time, shapes['step_time'] = _step_time(fit, term)
-        covariance = covariance + by_time
-    elif found.shape_interval is not None and effect is not None:
+    elif found.shape is not None and effect is not None:
         shape, = effect.nonlinear_parameters
-        shapes[shape.name] = Estimate(term.shapes[0], found.shape_interval, shape.unit)
+        shapes[shape.name] = Estimate.from_half_width(
+            term.shapes[0], NORMAL_QUANTILE_975 * found.shape.deviation, shape.unit)
     log = spans.log
     return cause_finding(
         term.cause, cause_parameters(term.cause, values, covariance, shapes), found.p_value,
         found.deficits, found.is_established, observed_range(
             [np.asarray(spans.channels.rate)], [each for each in [log.temperature]
                                                 if each is not None], float(spans.time[-1])),
-        detectable_sigmas(level), **evidence,
+        detectable_sigmas(level),
         where=(term.shapes[0], float(spans.time[-1])) if term.is_single_event else None,
         remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
-
-
-def _step_time(fit: SpanFit, term: CauseTerm) -> tuple[float, Estimate]:
-    """Return the variance of the size of a step by its time, and that time."""
-    place = fit.value_slice(term).start
-    inflation = float(fit.covariance[place, place] / fit.fit.covariance[place, place])
-    data = whiten_regression(fit, [each for each in fit.causes if each != term])
-    times = fit.spans.time[2:-2]
-    times = times[::max(len(times) // 200, 1)]
-    for _ in range(2):
-        times = np.unique(np.append(times, term.shapes))
-        gains, sizes = _step_gains(fit, data, times)
-        index = int(np.searchsorted(times, term.shapes[0]))
-        lack = (gains[index] - gains) / inflation
-        # the times around that of the step, and then between its neighbours
-        outside = np.flatnonzero(lack > MAX_STEP_TIME_LACK)
-        after = np.searchsorted(outside, index)
-        first = outside[after - 1] if after > 0 else 0
-        last = outside[after] if after < len(outside) else len(times) - 1
-        interval = float(times[first]), float(times[last])
-        inside = slice(first, last + 1)
-        weights = softmax(-lack[inside])
-        variance = float(weights @ (sizes[inside] - weights @ sizes[inside]) ** 2)
-        times = np.linspace(*interval, 100)
-    return variance, Estimate(term.shapes[0], interval, 's')
 
 
 def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
@@ -458,28 +416,16 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
 
 # the search
 
-class Evidence(NamedTuple):
-    """Evidence for a term."""
-
-    chance: float  # p-value of it alone
-    gain: float  # in log-likelihood
-    stretches: float  # effective number of stretches
-    # variance by the scatter of the stretches relative to that by the noise, at least 1
-    variance_ratio: float
-
-
 @dataclass(frozen=True)
 class FoundCause:
     """A cause that the search found."""
 
     cause_term: CauseTerm  # the cause
-    p_value: float  # of the best of all candidates in noise, cluster-robust
-    prediction_gain: float  # gain in log-likelihood on held-out stretches
-    selection_share: float  # share of the folds in which the same cause was selected
+    p_value: float  # that noise alone shows as much
     is_established: bool  # whether it is confirmed
     # what it and its alternatives lack in log-likelihood, the best first
     deficits: Mapping[str, float]
-    shape_interval: tuple[float, float] | None = None  # of 95 %; None if no shape was fitted
+    shape: Value | None = None  # None if no shape was fitted
 
 
 def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
@@ -510,43 +456,35 @@ def _follows_the_rate(cause: str) -> bool:
 
 def select_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
-    """Add one cause after the other, each cross-fitted, and fit again with those established."""
-    fit_with = cache(lambda *causes: fit_spans(fit.spans, causes))
-    steps = _find_steps(fit, fit_with, (), false_alarm_rate)
-    found, candidates = list(steps), _propose_terms(fit)
+    """Search for causes, and fit again with those that are established."""
+    terms = _propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in candidates if each.cause != SINE_RESPONSE.name}
-    rich = [*columns.values(), *(each.cause_term for each in steps)]
+    rich = [*{each.cause: each for each in terms if each.cause != SINE_RESPONSE.name}.values()]
     # of a log with fewer spans than columns, the noise is that without them
-    rich_fit = (fit_with(*rich)
-                if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
-    while len(found) < MAX_CAUSES:
-        found_terms = [each.cause_term for each in found]
-        names = {each.cause for each in found_terms}
-        if on_progress(None, f'search for causes, {len(found)} found'):
+    noise_fit = (fit_spans(fit.spans, rich)
+                 if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
+    candidates, at = tuple(span_candidate(each.cause, *each.shapes) for each in terms), fit
+    for _ in range(2):
+        search = Search(SpanProblem.of(at, noise_fit), candidates,
+                        false_alarm_rate / (1 + len(indices_by_cause(candidates))),
+                        {'bias_step': find_span_steps}, on_progress=on_progress)
+        causes = search_causes(search)
+        # once more, at the rate without these causes: similar ones differ in higher order
+        of_rate = [CauseTerm(each.cause, each.shapes) for each in causes
+                   if _follows_the_rate(each.cause) and each.cause != 'clock_rate']
+        if not of_rate:
             break
-        at = fit
-        for _ in range(2):
-            data = whiten_regression(at, found_terms, rich_fit, use_max_random_walk=True)
-            remaining = [fitted for each in candidates if each.cause not in names
-                         for fitted in _fit_shape(at.spans, data, each)]
-            best = _find_best_cause(at.spans, data, remaining, false_alarm_rate)
-            if best is None or 'rate' not in getattr(CATALOGUE.get(best.cause_term.cause),
-                                                     'inputs', ()):
-                break
-            # once more, at the rate without this cause: similar ones differ in higher order
-            at = fit_with(*found_terms, best.cause_term)
-        if best is None:
-            break
-        found.append(best)
-    found = [each for each in found if each.prediction_gain > 0.0]
-    causes = [each for each in found if each not in steps]
-    if causes:
-        # a step may have been part of another cause, or have been hidden by it
-        found = causes + _find_steps(fit, fit_with, [
-            each.cause_term for each in causes if each.is_established], false_alarm_rate)
+        at = fit_spans(fit.spans, of_rate)
+    found: list[FoundCause] = []
+    selection = confirm_causes(search, causes)
+    for causes, place, evidence, deficits in explain_selection(search, selection):
+        known = causes[place]
+        found.append(FoundCause(
+            CauseTerm(known.cause, known.shapes), p_value(known.cause, evidence),
+            len(found) < len(selection.named), deficits,
+            next(iter(fit_causes(search.problem, causes).shapes(place).values()), None)))
     while established := [each.cause_term for each in found if each.is_established]:
-        extended = fit_with(*established)
+        extended = fit_spans(fit.spans, established)
         worst = max(established,
                     key=lambda each: _implausibility(extended, each, false_alarm_rate))
         if _implausibility(extended, worst, false_alarm_rate) < 1.0:
@@ -554,131 +492,6 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
         found = [replace(each, is_established=each.is_established and each.cause_term != worst)
                  for each in found]
     return fit, found
-
-
-def _fit_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm) -> list[CauseTerm]:
-    """Return a term, that of a sine response with the k for the amplitude 1; none without one."""
-    if term.cause != SINE_RESPONSE.name:
-        return [term]
-    # beyond a quarter of a wave the output would fall while the rate increases
-    largest = 0.5 * math.pi / float(np.abs(spans.channels.rate).max())
-    for _ in range(20):  # each of which multiplies its error
-        column, left = _given_design(data, data.whiten_columns(spans.cause_columns(term)))
-        square = float(np.sum(column ** 2))
-        amplitude = float(left @ column[:, 0]) / square if square > 0.0 else 0.0
-        shape = _shape_of_sine(term, amplitude)[0]
-        if not SINE_RESPONSE.parameters[0].bounds[0] < shape < largest:
-            break
-        term = CauseTerm(term.cause, (shape,))
-        if abs(amplitude - 1.0) < 1e-3:
-            return [term]
-    return []
-
-
-def _find_steps(fit: SpanFit, fit_with: Callable[..., SpanFit], causes: Sequence[CauseTerm],
-                false_alarm_rate: float) -> list[FoundCause]:
-    """
-    Return the steps of the bias given some causes, at most three.
-
-    A step is tried at each point, and around the best of them; first also two at once. The noise
-    is fitted again with the steps, so that a random walk that they had caused does not hide them,
-    and one that the log has is not a step. Of three steps those that are not significant are
-    removed, the weakest first. A step beside a fine reference that too few stretches show is
-    suspected.
-    """
-    times = fit.spans.time[2:-2]
-    every = max(len(times) // 200, 1)
-    likely = math.log(2.0 * len(times))
-    steps: list[CauseTerm] = []
-
-    def given_noise(others: Sequence[CauseTerm]) -> WhitenedRegression:
-        """Return the regression on causes and other steps, under the noise with them."""
-        with_steps = fit_with(*causes, *others) if causes or others else fit
-        return whiten_regression(with_steps, with_steps.causes)
-
-    def refined(data: WhitenedRegression, place: int) -> tuple[CauseTerm, float]:
-        """Return the best step around one of the times, and its gain."""
-        # in a gap between two points, such as a rest of an encoder, the time matters too
-        begin, end = max(place - every, 0), min(place + every, len(times) - 1)
-        near = np.linspace(times[begin], times[end], 20 * (end - begin) + 1)
-        gains = _step_gains(fit, data, near)[0]
-        return CauseTerm('bias_step', (float(near[gains.argmax()]),)), float(gains.max())
-
-    while len(steps) < 3:
-        data = given_noise(steps)
-        step, gain = refined(data, every * int(np.argmax(
-            _step_gains(fit, data, times[::every])[0])))
-        by_two, pair = (gain, (0, 0)) if steps else _best_pair(fit, data, times[::every])
-        # one is tried in any case beside a fine reference: a random walk may have hidden it
-        if max(gain, by_two - likely) < likely - math.log(false_alarm_rate) and (
-                steps or not fit.spans.treatment.is_fine):
-            break
-        if gain >= by_two - likely:
-            steps.append(step)
-            continue
-        # one step explains little of a bias that differs in a part of a log
-        steps = [CauseTerm('bias_step', (float(times[every * place]),)) for place in pair]
-        for number, place in enumerate(pair):
-            steps[number] = refined(given_noise([steps[1 - number]]), every * place)[0]
-    while steps:
-        with_steps = fit_with(*causes, *steps)
-        places = [with_steps.value_slice(each).start for each in steps]
-        deviations = np.sqrt(np.diag(with_steps.covariance)[places])
-        sigmas = np.abs(with_steps.values[places]) / deviations
-        # given the other steps, a step between them rests on the stretches there
-        data = whiten_regression(with_steps, with_steps.causes)
-        influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, places]
-        inside = data.clusters[0] < data.stretch_count
-        stretches = effective_clusters(data.clusters[0][inside], influence[inside])
-        chances = 2.0 * student.sf(sigmas, np.maximum(stretches - 1.0, 1.0))
-        if fit.spans.treatment.is_fine:
-            # at the best of all times, beside the noise without the step
-            evidence = np.array([_step_evidence(with_steps, fit_with(
-                *causes, *(other for other in steps if other != each)), each) for each in steps])
-            chances = np.maximum(data.stretch_count * chances, 2.0 * len(times) * np.exp(
-                -np.maximum(evidence, 0.0)))
-            most = SUSPECTED_RATE_FACTOR * false_alarm_rate
-        else:
-            chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * chances)
-            most = false_alarm_rate
-        weakest = int(chances.argmax())
-        if chances[weakest] < most:
-            return [FoundCause(each, chance, 0.5 * size ** 2, 1.0,
-                               chance < false_alarm_rate and count >= MIN_STRETCHES, {})
-                    for each, chance, size, count in zip(
-                        steps, chances.tolist(), sigmas.tolist(), stretches.tolist())]
-        del steps[weakest]
-    return []
-
-
-def _step_evidence(fit: SpanFit, without: SpanFit, step: CauseTerm) -> float:
-    """Return the gain in log-likelihood by a step, averaged over the noises of each fit."""
-    place = fit.value_slice(step).start
-    return (fit.fit.log_evidence - without.fit.log_evidence
-            - 0.5 * math.log(fit.fit.covariance[place, place]))
-
-
-def _best_pair(fit: SpanFit, data: WhitenedRegression,
-               times: Array) -> tuple[float, tuple[int, int]]:
-    """Return the largest gain in log-likelihood by two steps of the bias, and their places."""
-    step, left = _given_design(data, data.whiten_columns(fit.spans.step_columns(times)))
-    size = np.sqrt(np.sum(step ** 2, axis=0)) + 1e-100
-    alone, alike = left @ step / size, step.T @ step / np.outer(size, size)
-    gains = 0.5 * (alone ** 2 + alone[:, None] ** 2 - 2.0 * alike * np.outer(alone, alone)) / (
-        1.0 - np.minimum(np.abs(alike), 1.0 - 1e-6) ** 2)
-    gains[np.abs(alike) > _MAX_ALIKENESS] = 0.0
-    first, second = np.unravel_index(int(gains.argmax()), gains.shape)
-    return float(gains.max()), (int(min(first, second)), int(max(first, second)))
-
-
-def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> tuple[Array, Array]:
-    """Return the gain in log-likelihood by a step of the bias at each time, and its size."""
-    whole = data.whiten_columns(fit.spans.step_columns(times))
-    step, left = _given_design(data, whole)
-    score, information = left @ step, np.maximum(np.sum(step ** 2, axis=0), 1e-300)
-    # a step that these spans do not distinguish from another explains nothing
-    distinct = information > (1.0 - _MAX_ALIKENESS ** 2) * np.sum(whole ** 2, axis=0)
-    return 0.5 * distinct * score ** 2 / information, distinct * score / information
 
 
 def _implausibility(fit: SpanFit, cause: CauseTerm, false_alarm_rate: float) -> float:
@@ -704,164 +517,3 @@ def _implausibility(fit: SpanFit, cause: CauseTerm, false_alarm_rate: float) -> 
     # larger ones result from several similar columns that nearly cancel each other
     return float(added / np.abs(fit.spans.channels.rate).max()) / (
         2.0 * HEADING_TREATMENT.prior[0])
-
-
-def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[CauseTerm],
-                     false_alarm_rate: float) -> FoundCause | None:
-    """Return the best of the remaining causes, given those found; None if insignificant."""
-    widths = [spans.cause_columns(each) for each in terms]
-    columns = data.whiten_columns(np.column_stack(widths))
-    ends = np.cumsum([each.shape[1] for each in widths]).tolist()
-    places = list(map(slice, [0, *ends], ends))
-    evidences = _term_evidences(data, columns, places, terms,
-                                np.ones(len(data.observed), dtype=bool))
-    p_values = [min(evidence.chance * len(terms), 1.0) for evidence in evidences]
-    strongest = min(range(len(terms)), key=lambda place: (p_values[place], place))
-    if p_values[strongest] > SUSPECTED_RATE_FACTOR * false_alarm_rate:
-        return None
-    # with one variance for all, as similar causes scatter alike
-    likelihoods = [each.gain * each.variance_ratio / evidences[strongest].variance_ratio
-                   for each in evidences]
-    best_of = {terms[place].cause: place
-               for place in sorted(range(len(terms)), key=likelihoods.__getitem__)}
-    gain = likelihoods[strongest]
-    equivalent = {name: place for name, place in reversed(best_of.items()) if place == strongest
-                  or gain - likelihoods[place] < RULED_OUT_DEFICIT}
-
-    def complexity(place: int) -> tuple[int, float, float]:
-        """Return the number of values and fitted shapes, the p-value, and less the likelihood."""
-        effect = CATALOGUE.get(terms[place].cause)
-        return (widths[place].shape[1] if effect is None
-                else sum(each.default is None for each in effect.parameters), p_values[place],
-                -evidences[place].gain)
-
-    simplest = min(equivalent.values(), key=complexity)
-    # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring
-    # ones, and fifths of the log
-    numbers, count = np.arange(data.stretch_count), min(5, data.stretch_count)
-    folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
-             for sets in ([numbers[fold::count] for fold in range(count)],
-                          np.array_split(numbers, count))]
-    # errors of a course are correlated over time, so that distant stretches must be predicted too
-    confirmed = [(sigmas > MIN_PREDICTION_SIGMAS and selected == 1.0, sigmas, predicted, selected)
-                 for sigmas, predicted, selected in folds]
-    is_confirmed, _, predicted, selected = (
-        max(confirmed) if spans.treatment.is_fine else min(confirmed, key=lambda each: each[1:]))
-    established = (p_values[simplest] < false_alarm_rate and is_confirmed
-                   and evidences[simplest].stretches >= MIN_STRETCHES)
-    term, interval = _profile_shape(spans, data, terms[simplest], [
-        each.shapes for each in terms if each.cause == terms[simplest].cause],
-        evidences[simplest].variance_ratio)
-    return FoundCause(term, p_values[simplest], predicted, selected, established, {
-        name: gain - likelihoods[place] for name, place in equivalent.items()}, interval)
-
-
-def _profile_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm,
-                   tried: Sequence[tuple[float, ...]], variance_ratio: float
-                   ) -> tuple[CauseTerm, tuple[float, float] | None]:
-    """
-    Return a term with its best shape, and the 95 % interval by the profile of the likelihood.
-
-    The shape is a positive one that the effect leaves to the data, such as a time constant. The
-    interval is within the range of those that were tried; None if there is no such shape.
-    """
-    effect = CATALOGUE.get(term.cause)
-    parameters = () if effect is None else effect.nonlinear_parameters
-    if len(parameters) != 1 or parameters[0].default is not None or len(tried) < 2:
-        return term, None
-
-    def likelihood(logarithm: float) -> float:
-        trial = CauseTerm(term.cause, (math.exp(logarithm),))
-        columns = data.whiten_columns(spans.cause_columns(trial))
-        (evidence,) = _term_evidences(data, columns, [slice(None)], [trial],
-                                      np.ones(len(data.observed), dtype=bool))
-        return evidence.gain * evidence.variance_ratio / variance_ratio
-
-    shapes = sorted(each for each, in tried)
-    place, logarithms = shapes.index(term.shapes[0]), np.log(shapes).tolist()
-    best = float(minimize_scalar(
-        lambda logarithm: -likelihood(logarithm), method='bounded',
-        bounds=(logarithms[max(place - 1, 0)],
-                logarithms[min(place + 1, len(shapes) - 1)])).x)
-    least = likelihood(best) - 0.5 * NORMAL_QUANTILE_975 ** 2
-    low, high = (math.exp(end if likelihood(end) > least else float(brentq(
-        lambda logarithm: likelihood(logarithm) - least, end, best)))
-        for end in (logarithms[0], logarithms[-1]))
-    return CauseTerm(term.cause, (math.exp(best),)), (low, high)
-
-
-def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[slice],
-                    terms: Sequence[CauseTerm], rows: Mask) -> list[Evidence]:
-    """Return the evidence for each term in some of the rows."""
-    given, left = _given_design(data, columns, rows)
-    clusters = [each[rows] for each in data.clusters]
-    least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
-    # along the motion they are similar to errors of an encoder that repeat with its position
-    return [_cluster_robust_evidence(
-        given[:, place], left, clusters if CAUSES[each.cause].along in ('rate', 'heading')
-        else clusters[:1], data.cosines, least[place]) for place, each in zip(places, terms)]
-
-
-def _given_design(data: WhitenedRegression, columns: Array,
-                  rows: Mask | slice = slice(None)) -> tuple[Array, Array]:
-    """Return what of more columns and of the observations the design does not explain."""
-    base, _ = np.linalg.qr(data.design[rows])
-    both = np.column_stack([columns, data.observed])[rows]
-    both -= base @ (base.T @ both)
-    return both[:, :-1], both[:, -1]
-
-
-def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
-                             cosines: slice, min_sizes: Array) -> Evidence:
-    """
-    Return the least evidence by any of the clusterings.
-
-    Evidence against a wander of the bias counts as that of all its cosines, since all of them show
-    its size, although a slow cause is in few of them.
-    """
-    information = x.T @ x
-    size = np.sqrt(np.diag(information))
-    if not (size > min_sizes).all():
-        return Evidence(1.0, 0.0, 0.0, 1.0)
-    # by the residual with the candidate: scores that contain the effect would overestimate scatter
-    off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
-    count, found = x.shape[1], []
-    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size ** 2)))
-    square = float(np.sum((root @ x.T @ residual) ** 2))
-    for cluster in clusters:
-        scores = np.array([np.bincount(cluster, part * off) for part in x.T])
-        shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
-        shares[cosines] = shares[cosines].mean()
-        effective = float(shares.sum() ** 2 / (shares ** 2).sum())
-        scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
-        ratio = max(float(np.linalg.eigvalsh(root @ scatter @ root.T).max()), 1.0)
-        statistic, freedom = square / ratio, max(effective - count, 1.0)
-        found.append(Evidence(float(fisher.sf(statistic / count, count, freedom)),
-                              0.5 * statistic, effective, ratio))
-    return max(found)
-
-
-def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice],
-               terms: Sequence[CauseTerm], equivalent: Mapping[str, int],
-               folds: Sequence[NDArray[np.intp]]) -> tuple[float, float, float]:
-    """
-    Select and fit without each fold, and predict it.
-
-    Return the gain in log-likelihood over its standard deviation by the scatter of stretches, the
-    gain, and the share of the folds in which one of the equivalent causes was selected.
-    """
-    gains: list[float] = []
-    same_choices = 0
-    for fold in folds:
-        held = np.isin(data.clusters[0], fold)
-        rest = ~held
-        evidences = _term_evidences(data, columns, places, terms, rest)
-        best = int(np.argmax([each.gain for each in evidences]))
-        same_choices += terms[best].cause in equivalent
-        off = []
-        for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
-            values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
-            off.append(data.observed[held] - design[held] @ values)
-        gains += np.bincount(np.searchsorted(fold, data.clusters[0][held]),
-                             0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
-    return prediction_sigmas(np.array(gains)), float(np.sum(gains)), same_choices / len(folds)

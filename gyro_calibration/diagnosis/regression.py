@@ -27,10 +27,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 import math
+from typing import Any
 
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, fitted_shape_indices, MAX_STEP_TIME_LACK, MAX_STEP_TIMES,
-    smooth_shapes, with_shape)
+    Candidate, candidate_transforms, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK,
+    MAX_STEP_TIMES, smooth_shapes, with_shape)
 from gyro_calibration.diagnosis.replay import (
     band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
     stated_shapes)
@@ -46,6 +47,8 @@ from scipy.special import logsumexp
 Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
+#: Penalty in log-likelihood of a fitted shape, at least, and of each column beyond the first.
+VALUE_PENALTY = 1.2
 #: Largest ratio of the power of noise in the last to that in the second quarter of the frequencies
 #: of a smoothed record before causes are fitted (jumps have 0.18, noise not less).
 SMOOTHED_RATIO = 0.05
@@ -53,7 +56,7 @@ SMOOTHED_RATIO = 0.05
 
 @dataclass(frozen=True, eq=False)
 class RegressionProblem:
-    """The logs and the noises that are tried."""
+    """The logs and the noises that are tried; `SpanProblem` is the same for a log as spans."""
 
     replays: tuple[Replay, ...]  # the logs, with the reference rate
     # standard deviation of each coefficient by the first noise, relative to that of white noise,
@@ -95,9 +98,74 @@ class RegressionProblem:
         return np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
                          for begin, end in zip(edges, edges[1:])])
 
+    # what a search needs
+
+    @property
+    def durations(self) -> list[float]:
+        """Return the length of each log, s."""
+        return [each.duration for each in self.replays]
+
+    def distorted(self, causes: Sequence[Candidate]) -> tuple[Replay, ...]:
+        """Return the logs with the rate that the gyro senses, distorted by causes."""
+        distortions = tuple((each.cause, each.shapes) for each in causes if each.distorts)
+        return tuple(_with_distorted_rate(each, distortions) for each in self.replays)
+
+    def base_rows(self, logs: tuple[Replay, ...]) -> Array:
+        """Return what is always fitted, and last the residual, whitened, shape (q + 1, m)."""
+        residual, rate = _transforms_without_causes(self.replays, logs)
+        return np.array([rate, residual]) / self.deviation
+
+    def rows(self, candidate: Candidate, logs: tuple[Replay, ...]) -> Array:
+        """Return the columns of a candidate, whitened by the first noise, shape (k, m)."""
+        return _transforms(candidate, logs) / self.deviation
+
     def products(self, one: Array, other: Array) -> Array:
-        """Return the products of rows under each noise, shape (g, rows, rows of the other)."""
+        """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
         return np.tensordot(self.weights, self.band_products(one, other), 1)
+
+    def with_white_noise(self) -> RegressionProblem:
+        """Return the problem without a wander of the bias."""
+        return replace(self, noise_shapes=self.noise_shapes[:1], weights=self.weights[:1],
+                       log_determinants=self.log_determinants[:1])
+
+    def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
+                       known: Candidate) -> Array | None:
+        """
+        Return by how much a fit predicts held-out stretches better than one without a cause.
+
+        In log-likelihood; given the others, the cause is scaled to fit best without each stretch
+        in turn. None for a single event that no other stretch shows: slips, and a step of the bias
+        that a random walk soon hides. Errors of a response to a command are events of the motion.
+        """
+        if known.cause == 'reference_slip':
+            return None
+        count = max(64 // len(self.replays), 1)  # stretches of each log
+        stretch = np.concatenate([run * count + np.arange(each.point_count) * count
+                                  // each.point_count for run, each in enumerate(self.replays)])
+        off, before = (np.concatenate(each.whitened_series(full)) for each in (full, rest))
+        added = before - off
+        score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
+        if (known.log_index is not None and information.max() > 0.5 * information.sum()
+                and self.replays[known.log_index].command is None):
+            return None
+        size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
+        return 0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)
+
+    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
+        """
+        Return an upper bound of the evidence for one more cause, and a ratio of variances.
+
+        The bound for a single event is by the noise of its log alone, whose slow noise may be
+        larger than that of the others. The ratio is of the variance by the scatter of stretches
+        to that by the noise, at least 1.
+        """
+        if len(self.replays) == 1 or candidate.log_index is None or not is_named(candidate):
+            return math.inf, 1.0
+        own, left = self.replays[candidate.log_index], rest.residuals[candidate.log_index]
+        alone = fit_causes(build_problem([replace(own, channels=replace(
+            own.channels, output=own.reference + left))]), [])
+        return (likelihood_with(alone, replace(candidate, log_index=0)) - alone.log_likelihood
+                - complexity_penalty(candidate)), 1.0
 
 
 def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
@@ -177,9 +245,9 @@ class Value:
 class RegressionFit:
     """A regression with some causes."""
 
-    problem: RegressionProblem  # the logs and noises
+    problem: Any  # the logs and noises, as of `RegressionProblem`
     # the logs with the rate that the gyro senses, distorted by causes
-    distorted: tuple[Replay, ...]
+    distorted: tuple[Any, ...]
     causes: tuple[Candidate, ...]  # causes
     # whitened, shape (q + 1, m): the independent columns of scale factor error, causes, and
     # derivatives with respect to their shapes; the residual less the causes of fixed amplitude
@@ -329,12 +397,12 @@ class RegressionFit:
         found: dict[str, Array] = {}
         new = replay
         for known in self.causes:
-            if is_rate_distortion(known.cause):
+            if known.distorts:
                 before, new = new, _with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.causes):
-            if (is_rate_distortion(known.cause) or known.log_index not in (None, log_index)
+            if (known.distorts or known.log_index not in (None, log_index)
                     or not self.is_included(place)):
                 continue
             values = ([known.amplitude] if known.amplitude is not None
@@ -394,11 +462,6 @@ def is_single_event(cause: Candidate) -> bool:
     return cause.log_index is not None and cause.cause in CATALOGUE
 
 
-def is_rate_distortion(name: str) -> bool:
-    """Tell whether a cause distorts the rate before errors are added to it."""
-    return name in CATALOGUE and CATALOGUE[name].stage == 'rate'
-
-
 @lru_cache(maxsize=16)
 def _with_distorted_rate(replay: Replay,
                          distortions: tuple[tuple[str, tuple[float, ...]], ...]) -> Replay:
@@ -435,36 +498,34 @@ def forget_fits() -> None:
 
 # fits
 
-def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> RegressionFit:
+def fit_causes(problem: Any, causes: Sequence[Candidate]) -> RegressionFit:
     """Fit causes to logs, and the shapes of those that have values to first order."""
     return _fit_causes(problem, tuple(causes))
 
 
 @lru_cache(maxsize=16)
-def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> RegressionFit:
-    distortions = tuple((each.cause, each.shapes)
-                        for each in causes if is_rate_distortion(each.cause))
-    distorted = tuple(_with_distorted_rate(each, distortions) for each in problem.replays)
-    residual, rate = _transforms_without_causes(problem.replays, distorted)
-    columns, owners, widths = [rate[None]], [(-1, 0)], []
+def _fit_causes(problem: Any, causes: tuple[Candidate, ...]) -> RegressionFit:
+    distorted = problem.distorted(causes)
+    *base, residual = problem.base_rows(distorted)
+    columns, owners, widths = [np.array(base)], [(-1, place) for place in range(len(base))], []
     for place, known in enumerate(causes):
-        distorts = is_rate_distortion(known.cause)
-        replays = problem.replays if distorts else distorted
-        own = _transforms(known, replays) if known.values or not distorts else rate[:0]
+        logs = problem.distorted(()) if known.distorts else distorted
+        own = (problem.rows(known, logs) if known.values or not known.distorts
+               else columns[0][:0])
         widths.append(len(own) if known.amplitude is None else 0)
         if known.amplitude is None:
             columns.append(own)
             owners += [(place, number) for number in range(len(own))]
-        elif not distorts:
+        elif not known.distorts:
             residual = residual - known.amplitude * own[0]
         for shape in smooth_shapes(known) if known.values else ():
-            columns.append(_shape_derivative(known, shape, replays)[None])
+            columns.append(_shape_derivative(problem, known, shape, logs)[None])
             owners.append((place, -1 - shape))
-    rows = np.concatenate([*columns, residual[None]]) / problem.deviation
-    of_bands = problem.band_products(rows, rows)
-    kept = [*_independent_columns(of_bands.sum(axis=0)[:-1, :-1]), len(rows) - 1]
+    rows = np.concatenate([*columns, residual[None]])
+    sums = problem.products(rows, rows)
+    kept = [*_independent_columns((rows @ rows.T)[:-1, :-1]), len(rows) - 1]
     rows = rows if len(kept) == len(rows) else rows[kept]
-    sums = np.tensordot(problem.weights, of_bands[:, kept][:, :, kept], 1)[:, :, :-1]
+    sums = sums[:, kept][:, :, kept[:-1]]
     information, scores = sums[:, :-1], sums[:, -1]
     # of what the values for one noise leave, as the difference of the whole sums is rounded
     left = np.append(-np.linalg.solve(information[0], scores[0]), 1.0) @ rows
@@ -479,7 +540,8 @@ def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> Re
 
 
 @lru_cache(maxsize=32)
-def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay, ...]) -> Array:
+def _shape_derivative(problem: Any, cause: Candidate, shape_index: int,
+                      logs: tuple[Any, ...]) -> Array:
     """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
     shape = cause.shapes[shape_index]
     # so small that the phase of a wave changes little up to the end of a log
@@ -487,8 +549,7 @@ def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay,
     moved = with_shape(cause, shape_index, shape + step)
     if moved.shapes[shape_index] == shape:  # at its upper bound
         moved = with_shape(cause, shape_index, shape - step)
-    change = np.tensordot(
-        cause.values, candidate_transforms(moved, replays) - _transforms(cause, replays), 1)
+    change = np.tensordot(cause.values, problem.rows(moved, logs) - problem.rows(cause, logs), 1)
     return np.asarray(change / (moved.shapes[shape_index] - shape))
 
 
@@ -524,17 +585,16 @@ class ColumnGroups:
     of_width: list[tuple[Indices, Indices, Array]]
 
 
-def group_columns(problem: RegressionProblem, columns: Array,
+def group_columns(problem: Any, columns: Array,
                   groups: Sequence[Sequence[int]]) -> ColumnGroups:
     """Return groups of whitened columns, shape (p, m)."""
     of_width = []
     for width in sorted({len(group) for group in groups}):
         places = np.array([place for place, group in enumerate(groups) if len(group) == width])
         members = np.array([groups[place] for place in places])
-        edges = [*problem.band_starts, columns.shape[1]]
-        of_bands = [part @ np.swapaxes(part, 1, 2) for part in (
-            columns[:, begin:end][members] for begin, end in zip(edges, edges[1:]))]
-        of_width.append((places, members, np.tensordot(problem.weights, np.array(of_bands), 1)))
+        parts = np.array_split(members, math.ceil(len(members) / 32))  # for the memory
+        of_width.append((places, members, np.concatenate(
+            [problem.products(columns[part], columns[part]) for part in parts], axis=1)))
     return ColumnGroups(columns, groups, of_width)
 
 
@@ -569,6 +629,12 @@ def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
     return found
 
 
+def complexity_penalty(cause: Candidate) -> float:
+    """Return the penalty of shapes and columns of a cause, in log-likelihood."""
+    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause)))
+    return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
+
+
 def likelihood_with(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the log-likelihood of a fit with one more cause, whose shapes are fixed."""
     return fit_causes(fit.problem, [*fit.causes, candidate]).log_likelihood
@@ -587,13 +653,13 @@ def _profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -
     half_range = candidate.half_width
     while half_range:  # a time: by all times that are about as likely
         shifts = np.linspace(-half_range, half_range, 2 * MAX_STEP_TIMES + 1)
-        columns = np.concatenate([candidate_transforms(moved(by), rest.distorted)
-                                  for by in shifts.tolist()]) / problem.deviation
+        columns = np.concatenate([problem.rows(moved(by), rest.distorted)
+                                  for by in shifts.tolist()])
         evidence = column_evidence(rest, group_columns(
             problem, columns, np.arange(len(shifts))[:, None].tolist()))
         likely = evidence >= evidence[len(shifts) // 2] - MAX_STEP_TIME_LACK
         largest = float(np.abs(shifts[likely]).max() + shifts[1] - shifts[0])
-        if largest < half_range or half_range > max(each.duration for each in problem.replays):
+        if largest < half_range or half_range > max(problem.durations):
             return largest / NORMAL_QUANTILE_975
         half_range *= 2.0
     least = likelihood_with(rest, moved(0.0)) - 0.5 * NORMAL_QUANTILE_975 ** 2

@@ -27,10 +27,9 @@ from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding, NOISE_NAMES
 from gyro_calibration.diagnosis.findings import Curve, Estimate, Finding
-from gyro_calibration.diagnosis.regression import RegressionFit
+from gyro_calibration.diagnosis.regression import RegressionFit, VALUE_PENALTY
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, NoiseShape, Replay, spline_derivative_gain)
-from gyro_calibration.diagnosis.search import VALUE_PENALTY
 from gyro_calibration.diagnosis.significance import RULED_OUT_DEFICIT
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import Array

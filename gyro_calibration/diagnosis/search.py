@@ -19,56 +19,45 @@ that are held out, and if the interval of its size excludes 0.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 import math
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, depends_on_rate, effect_candidate, fitted_shape_indices,
-    gaussian_pulse, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
+    Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import OnProgress
 from gyro_calibration.diagnosis.regression import (
-    build_problem, column_evidence, ColumnGroups, fit_causes, group_columns, Indices,
-    is_rate_distortion, likelihood_with, MIN_INDEPENDENT_SHARE, RegressionFit, RegressionProblem)
-from gyro_calibration.diagnosis.replay import (
-    coefficient_angles, cosine_transform, inverse_cosine_transform, Replay)
+    build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, forget_fits,
+    group_columns,
+    likelihood_with, RegressionFit, VALUE_PENALTY)
+from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.diagnosis.scans import (
+    find_slips, find_steps, find_tones, MAX_PER_LOG, Scored)
 from gyro_calibration.diagnosis.significance import (
     MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
-from scipy.fft import fft
-from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
-from scipy.signal import correlate
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
-#: Penalties in log-likelihood: of a fitted shape, at least, and of each column beyond the first;
-#: and of a structure without a name.
-VALUE_PENALTY, _UNNAMED_PENALTY = 1.2, 4.0
-#: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
-#: a disturbance that is not periodic.
-_MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
-#: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
-_SLIP_DURATIONS, _MAX_SLIPS = (0.0, 0.1, 0.4), 20
-#: Least time between two slips, and between a slip and a gap where the heading is rounded, s.
-_SLIP_INTERVAL = 1.0
+#: Penalty in log-likelihood of a structure without a name.
+_UNNAMED_PENALTY = 4.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
 _MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 
 Causes = tuple[Candidate, ...]
-#: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
-Scored = tuple[Candidate, float]
 
 
 def evidence_threshold(cause: str, rate: float) -> float:
     """Return the evidence that noise alone exceeds with a given probability: see `p_value`."""
-    return -math.log(rate) if cause in _MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
+    return -math.log(rate) if cause in MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
 
 
 def p_value(cause: str, evidence: float) -> float:
@@ -81,50 +70,42 @@ def p_value(cause: str, evidence: float) -> float:
     degrees of freedom less the logarithm of their number.
     """
     evidence = max(evidence, 0.0)
-    return math.exp(-evidence) if cause in _MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
+    return math.exp(-evidence) if cause in MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """State of a search."""
 
-    problem: RegressionProblem  # the logs
+    problem: Any  # the logs, as of `RegressionProblem`
     candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
-    # causes that are scanned for over all frequencies or times
-    scanned_causes: frozenset[str] = frozenset({'bias_step', *_MAX_PER_LOG})
+    # causes that are scanned for over all frequencies or times -> their candidates, given a fit
+    scans: Mapping[str, Callable[[RegressionFit], list[Scored]]]
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
-    # columns_cache, step_cache: caches of columns and of steps, by the named causes
-    columns_cache: dict[tuple[Any, ...], ColumnGroups] = field(default_factory=dict)
-    step_cache: dict[tuple[Any, ...], tuple[Candidate | None, list[Scored]]] = field(
-        default_factory=dict)
     # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
+    finds_several: bool = True  # whether several steps are searched for at once
 
     def candidate_evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
         # for the rate that the gyro senses, with shapes to two digits
-        key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
-                    for each in fit.causes if is_rate_distortion(each.cause))
-        if key not in self.columns_cache:
-            deviation = self.problem.deviation
-            if self.columns_cache:  # those for another rate
-                known = self.columns_cache.popitem()[1]
-                columns, groups = known.columns, known.groups
-                for each, own in zip(self.candidates, groups):
-                    if depends_on_rate(each):
-                        columns[own] = candidate_transforms(each, fit.distorted) / deviation
-            else:
-                parts = [candidate_transforms(each, fit.distorted) / deviation
-                         for each in self.candidates]
-                columns = np.concatenate([np.empty((0, len(deviation))), *parts])
-                ends = np.cumsum([len(part) for part in parts]).tolist()
-                groups = [range(end - len(part), end) for end, part in zip(ends, parts)]
-            self.columns_cache[key] = group_columns(self.problem, columns, groups)
-        known = self.columns_cache[key]
+        logs = self.problem.distorted([
+            replace(each, shapes=tuple(float(f'{shape:.2g}') for shape in each.shapes))
+            for each in fit.causes if each.distorts])
+        known = _candidate_columns(self.problem, self.candidates, logs)
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in known.groups])
         return column_evidence(fit, known) - penalty
+
+
+@lru_cache(maxsize=2)
+def _candidate_columns(problem: Any, candidates: tuple[Candidate, ...],
+                       logs: tuple[Any, ...]) -> ColumnGroups:
+    parts = [problem.rows(each, logs) for each in candidates]
+    ends = np.cumsum([len(part) for part in parts]).tolist()
+    return group_columns(problem, np.concatenate(parts or [np.empty((0, 1))]), [
+        range(end - len(part), end) for end, part in zip(ends, parts)])
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
@@ -139,8 +120,10 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
-    search = Search(problem, found, rate / len(places), on_progress=on_progress,
-                    scanned_causes=Search.scanned_causes.difference(without))
+    scans = {'bias_step': find_steps, 'interference_tone': find_tones,
+             'reference_slip': find_slips}
+    search = Search(problem, found, rate / len(places), on_progress=on_progress, scans={
+        cause: scan for cause, scan in scans.items() if cause not in without})
     shown = search.candidate_evidence(fit)
     return replace(search, unidentifiable=frozenset(
         cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
@@ -150,24 +133,28 @@ def restrict_search(search: Search, replays: Sequence[Replay], causes: Collectio
                     rate: float) -> Search:
     """Return a silent search for some causes in other parts of the logs, at another rate."""
     return replace(search, problem=build_problem(replays), rate=rate,
-                   columns_cache={}, step_cache={}, on_progress=lambda share, words: None,
-                   scanned_causes=search.scanned_causes & frozenset(causes),
+                   on_progress=lambda share, words: None,
+                   scans={each: scan for each, scan in search.scans.items() if each in causes},
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
+
+
+def forget_searches() -> None:
+    """Release the columns and fits that searches keep for the next ones."""
+    for kept in (_candidate_columns, _find_strongest):
+        kept.cache_clear()
+    forget_fits()
 
 
 # one more cause
 
-def _find_strongest(search: Search, causes: Sequence[Candidate],
-                    ) -> tuple[Candidate | None, list[Scored]]:
+@lru_cache(maxsize=32)
+def _find_strongest(search: Search, causes: Causes) -> tuple[Candidate | None, list[Scored]]:
     """
     Search for one more cause.
 
     Return the best cause, None if none is significant, and all that were refined with their
     log-likelihoods, the best first; if none is significant, those that are suspected.
     """
-    key = tuple((each.cause, each.log_index, *each.shapes) for each in causes)
-    if key in search.step_cache:
-        return search.step_cache[key]
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit)
     significant = [each for each, evidence in first
@@ -189,8 +176,8 @@ def _find_strongest(search: Search, causes: Sequence[Candidate],
         # less than its penalty.
         steps = [(each, score) for each, score in steps if score > fit.log_likelihood]
         best = next((each for each, score in steps if p_value(each.cause, min(
-            score - fit.log_likelihood, _evidence_alone(fit, each))) < search.rate), None)
-    search.step_cache[key] = best, steps
+            score - fit.log_likelihood, search.problem.robust_evidence(fit, each)[0]))
+            < search.rate), None)
     return best, steps
 
 
@@ -210,9 +197,7 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
             mean = float(logsumexp(found[own])) - math.log(len(own))
             first.append((replace(search.candidates[best], penalty=float(found[best]) - mean),
                           float(found[best])))
-    scans = {'interference_tone': _find_tones, 'reference_slip': _find_slips,
-             'bias_step': _find_steps}
-    first += [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
+    first += [each for scan in search.scans.values() for each in scan(fit)
               if math.isfinite(each[1])]
     return list({each.cause: (each, evidence) for each, evidence in sorted(
         first, key=lambda scored: scored[1] - scored[0].penalty)}.values())
@@ -243,13 +228,13 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
             lambda by: -likelihood_with(fit, moved(by)), bounds=(-half_range, half_range),
             method='bounded', options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    more = max(_free_column_count(candidate, fit.problem) - 1, 0)
+    more = max(_free_column_count(candidate, fit) - 1, 0)
     return candidate, (likelihood_with(fit, candidate) - VALUE_PENALTY * more
                        - candidate.penalty - (0.0 if is_named(candidate) else _UNNAMED_PENALTY))
 
 
-def _free_column_count(candidate: Candidate, problem: RegressionProblem) -> int:
-    return 0 if candidate.amplitude is not None else len(candidate.columns(problem.replays[0]))
+def _free_column_count(candidate: Candidate, fit: RegressionFit) -> int:
+    return 0 if candidate.amplitude is not None else len(candidate.columns(fit.distorted[0]))
 
 
 def _is_lasting(candidate: Candidate) -> bool:
@@ -259,140 +244,6 @@ def _is_lasting(candidate: Candidate) -> bool:
     A limit or a delay has no size apart from its shape, and its refinement would fit single peaks.
     """
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
-
-
-# scans over all frequencies and times
-
-def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
-    """Return the logs that may contain one more instance of a cause."""
-    taken = [known.log_index for known in fit.causes if known.cause == cause]
-    return [run
-            for run in range(len(fit.problem.replays)) if taken.count(run) < _MAX_PER_LOG[cause]]
-
-
-def _find_tones(fit: RegressionFit) -> list[Scored]:
-    """Return the strongest tone of each log, which has its own size and phase."""
-    found, left = [], fit.whitened_series()
-    for run in _logs_to_scan(fit, 'interference_tone'):
-        each, white = fit.problem.replays[run], left[run]
-        # Zero padding: a tone between two frequencies of the log would lose half of its power.
-        power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
-        lowest = 40  # of 20 periods in the log; slower variations are bias wander
-        if len(power) > 2 * lowest:
-            best = lowest + int(power[lowest:-2].argmax())
-            frequency = 0.5 * best / each.duration
-            # of all frequencies that are this one in means over some samples
-            places = np.arange(each.decimation // 2 + 1) / each.point_interval
-            aliases = np.concatenate([places + frequency, places[1:] - frequency])
-            error = (each.channels.output - each.reference)[each.valid]
-            time = each.channels.time[each.valid]
-            frequency = max(aliases.tolist(), key=lambda at: float(np.abs(
-                np.mean(error * np.exp(-2.0j * np.pi * at * time)))))
-            found.append((replace(
-                effect_candidate('interference_tone', frequency, log_index=run,
-                                 half_width=1.0 / each.duration),
-                penalty=math.log(len(power) * len(left))), float(power[best]) - VALUE_PENALTY))
-    return found
-
-
-def _find_steps(fit: RegressionFit) -> list[Scored]:
-    """
-    Return the clearest step of the bias of each log at any time, under the likeliest noise.
-
-    Beside a random walk that soon exceeds the white noise, a step shows for a short time only.
-    """
-    best, split_by_log = fit.best_noise, fit.problem.split_by_log
-    covariance = fit.inverse_information[best] * fit.residual_squares[best] / (
-        fit.degrees_of_freedom)
-    # under that noise, as the factors are
-    residual = fit.rows[-1] - fit.inverse_information[best] @ fit.scores[best] @ fit.columns
-    found, evidence = [], []
-    for run, (replay, factor, deviation, *rows) in enumerate(zip(
-            fit.problem.replays, fit.whitening_factors(), split_by_log(fit.problem.deviation),
-            *map(split_by_log, (residual, *fit.columns)))):
-        count, interval = replay.point_count, replay.point_interval
-        # products of a step at each point with the residual, the columns, and itself
-        pull, *products = [
-            np.cumsum(inverse_cosine_transform(factor ** 2 / deviation * each)[::-1])[::-1]
-            for each in rows]
-        power = (factor / deviation / np.sin(0.5 * coefficient_angles(count))) ** 2 / (2.0 * count)
-        whole = 0.5 * (power.sum() - fft(np.append(0.0, power)).real)
-        crossing = np.reshape(products, (len(products), count))
-        left = whole - np.einsum('qn,qr,rn->n', crossing, covariance, crossing)
-        shown = left > MIN_INDEPENDENT_SHARE * whole
-        # as far from the ends as the first of equally spaced times
-        margin = max(count // (MAX_STEP_TIMES + 1), 1)
-        own = np.where(shown, 0.5 * pull ** 2 / np.where(shown, left, 1.0), 0.0)[margin:-margin]
-        top = int(own.argmax())
-        # number of points that are about as likely
-        width = min(float(np.exp(logsumexp(own - own[top]))), margin)
-        time = float(replay.channels.time[replay.valid][0]) + (margin + top) * interval
-        found.append(effect_candidate('bias_step', time, log_index=run,
-                                      half_width=1.5 * width * interval))
-        evidence.append(own)
-    every = np.concatenate(evidence)
-    mean = float(logsumexp(every)) - math.log(len(every))
-    return [(replace(each, penalty=float(own.max()) - mean), float(own.max()))
-            for each, own in zip(found, evidence)]
-
-
-def _find_slips(fit: RegressionFit) -> list[Scored]:
-    """Return the clearest jumps of the heading of each reference, where it accelerates."""
-    found, left = [], fit.whitened_series()
-    factors = [own / each for own, each in zip(fit.whitening_factors(), fit.problem.split_by_log(
-        fit.problem.deviation))]
-    for run in _logs_to_scan(fit, 'reference_slip'):
-        each = fit.problem.replays[run]
-        acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
-        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
-        if acceleration.max() > 0.0 and len(moments):
-            tried = [_fit_slips(each, run, left[run], factors[run], moments,
-                                max(width, 0.5 * each.point_interval))
-                     for width in _SLIP_DURATIONS]
-            # The largest number indicates a continuous disturbance, not slips.
-            if max(len(slips.shapes) - 1 for slips, _ in tried) < _MAX_SLIPS:
-                found += tried
-    return found
-
-
-def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
-               width: float) -> Scored:
-    """Return slips of one duration, apart from each other, with evidence for the times scanned."""
-    time = np.arange(replay.point_count) * replay.point_interval
-    likely = math.log(len(indices) * len(_SLIP_DURATIONS))
-    size, deviation = _matched_filter(white, factor, time, width)
-    wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
-    value = 0.5 * (size[indices] / deviation) ** 2 - likely - VALUE_PENALTY
-    # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
-    # of an encoder is constant at rest, and differs by up to a step between two rests. What the
-    # gyro turns in a gap is not known, nor is the rounding error there.
-    is_temporary = wide[indices] / size[indices] < 0.3
-    unknown = _SLIP_INTERVAL if replay.heading_step else 2.0 * width
-    near_gap = maximum_filter1d(replay.filled_points,
-                                2 * math.ceil(unknown / replay.point_interval) + 1)
-    value[is_temporary | near_gap[indices]
-          | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
-    chosen: list[float] = []
-    total = 0.0
-    for place in np.argsort(-value)[:200]:
-        if (value[place] <= 0.0 and chosen) or len(chosen) == _MAX_SLIPS:
-            break
-        at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
-        if all(abs(at - other) > _SLIP_INTERVAL for other in chosen):
-            chosen.append(at)
-            total += float(value[place])
-    penalty = likely * len(chosen)
-    slips = effect_candidate('reference_slip', width, *chosen, log_index=log_index)
-    return replace(slips, penalty=penalty), total + penalty
-
-
-def _matched_filter(white: Array, whitening_factor: Array, time: Array,
-                    width: float) -> tuple[Array, float]:
-    """Return the size of a pulse at each time, rad, and its standard deviation."""
-    kernel = inverse_cosine_transform(
-        cosine_transform(gaussian_pulse(time, time[len(time) // 2], width)) * whitening_factor)
-    return (correlate(white, kernel, 'same') / (kernel @ kernel),
-            float(1.0 / np.sqrt(kernel @ kernel)))
 
 
 # the growing search
@@ -408,8 +259,9 @@ def search_causes(search: Search) -> Causes:
     everything = _select_forward(search)
     if all(is_named(each) for each in everything):
         return everything
+    # without generic terms nothing tells a part from another structure in time
     named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates)),
-                                    columns_cache={}, step_cache={}))
+                                    finds_several=False))
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
                    complexity_penalty(each)
@@ -437,17 +289,14 @@ def _with_several(search: Search, causes: Causes) -> Causes:
     they are looked for in white noise, and must be significant together. A drift replaces the
     steps that follow it.
     """
-    # without generic terms nothing tells a part from another structure in time
-    if 'bias_step' not in search.scanned_causes or all(map(is_named, search.candidates)):
+    if 'bias_step' not in search.scans or not search.finds_several:
         return ()
     problem, grown, tried = search.problem, causes, []
     white = replace(
-        search, columns_cache={}, step_cache={}, scanned_causes=frozenset(),
-        candidates=tuple(filter(_is_lasting, search.candidates)), problem=replace(
-            problem, noise_shapes=problem.noise_shapes[:1], weights=problem.weights[:1],
-            log_determinants=problem.log_determinants[:1]))
+        search, scans={}, candidates=tuple(filter(_is_lasting, search.candidates)),
+        problem=problem.with_white_noise())
     while len(grown) < MAX_CAUSES:
-        step, evidence = max(_find_steps(fit_causes(white.problem, grown)),
+        step, evidence = max(search.scans['bias_step'](fit_causes(white.problem, grown)),
                              key=lambda each: each[1] - each[0].penalty)
         # the first of a pair may not be significant alone
         if len(grown) > len(causes) + 1 and p_value(
@@ -472,7 +321,7 @@ def _with_several(search: Search, causes: Causes) -> Causes:
         steps = [each for each in several if each.cause == 'bias_step']
         return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
                    or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
-                   >= problem.replays[one.log_index or 0].duration
+                   >= problem.durations[one.log_index or 0]
                    for one, other in combinations(steps, 2))
 
     best = max(filter(are_apart, tried), key=evidence_of, default=())
@@ -511,12 +360,6 @@ def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
     return tuple(current)
 
 
-def complexity_penalty(cause: Candidate) -> float:
-    """Return the penalty of shapes and columns of a cause, in log-likelihood."""
-    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause)))
-    return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
-
-
 def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
     """
     Return the evidence for one of the causes given the others.
@@ -524,30 +367,14 @@ def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) 
     Of two distortions of the rate, such as a delay and a lag, one may stand in for the other:
     without one, the shape of the other is refined.
     """
-    fit = fit_causes(search.problem, causes)
-    rest = _without(causes, cause_index)
-    without = fit_causes(search.problem, rest).log_likelihood
-    if is_rate_distortion(causes[cause_index].cause) and any(
-            is_rate_distortion(each.cause) for each in rest):
+    known, rest = causes[cause_index], _without(causes, cause_index)
+    fit, rest_fit = (fit_causes(search.problem, some) for some in (causes, rest))
+    without = rest_fit.log_likelihood
+    if known.distorts and any(each.distorts for each in rest):
         without = max(without, fit_causes(
             search.problem, refine_jointly(search, rest)).log_likelihood)
-    evidence = fit.log_likelihood - without - complexity_penalty(causes[cause_index])
-    return min(evidence, _evidence_alone(fit_causes(search.problem, rest), causes[cause_index]))
-
-
-def _evidence_alone(rest: RegressionFit, event: Candidate) -> float:
-    """
-    Return the evidence for a single event by the noise of its log alone, given other causes.
-
-    The slow noise of a log may be larger than that of the others. Infinite for lasting causes.
-    """
-    if len(rest.problem.replays) == 1 or event.log_index is None or not is_named(event):
-        return math.inf
-    own, left = rest.problem.replays[event.log_index], rest.residuals[event.log_index]
-    alone = fit_causes(build_problem([replace(own, channels=replace(
-        own.channels, output=own.reference + left))]), [])
-    return (likelihood_with(alone, replace(event, log_index=0)) - alone.log_likelihood
-            - complexity_penalty(event))
+    return min(fit.log_likelihood - without - complexity_penalty(known),
+               search.problem.robust_evidence(rest_fit, known)[0])
 
 
 def _eliminate_backward(search: Search, causes: Causes, kept: Causes = ()) -> Causes:
@@ -574,7 +401,7 @@ def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     variables = {unnamed_variable(each) for each in causes if not is_named(each)}
     exceeded = {name for variable in variables for name in variable.split(' and ')}
     tones = [each.log_index for each in causes if each.cause == 'interference_tone']
-    if any(tones.count(run) >= _MAX_PER_LOG['interference_tone'] for run in tones):
+    if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
         exceeded.add('frequency')
     kept, problem = [], search.problem
     for each in causes:
@@ -582,7 +409,7 @@ def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
             continue
         # as far as it is one along a temperature, with its own size in each log but the last
         alone = [replace(each, log_index=run, values=()) for run in range(
-            len(problem.replays) - 1) if each.amplitude is None
+            len(problem.durations) - 1) if each.amplitude is None
             and CAUSES[each.cause].along in ('temperature', 'temperature_rate')]
         more = 2.0 * (fit_causes(problem, [*causes, *alone]).log_likelihood
                       - fit_causes(problem, causes).log_likelihood) if alone else 0.0
@@ -622,12 +449,30 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
     if not suspected:  # one more cause at a higher rate, if there is one
         selected = (*named, *unnamed)
         _, steps = _find_strongest(search, selected)
-        score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
+        rest = fit_causes(search.problem, selected)
+        score = rest.log_likelihood
         suspected = tuple(each for each, likelihood in steps if _is_lasting(each)
                           and each.cause not in {other.cause for other in selected} and p_value(
-                              each.cause, likelihood - score)
+                              each.cause, min(likelihood - score, search.problem.robust_evidence(
+                                  rest, each)[0]))
                           < SUSPECTED_RATE_FACTOR * search.rate)[:1]
     return Selection(named, alternatives, unnamed, suspected)
+
+
+def explain_selection(search: Search, selection: Selection
+                      ) -> Iterator[tuple[Causes, int, float, Mapping[str, float]]]:
+    """
+    Give the causes of a selection, the named ones first, then those that are suspected.
+
+    Each is given as its place among all causes, with its evidence given the others and its
+    alternatives.
+    """
+    causes = (*selection.named, *selection.unnamed)
+    for place, deficits in enumerate(selection.alternatives):
+        yield causes, place, evidence_for(search, causes, place), deficits
+    for known in selection.suspected:
+        every = refine_jointly(search, (*causes, known))
+        yield every, len(causes), evidence_for(search, every, len(causes)), {}
 
 
 def _remove_unconfirmed(search: Search, causes: Causes,
@@ -662,34 +507,12 @@ def _remove_unconfirmed(search: Search, causes: Causes,
 
 
 def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
-    """
-    Return the gain of each cause on held-out stretches in standard deviations.
-
-    Given the others, it is scaled to fit best without each stretch in turn. No other stretch
-    shows a single event: slips, and a step of the bias that a random walk soon hides.
-    """
+    """Return the gain of each cause on held-out stretches in standard deviations."""
     full, found = fit_causes(search.problem, causes), []
-    left = full.whitened_series()
-    count = max(64 // len(left), 1)  # stretches of each log
-    stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
-                              for run, each in enumerate(left)])
-    off = np.concatenate(left)
     for place, known in enumerate(causes):
-        if known.cause == 'reference_slip':
-            found.append(math.inf)
-            continue
         rest = fit_causes(search.problem, _without(causes, place))
-        before = np.concatenate(rest.whitened_series(full))
-        added = before - off
-        score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
-        # errors of a response to a command are events of the motion
-        if (known.log_index is not None and information.max() > 0.5 * information.sum()
-                and search.problem.replays[known.log_index].command is None):
-            found.append(math.inf)
-            continue
-        size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
-        found.append(prediction_sigmas(
-            0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
+        gains = search.problem.held_out_gains(full, rest, known)
+        found.append(math.inf if gains is None else prediction_sigmas(gains))
     return found
 
 
@@ -715,13 +538,15 @@ def _alternatives(search: Search, named: Causes, place: int,
     """Return the simplest alternative of a cause, or itself, and all with their deficits."""
     def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
-        return len(fitted_shape_indices(known)) + _free_column_count(known, search.problem)
+        return len(fitted_shape_indices(known)) + _free_column_count(known, rest)
 
-    own = named[place]
-    _, steps = _find_strongest(search, (*_without(named, place), *unnamed))
+    own, others = named[place], (*_without(named, place), *unnamed)
+    _, steps = _find_strongest(search, others)
     mine = max((score for each, score in steps if each.cause == own.cause), default=math.inf)
-    members = [(each, mine - score) for each, score in steps
-               if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(own, 0.0)]
+    rest = fit_causes(search.problem, others)
+    _, ratio = search.problem.robust_evidence(rest, own)
+    members = [(each, lack) for each, score in steps if is_named(each)
+               and (lack := (mine - score) / ratio) < RULED_OUT_DEFICIT] or [(own, 0.0)]
     simplest = min((each for each, _ in members), key=size)
     return (simplest if size(simplest) < size(own) else own,
             {each.cause: lack for each, lack in members})

@@ -21,8 +21,10 @@ from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import FoundCause, select_causes
+from gyro_calibration.diagnosis.noisy_reference import select_causes
 from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.search import Selection
+from gyro_calibration.diagnosis.span_problem import span_candidate
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -271,10 +273,11 @@ def test_a_cause_that_its_own_fit_does_not_show_at_the_level_is_suspected(monkey
     chance = float(2.0 * student.sf(
         abs(with_rate.values[3]) / np.sqrt(with_rate.covariance[3, 3]), with_rate.freedom[3]))
     assert chance < 0.01
+    candidate = span_candidate(name)
+    monkeypatch.setattr(noisy_reference, 'search_causes', lambda search: (candidate,))
+    monkeypatch.setattr(noisy_reference, 'confirm_causes', lambda search, causes: Selection(
+        causes, [{name: 0.0}], (), ()))
     for level, is_established in ((0.5 * chance, False), (2.0 * chance, True)):
-        found = iter([FoundCause(CauseTerm(name), 1e-4, 10.0, 1.0, True, {})])
-        monkeypatch.setattr(noisy_reference, '_find_best_cause',
-                            lambda *given, rest=found: next(rest, None))
         (cause,) = select_causes(fit, level, lambda share, words: None)[1]
         assert cause.is_established == is_established
 
