@@ -56,6 +56,8 @@ NOISE_TOLERANCE = 1.25
 #: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
 #: it is attributed to the bias after this time, s.
 _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
+#: Variance relative to that of white noise with which a rate does not measure the bias.
+_UNINFORMATIVE_RATIO = 1e6
 #: Last blocks of a rest in memory, among which its end is located.
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
 #: States of a rest in memory.
@@ -836,8 +838,12 @@ class HeadingTracker:
             count, moving = before.step_count - 1, last.moving_heading
         chances = self._rest_scatter.probabilities(likelihood)
         if not self._wheels_stand:
-            part.wander = np.array([
-                sum_ratios(max(part.duration, 1.0)) * (white * part.duration), chances])
+            ratios = sum_ratios(max(part.duration, 1.0))
+            if part.duration < 2.0 * _STEP_DURATION - TIME_TOLERANCE:
+                # Until two parts of a rest have been compared, a drive passes for one just where
+                # its rate is near the expected one, and does not measure the bias.
+                ratios = np.where(ratios > 0.0, _UNINFORMATIVE_RATIO, 0.0)
+            part.wander = np.array([ratios * (white * part.duration), chances])
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
                          - remaining.duration, moving)
         self._state = start.advance_at_rest(part)

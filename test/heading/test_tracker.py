@@ -24,12 +24,13 @@ from gyro_calibration.heading.stationary import (
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model import presets
-from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_track import track
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, poisson
 
 XV3500 = presets.XV3500.noise
@@ -404,6 +405,33 @@ def test_the_deviation_holds_where_a_vehicle_never_rests_and_each_way_bends(hind
                                     generator.normal(0.0, 0.01))
         inside.append(np.mean(np.abs(error) <= 1.96 * deviation))
     assert np.mean(inside) > 0.7, inside  # at most half, without a state of no rests
+
+
+def test_straight_ways_that_pass_for_short_rests_do_not_hide_a_drift_of_the_bias():
+    """The bias drifts by 0.25 deg/s with the temperature; the ways yaw by 0.3 deg/s over 2 s."""
+    walk, left, inside = 0.006 * DEGREE, math.exp(-1.0 / (2.0 * RATE)), []
+    model = GyroModel(noise=Noise(walk, 0.0, 0.0), self_calibration=SelfCalibration(
+        covariance=((1e-8, 0.0), (0.0, (0.005 * DEGREE) ** 2)), temperature=25.0))
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        parts = [np.zeros(round(20.0 * RATE))]
+        for _ in range(3):
+            for _ in range(8):
+                count = round(generator.uniform(10.0, 60.0) * RATE)
+                parts += [lfilter([0.3 * math.sqrt(1.0 - left ** 2)], [1.0, -left],
+                                  generator.standard_normal(count)),
+                          np.full(round(3.0 * RATE), generator.choice((-30.0, 30.0)))]
+            parts.append(np.zeros(round(15.0 * RATE)))
+        rate = np.concatenate(parts)
+        time, true = np.arange(len(rate)) / RATE, np.append(
+            0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]))) / RATE
+        temperature = 25.0 - 6.0 * (1.0 - np.exp(-time / 500.0))
+        output = (rate + 0.06 * (temperature - 25.0)) * DEGREE + walk * math.sqrt(
+            RATE) * generator.standard_normal(len(rate))
+        found = gyro_calibration.track(Log(time, output, temperature=temperature), model)
+        error = (found.heading - found.heading[0]) / DEGREE - true
+        inside.append(np.mean(np.abs(error) <= 1.96 * found.heading_std / DEGREE))
+    assert np.mean(inside) > 0.6, inside  # 0.23 where a straight way measures the bias
 
 
 def test_rests_that_agree_show_that_a_vehicle_rests():
