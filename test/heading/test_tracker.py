@@ -441,6 +441,34 @@ def test_rests_that_agree_show_that_a_vehicle_rests():
     assert deviations[0] > deviations[1] > deviations[2] and deviations[2] < 1.05 * 0.451
 
 
+@pytest.mark.parametrize('way', [5 * [(4.0, 0.6), (1.0, 0.9)], [
+    part for rate in np.linspace(-2.1, 2.1, 22) for part in ((3.0, rate), (2.0, 20.0))]],
+    ids=['pieces of a bend', 'more bends than in memory'])
+def test_bends_do_not_replace_the_bias_of_a_rest_before_them(way):
+    """Pieces of one bend do not confirm each other; the first rest is the longest."""
+    error, deviation = followed([(13.0, 0.0), *way, (4.0, 20.0), (5.0, 0.0), (4.0, -20.0)])
+    assert (np.abs(error) <= 3.0 * deviation).all() and deviation[-1] < 3.0
+
+
+@pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
+@pytest.mark.parametrize('off', [0.08, 0.15])
+def test_rests_replace_a_bias_that_is_not_that_of_the_calibration(off, hindsight):
+    """The gyro was without power since its calibration: 0.002 deg/s then."""
+    error, deviation = followed(6 * [(10.0, 0.0), (4.0, 30.0), (6.0, 3.0)], 0.002, hindsight,
+                                true_bias=off)
+    after = slice(round(20 * RATE), None)  # the first rest
+    assert (np.abs(error[after]) <= 4.0 * deviation[after]).all() and deviation[-1] < 1.0
+
+
+def test_a_steady_turn_does_not_replace_the_bias_of_a_calibration():
+    """It is never confirmed; rests at the bias of the calibration end the doubt."""
+    error, deviation = followed(
+        [(8.0, 30.0), (60.0, 0.15), (8.0, 30.0), (10.0, 0.0), (8.0, 30.0), (10.0, 0.0)], 0.002,
+        true_bias=0.0)
+    assert deviation[round(70 * RATE)] > 1.0 > deviation[-1]
+    assert np.abs(error).max() < 1.0
+
+
 def test_a_user_is_warned_of_the_ambiguity():
     model = GyroModel(noise=NOISE)
     assumptions = Assumptions(bias=0.5 * DEGREE, bias_temperature_coefficient=0.0)
