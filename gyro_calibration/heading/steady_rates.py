@@ -336,9 +336,14 @@ class SteadyRates:
         together = chances @ agrees
         best = int(np.argmax(together))
         self.variance = float(chances @ np.where(in_use, 0.0, off ** 2))
-        # a calibration is one more reason for the bias in use, as good as that for another one
-        if (in_use[best] or together[best] < _CHANGE_PROBABILITY or is_known
-                and chances[in_use].sum() > (1.0 - _CHANGE_PROBABILITY) ** 2):
+        if is_known:
+            # the calibration is one more reason, as good as that by which a bias is changed: it
+            # holds, is given up, or is in doubt
+            doubt, held = (1.0 - _CHANGE_PROBABILITY) ** 2, float(chances[in_use].sum())
+            self.variance *= held < 1.0 - doubt
+            if held > doubt:
+                return None
+        if in_use[best] or together[best] < _CHANGE_PROBABILITY:
             return None
         self.is_changing = is_known
         weights = np.where(agrees[:, best] > 0.5, agrees[:, best] * durations, 0.0)
