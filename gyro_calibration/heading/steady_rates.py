@@ -14,10 +14,14 @@ Steady rates, of which each is that of a rest or of a straight way that bends.
 To a gyro alone, a rest and a turn at a constant rate differ by the rate only. While the prior of
 the bias is wider than a rest of 1 s measures it, each steady rate within this prior may be the
 bias. If it is, each other one is a rest too, which agrees with it, or a turn, with the prior odds
-of a rest and a straight drive. Their product is the probability of each. The bias in use is that
-of the first rest; the uncertainty of the heading contains all others, and the bias is changed when
-one of them is more probable than 95 %. Under another bias the rests until then were turns: the
-heading changes by the difference times the time since its begin.
+of a rest and a straight drive. Their product is the probability of each. Equal rates without a
+turn between them are one. The bias in use is that of the first rest; the uncertainty of the
+heading contains all others, and the bias is changed when one of them is more probable than 95 %.
+Under another bias the rests until then were turns: the heading changes by the difference times the
+time since its begin.
+
+A calibration is one more rest before the others, if the bias is still that of its power-on, which
+is as probable as another one. Without rests, all steady rates are bends and the calibration holds.
 
 With a known bias, either some of the steady rates near it are rests, or the vehicle never rests. A
 bend has a rate of normal distribution and an exponential duration, and a rest may last. The share
@@ -28,7 +32,6 @@ heading is the mean of both hypotheses, and its variance contains both.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 import math
 
@@ -68,23 +71,33 @@ class _SteadyRate:
     end_time: float  # s
     step_count: int  # a single step does not tell whether its rate is steady
     is_possible: bool  # within the prior of the bias; else it is certainly a turn
+    way: int  # number of the way without a turn, on which equal rates are one
     #: Mean, rad/s, and variance of the error of the rate before it, with rests and without.
     errors: tuple[float, float, float, float]
 
     @property
     def is_candidate(self) -> bool:
         """Tell whether it may be that of a rest."""
-        return self.step_count > 1 and self.is_possible
+        return (self.step_count > 1 and self.is_possible
+                and self.turn.duration > 2.0 * MEAN_LAGS[0] - TIME_TOLERANCE)
 
 
 class SteadyRates:
     """Steady rates, the ambiguity of the bias by them, and the state if there was no rest."""
 
-    def __init__(self, state: HeadingState, covariance: Array):
-        """Begin with a state and the covariance of the calibration, shape (m, m)."""
-        self._covariance = covariance
-        self._ended = deque[_SteadyRate](maxlen=_MAX_RATES)
+    def __init__(self, state: HeadingState, covariance: Array, turn_on: float):
+        """
+        Begin with a state and the covariance of the calibration, shape (m, m).
+
+        It holds, or the bias is that of another power-on, with this standard deviation, rad/s;
+        both are as probable.
+        """
+        self._covariance, self._turn_on_variance = covariance, turn_on ** 2
+        self._ended = list[_SteadyRate]()
         self._last: _SteadyRate | None = None
+        self._way, self._way_rate, self._begin_time = 0, math.inf, math.inf
+        self._is_calibrated = self.is_changing = self._has_changed = False
+        self._agreement = 0.0  # largest square of the difference of rates over 1 s, (rad/s)²
         #: Mean square of the difference between the bias in use and the right one, (rad/s)².
         self.variance = 0.0
         #: Probability that the vehicle never rests; 0 with an unknown bias.
@@ -120,12 +133,17 @@ class SteadyRates:
             self._log_weights = _LOG_PRIORS
             self.moving_probability = self._ended_probability = float(
                 np.exp(_LOG_PRIORS[0]).sum())
+        # else the prior contains the scatter of power-ons
+        self._is_calibrated = prior < 0.5 * self._turn_on_variance
+        widest = prior + self._turn_on_variance * self._is_calibrated
+        is_possible = rate ** 2 < sigmas ** 2 * (widest + white / still.duration)
+        self._agreement, self._begin_time = sigmas ** 2 * white, min(
+            self._begin_time, time - turn.duration)
+        self._way += not is_possible
         last, freedom = self._last, still.block_count - 1
         is_steady = is_rest or freedom <= 0 or still.block_square_sum - still.angle * rate <= (
             white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas))))
-        if is_steady and last is not None and (
-                rate - last.turn.angle / last.turn.duration) ** 2 < (
-                sigmas ** 2 * white * (1.0 / still.duration + 1.0 / last.turn.duration)):
+        if is_steady and last is not None and self._agree(last.turn, still):
             still, count, errors = last.turn + still, last.step_count + 1 + is_rest, last.errors
         else:
             self.end(before.noise)
@@ -138,13 +156,21 @@ class SteadyRates:
         if not is_steady:
             return False
         # of the whole: parts of one rate at the limit would confirm each other
-        self._last = _SteadyRate(
-            still, time, count,
-            still.angle ** 2 < sigmas ** 2 * still.duration * (prior * still.duration + white),
-            errors)
-        if count > 1 and still.duration >= 2.0 * self._evaluated_duration:
+        rate = still.angle / still.duration
+        is_possible = rate ** 2 < sigmas ** 2 * (widest + white / still.duration)
+        if count > 1 and is_possible:
+            self._way += (rate - self._way_rate) ** 2 > MAX_SCATTER_RATIO * white
+            self._way_rate = rate
+        self._last = _SteadyRate(still, time, count, is_possible, self._way, errors)
+        is_due = count > 1 and still.duration >= 2.0 * self._evaluated_duration
+        if is_due:
             self._evaluate(before.noise)
-        return self._log_weights is None and self._last.is_candidate
+        return self._last.is_candidate and (
+            self.is_changing or is_due if self._is_calibrated else self._log_weights is None)
+
+    def _agree(self, one: RateIntegral, other: RateIntegral) -> bool:
+        return (one.angle / one.duration - other.angle / other.duration) ** 2 < (
+            self._agreement * (1.0 / one.duration + 1.0 / other.duration))
 
     def _evaluate(self, noise: Noise, has_ended: bool = False) -> None:
         """Update the probability that the vehicle never rests with the last rate."""
@@ -189,6 +215,16 @@ class SteadyRates:
                 bent = np.array([bends * duration ** 2, chances[0] / chances[0].sum()])
                 self.restart(self.moving_state(noise).advance_at_rest(replace(turn, wander=bent)))
 
+    def adopt(self, state: HeadingState, variance: float) -> None:
+        """Continue with the state after a change of the bias, and with `variance` after it."""
+        self.restart(state)
+        self.variance = variance
+        self.is_changing, self._has_changed = False, True
+        if self._log_weights is not None:
+            self._log_weights = _LOG_PRIORS.copy()
+            self._log_weights[0] += math.log(1.0 / _CHANGE_PROBABILITY - 1.0)
+            self.moving_probability = self._ended_probability = 1.0 - _CHANGE_PROBABILITY
+
     def moving_heading(self, noise: Noise) -> tuple[float, float]:
         """Return the heading now if there was no rest, rad, and its variance, rad²."""
         return replace(self._moving, noise=noise).heading(self._since)
@@ -217,51 +253,100 @@ class SteadyRates:
         """End the last steady rate."""
         self._evaluate(noise, has_ended=True)
         self.moving_probability = self._ended_probability
-        if self._last is not None and self._last.is_candidate:
-            self._ended.append(self._last)
+        self._ended = self._candidates()
+        if len(self._ended) > _MAX_RATES:
+            self._ended.remove(min(self._ended, key=lambda each: each.turn.duration))
         self._last, self._evaluated_duration = None, 0.0
 
-    def compare(self, state: HeadingState, sigmas: float) -> tuple[float, float] | None:
-        """Update `variance`; return the change to a likelier bias, rad/s, and its variance."""
-        rates = [*self._ended, *([self._last] if self._last and self._last.is_candidate else [])]
-        noise, count = state.noise, len(rates)
-        if count < 2:
+    def _candidates(self) -> list[_SteadyRate]:
+        """Return the rates that may be the bias, of which equal ones on one way are one."""
+        last, found = self._last, self._ended
+        if last is None or not last.is_candidate:
+            return found
+        for place, each in enumerate(found):
+            if each.way == last.way and self._agree(each.turn, last.turn):
+                return [*found[:place], *found[place + 1:],
+                        replace(last, turn=each.turn + last.turn)]
+        return [*found, last]
+
+    def compare(self, state: HeadingState, sigmas: float) -> tuple[float, float, float] | None:
+        """
+        Update `variance`; return the change to a likelier bias, or None.
+
+        The change, rad/s, is that for `adopt`, with its variance and the value of `variance` after
+        it, (rad/s)².
+        """
+        rates, noise, is_known = self._candidates(), state.noise, self._is_calibrated
+        self.is_changing = False
+        if len(rates) + is_known < 2 or not rates:
             return None
         white, floor = noise.angle_random_walk ** 2, noise.allan_floor ** 2
         durations, ends = np.array([(each.turn.duration, each.end_time) for each in rates]).T
         rows = np.array([each.turn.sensitivity for each in rates]) / durations[:, None]
         rate = np.array([each.turn.angle for each in rates]) / durations
+        # variances of the prior
+        prior = ((rows @ self._covariance) * rows).sum(axis=1)
+        lasting = durations
+        if is_known:
+            # a calibration is one more rest before the others, as long as it is certain, and not
+            # refuted by a single turn, however long
+            rate, rows = np.append(rate, 0.0), np.append(rows, rows[-1:], axis=0)
+            lasting = np.minimum(np.append(durations, 0.0), MEAN_LAGS[-1])
+            durations = np.append(durations, white / max(prior[-1], np.finfo(float).tiny))
+            ends, prior = np.append(ends, self._begin_time), np.append(prior, prior[-1])
         # less the bias in use
         off = rate - state.wander_rate[0] + rows @ state.calibration_errors[0]
-        # variances of the prior, and of the difference of two rests
-        prior = ((rows @ self._covariance) * rows).sum(axis=1)
+        # variances of the difference of two rests
         apart = rows[:, None] - rows
         same = (white * (1.0 / durations[:, None] + 1.0 / durations) + 2.0 * floor
                 + noise.rate_random_walk ** 2 * np.abs(ends[:, None] - ends)
                 + ((apart @ self._covariance) * apart).sum(axis=2))
         turned = np.unique(SCATTER_RATIOS[1:]) * white
+        prior += self._turn_on_variance * is_known
         turned = turned[turned <= MAX_SCATTER_RATIO * prior.max()]
         square = (rate[:, None] - rate) ** 2
         as_rest = np.log(_REST_PROBABILITY) - 0.5 * (square / same + np.log(same))
         spread = same + turned[:, None, None]
-        as_turn = (np.log((1.0 - _REST_PROBABILITY) / len(turned))
-                   - durations[:, None] / MEAN_LAGS[-1]
-                   + logsumexp(-0.5 * (square / spread + np.log(spread)), axis=0))
+        turns = (-0.5 * (square / spread + np.log(spread)) - np.log(len(turned))
+                 - lasting[:, None] / MEAN_LAGS[-1])
+        as_turn = np.log(1.0 - _REST_PROBABILITY) + logsumexp(turns, axis=0)
+        assumed = -0.5 * (rate ** 2 / prior + np.log(prior))
+        if is_known:
+            # without rests, all others are turns of one size
+            never = float(logsumexp(turns[:, :-1, -1].sum(axis=1) + (
+                len(rates) - 1) * np.log(len(turned))))
+            as_rest[-1] += np.log(0.5 / _REST_PROBABILITY)
+            as_turn[-1], assumed = np.log(0.5) + assumed, np.zeros(len(rate))
         either = np.logaddexp(as_rest, as_turn)
-        np.fill_diagonal(either, 0.0)
-        np.fill_diagonal(as_rest, 0.0)
+        own = np.log(_REST_PROBABILITY) * np.ones(len(rate))
+        own[len(rates):] = np.log(0.5)
+        np.fill_diagonal(either, own)
+        np.fill_diagonal(as_rest, own)
         agrees = np.exp(as_rest - either)  # of each (row) if another (column) is a rest
-        chances = softmax(-0.5 * (rate ** 2 / prior + np.log(prior)) + either.sum(axis=0)
-                          - np.log(agrees.sum(axis=0)))
-        in_use = off ** 2 < sigmas ** 2 * np.diagonal(same)
-        if not in_use.any():
+        chances = softmax(np.append(
+            assumed + either.sum(axis=0) - np.log(agrees.sum(axis=0)),
+            never if is_known else -math.inf))
+        unrested, chances = float(chances[-1]), chances[:-1]
+        chances[-1] += unrested  # and with the bias of the calibration
+        # the rate whose bias is in use: first that of the calibration
+        used = int(np.argmin(np.abs(off))) if self._has_changed or not is_known else len(rates)
+        if used < len(rates) and off[used] ** 2 > sigmas ** 2 * same[used, used]:
             return None
+        in_use = agrees[:, used] > 0.5
         together = chances @ agrees
         best = int(np.argmax(together))
+        self.variance = float(chances @ np.where(in_use, 0.0, off ** 2))
+        if is_known:
+            # the calibration is one more reason, as good as that by which a bias is changed: it
+            # holds, is given up, or is in doubt
+            doubt, held = (1.0 - _CHANGE_PROBABILITY) ** 2, float(chances[in_use].sum())
+            self.variance *= held < 1.0 - doubt
+            if held > doubt:
+                return None
         if in_use[best] or together[best] < _CHANGE_PROBABILITY:
-            self.variance = float(chances @ np.where(in_use, 0.0, off ** 2))
             return None
-        weights = agrees[:, best] * durations
+        self.is_changing = is_known
+        weights = np.where(agrees[:, best] > 0.5, agrees[:, best] * durations, 0.0)
         change = float(weights @ off / weights.sum())
-        self.variance = float(chances @ np.where(agrees[:, best] > 0.5, 0.0, (off - change) ** 2))
-        return change, white / float(weights.sum()) + floor
+        return (change, white / float(weights.sum()) + floor,
+                float(chances @ np.where(weights > 0.0, 0.0, (off - change) ** 2)))

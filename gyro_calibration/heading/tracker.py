@@ -56,6 +56,8 @@ NOISE_TOLERANCE = 1.25
 #: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
 #: it is attributed to the bias after this time, s.
 _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
+#: Variance relative to that of white noise with which a rate does not measure the bias.
+_UNINFORMATIVE_RATIO = 1e6
 #: Last blocks of a rest in memory, among which its end is located.
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
 #: States of a rest in memory.
@@ -71,6 +73,9 @@ class TrackerSettings:
     false_alarms: float = 0.1
     threshold: Threshold = Threshold(0.0)
     maximum_gap: float = MAX_GAP  # longest gap in the stamps that is integrated, s
+    #: Standard deviation of the bias from one power-on to the next, rad/s, of all gyros together:
+    #: of most 0.05 deg/s or less, of one in five 0.2 (`bias_table`).
+    turn_on: float = 0.1 * DEGREE
 
 
 class HeadingTracker:
@@ -139,7 +144,8 @@ class HeadingTracker:
         self._open_variance: float | None = None
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         # None with wheels, which tell of rests
-        self._steady_rates: SteadyRates | None = SteadyRates(self._state, covariance)
+        self._steady_rates: SteadyRates | None = SteadyRates(
+            self._state, covariance, self._settings.turn_on)
         self._mixture_variance = 0.0  # of the heading, beyond that of the state, rad²
         self._moving_heading = 0.0, 0.0  # before the last step, as in `TrackStep`
         self._heading_begin_time = self._last_time
@@ -527,7 +533,12 @@ class HeadingTracker:
                 self._revert_to_motion(WINDOW_DURATION)
             elif self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
                 self._advance_state()
-                self._compare_means(wheels)
+                if self._steady_rates is not None and self._steady_rates.is_changing:
+                    # of this rest too, which begins again with the next step
+                    self._revert_to_motion(self._rest_integral.duration)
+                    self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
+                else:
+                    self._compare_means(wheels)
             return
         if not quiet or wheels:
             self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
@@ -788,15 +799,18 @@ class HeadingTracker:
                     and (not self.is_resting or rates.variance)
                     and (change := rates.compare(self._state, sigmas)) and not self.is_resting):
                 self._state = self._state.with_bias_change(
-                    *change, end - self._heading_begin_time)
+                    *change[:2], end - self._heading_begin_time)
+                rates.adopt(self._state, change[2])
                 # there was no rest: the steps are computed again with the change
                 first = self.recalibrations[-1][0] if self.recalibrations else 0
                 if self._keeps_steps:
-                    state = self.steps[first].state_before
+                    state, row = self.steps[first].state_before, still.sensitivity / still.duration
                     state = state.with_bias_change(
-                        change[0] + self._state.wander_rate[0], change[1], 0.0)
+                        self._state.rate_error(row)[0] - state.rate_error(row)[0], change[1], 0.0)
                 for place, step in enumerate(self.steps[first:], first):
-                    self.steps[place] = replace(step, state_before=state, is_resting=False)
+                    self.steps[place] = replace(
+                        step, state_before=state, is_resting=False,
+                        moving_heading=state.heading(self._zero_integral))
                     state = state.propagate(step.rate_integral)
         self._adopt_state()
 
@@ -836,8 +850,12 @@ class HeadingTracker:
             count, moving = before.step_count - 1, last.moving_heading
         chances = self._rest_scatter.probabilities(likelihood)
         if not self._wheels_stand:
-            part.wander = np.array([
-                sum_ratios(max(part.duration, 1.0)) * (white * part.duration), chances])
+            ratios = sum_ratios(max(part.duration, 1.0))
+            if part.duration < 2.0 * _STEP_DURATION - TIME_TOLERANCE:
+                # Until two parts of a rest have been compared, a drive passes for one just where
+                # its rate is near the expected one, and does not measure the bias.
+                ratios = np.where(ratios > 0.0, _UNINFORMATIVE_RATIO, 0.0)
+            part.wander = np.array([ratios * (white * part.duration), chances])
         step = TrackStep(start, part, True, self._last_time - self._block_integral.duration
                          - remaining.duration, moving)
         self._state = start.advance_at_rest(part)

@@ -161,7 +161,8 @@ def test_compensate_warns_of_a_bias_that_is_not_calibrated(compensate, words, sa
     """The robot turns at 0.3 deg/s where the log begins, then rests."""
     generator = np.random.default_rng(1)
     rate = np.where(np.arange(3000) < 1500, 0.3 * DEGREE, 0.0)
-    log = Log(output=rate + 1e-3 * generator.standard_normal(3000), time=np.arange(3000) / 100.0)
+    log = Log(output=rate + 0.01 * known + 1e-3 * generator.standard_normal(3000),
+              time=np.arange(3000) / 100.0)
     model = f'effects: {effects}\ncovariance: [[1.0e-8]]\nnoise: {{angle_random_walk: 1.0e-4}}'
     text = compensate(log, model, *words).text
     assert ('The bias is not known from a calibration' in text and said in text) != known

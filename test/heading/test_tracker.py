@@ -24,12 +24,13 @@ from gyro_calibration.heading.stationary import (
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model import presets
-from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_track import track
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, poisson
 
 XV3500 = presets.XV3500.noise
@@ -406,11 +407,66 @@ def test_the_deviation_holds_where_a_vehicle_never_rests_and_each_way_bends(hind
     assert np.mean(inside) > 0.7, inside  # at most half, without a state of no rests
 
 
+def test_straight_ways_that_pass_for_short_rests_do_not_hide_a_drift_of_the_bias():
+    """The bias drifts by 0.25 deg/s with the temperature; the ways yaw by 0.3 deg/s over 2 s."""
+    walk, left, inside = 0.006 * DEGREE, math.exp(-1.0 / (2.0 * RATE)), []
+    model = GyroModel(noise=Noise(walk, 0.0, 0.0), self_calibration=SelfCalibration(
+        covariance=((1e-8, 0.0), (0.0, (0.005 * DEGREE) ** 2)), temperature=25.0))
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        parts = [np.zeros(round(20.0 * RATE))]
+        for _ in range(3):
+            for _ in range(8):
+                count = round(generator.uniform(10.0, 60.0) * RATE)
+                parts += [lfilter([0.3 * math.sqrt(1.0 - left ** 2)], [1.0, -left],
+                                  generator.standard_normal(count)),
+                          np.full(round(3.0 * RATE), generator.choice((-30.0, 30.0)))]
+            parts.append(np.zeros(round(15.0 * RATE)))
+        rate = np.concatenate(parts)
+        time, true = np.arange(len(rate)) / RATE, np.append(
+            0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]))) / RATE
+        temperature = 25.0 - 6.0 * (1.0 - np.exp(-time / 500.0))
+        output = (rate + 0.06 * (temperature - 25.0)) * DEGREE + walk * math.sqrt(
+            RATE) * generator.standard_normal(len(rate))
+        found = gyro_calibration.track(Log(time, output, temperature=temperature), model)
+        error = (found.heading - found.heading[0]) / DEGREE - true
+        inside.append(np.mean(np.abs(error) <= 1.96 * found.heading_std / DEGREE))
+    assert np.mean(inside) > 0.6, inside  # 0.23 where a straight way measures the bias
+
+
 def test_rests_that_agree_show_that_a_vehicle_rests():
     """After four rests the deviation is that of a vehicle that is known to rest, 0.451 deg."""
     deviations = [followed([*(rests * [(10.0, 0.0), (4.0, 30.0)]), (60.0, 10.0)], 0.01,
                            true_bias=0.01)[1][-1] for rests in (0, 1, 4)]
     assert deviations[0] > deviations[1] > deviations[2] and deviations[2] < 1.05 * 0.451
+
+
+@pytest.mark.parametrize('way', [5 * [(4.0, 0.6), (1.0, 0.9)], [
+    part for rate in np.linspace(-2.1, 2.1, 22) for part in ((3.0, rate), (2.0, 20.0))]],
+    ids=['pieces of a bend', 'more bends than in memory'])
+def test_bends_do_not_replace_the_bias_of_a_rest_before_them(way):
+    """Pieces of one bend do not confirm each other; the first rest is the longest."""
+    error, deviation = followed([(13.0, 0.0), *way, (4.0, 20.0), (5.0, 0.0), (4.0, -20.0)])
+    assert (np.abs(error) <= 3.0 * deviation).all() and deviation[-1] < 3.0
+
+
+@pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
+@pytest.mark.parametrize('off', [0.08, 0.15])
+def test_rests_replace_a_bias_that_is_not_that_of_the_calibration(off, hindsight):
+    """The gyro was without power since its calibration: 0.002 deg/s then."""
+    error, deviation = followed(6 * [(10.0, 0.0), (4.0, 30.0), (6.0, 3.0)], 0.002, hindsight,
+                                true_bias=off)
+    after = slice(round(20 * RATE), None)  # the first rest
+    assert (np.abs(error[after]) <= 4.0 * deviation[after]).all() and deviation[-1] < 1.0
+
+
+def test_a_steady_turn_does_not_replace_the_bias_of_a_calibration():
+    """It is never confirmed; rests at the bias of the calibration end the doubt."""
+    error, deviation = followed(
+        [(8.0, 30.0), (60.0, 0.15), (8.0, 30.0), (10.0, 0.0), (8.0, 30.0), (10.0, 0.0)], 0.002,
+        true_bias=0.0)
+    assert deviation[round(70 * RATE)] > 1.0 > deviation[-1]
+    assert np.abs(error).max() < 1.0
 
 
 def test_a_user_is_warned_of_the_ambiguity():
