@@ -90,6 +90,8 @@ class Search:
 
     def candidate_evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
+        if not self.candidates:
+            return np.empty(0)
         # for the rate that the gyro senses, with shapes to two digits
         logs = self.problem.distorted([
             replace(each, shapes=tuple(float(f'{shape:.2g}') for shape in each.shapes))
@@ -104,7 +106,7 @@ def _candidate_columns(problem: Any, candidates: tuple[Candidate, ...],
                        logs: tuple[Any, ...]) -> ColumnGroups:
     parts = [problem.rows(each, logs) for each in candidates]
     ends = np.cumsum([len(part) for part in parts]).tolist()
-    return group_columns(problem, np.concatenate(parts or [np.empty((0, 1))]), [
+    return group_columns(problem, np.concatenate(parts), [
         range(end - len(part), end) for end, part in zip(ends, parts)])
 
 
