@@ -379,7 +379,7 @@ def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
     """
-    Give the named causes, and the doubtful ones as suspected, each given all named causes.
+    Give the named causes, and the uncertain ones as suspected, each given all named causes.
 
     A cause that is not significant where the noise has a random walk of any size may be that.
     """

@@ -301,33 +301,8 @@ class SteadyRates:
         same = (white * (1.0 / durations[:, None] + 1.0 / durations) + 2.0 * floor
                 + noise.rate_random_walk ** 2 * np.abs(ends[:, None] - ends)
                 + ((apart @ self._covariance) * apart).sum(axis=2))
-        turned = np.unique(SCATTER_RATIOS[1:]) * white
         prior += self._turn_on_variance * is_known
-        turned = turned[turned <= MAX_SCATTER_RATIO * prior.max()]
-        square = (rate[:, None] - rate) ** 2
-        as_rest = np.log(_REST_PROBABILITY) - 0.5 * (square / same + np.log(same))
-        spread = same + turned[:, None, None]
-        turns = (-0.5 * (square / spread + np.log(spread)) - np.log(len(turned))
-                 - lasting[:, None] / MEAN_LAGS[-1])
-        as_turn = np.log(1.0 - _REST_PROBABILITY) + logsumexp(turns, axis=0)
-        assumed = -0.5 * (rate ** 2 / prior + np.log(prior))
-        if is_known:
-            # without rests, all others are turns of one size
-            never = float(logsumexp(turns[:, :-1, -1].sum(axis=1) + (
-                len(rates) - 1) * np.log(len(turned))))
-            as_rest[-1] += np.log(0.5 / _REST_PROBABILITY)
-            as_turn[-1], assumed = np.log(0.5) + assumed, np.zeros(len(rate))
-        either = np.logaddexp(as_rest, as_turn)
-        own = np.log(_REST_PROBABILITY) * np.ones(len(rate))
-        own[len(rates):] = np.log(0.5)
-        np.fill_diagonal(either, own)
-        np.fill_diagonal(as_rest, own)
-        agrees = np.exp(as_rest - either)  # of each (row) if another (column) is a rest
-        chances = softmax(np.append(
-            assumed + either.sum(axis=0) - np.log(agrees.sum(axis=0)),
-            never if is_known else -math.inf))
-        unrested, chances = float(chances[-1]), chances[:-1]
-        chances[-1] += unrested  # and with the bias of the calibration
+        agrees, chances = _compare_rests(rate, prior, same, lasting, white, is_known)
         # the rate whose bias is in use: first that of the calibration
         used = int(np.argmin(np.abs(off))) if self._has_changed or not is_known else len(rates)
         if used < len(rates) and off[used] ** 2 > sigmas ** 2 * same[used, used]:
@@ -338,10 +313,10 @@ class SteadyRates:
         self.variance = float(chances @ np.where(in_use, 0.0, off ** 2))
         if is_known:
             # the calibration is one more reason, as good as that by which a bias is changed: it
-            # holds, is given up, or is in doubt
-            doubt, held = (1.0 - _CHANGE_PROBABILITY) ** 2, float(chances[in_use].sum())
-            self.variance *= held < 1.0 - doubt
-            if held > doubt:
+            # holds, is given up, or neither is decided
+            least, held = (1.0 - _CHANGE_PROBABILITY) ** 2, float(chances[in_use].sum())
+            self.variance *= held < 1.0 - least
+            if held > least:
                 return None
         if in_use[best] or together[best] < _CHANGE_PROBABILITY:
             return None
@@ -350,3 +325,41 @@ class SteadyRates:
         change = float(weights @ off / weights.sum())
         return (change, white / float(weights.sum()) + floor,
                 float(chances @ np.where(weights > 0.0, 0.0, (off - change) ** 2)))
+
+
+def _compare_rests(rate: Array, prior: Array, same: Array, lasting: Array, white: float,
+                   is_known: bool) -> tuple[Array, Array]:
+    """
+    Return the probabilities that rates are rests if another is one, and that each is the bias.
+
+    Of k rates, rad/s, given are the variances of their prior, shape (k,), and of the difference of
+    two rests, (k, k), (rad/s)², their durations, s, and the variance of white noise over 1 s. The
+    last may be that of a calibration. The results have the shapes (k, k), with the other rate by
+    column, and (k,).
+    """
+    turned, count = np.unique(SCATTER_RATIOS[1:]) * white, len(rate)
+    turned = turned[turned <= MAX_SCATTER_RATIO * prior.max()]
+    square = (rate[:, None] - rate) ** 2
+    as_rest = np.log(_REST_PROBABILITY) - 0.5 * (square / same + np.log(same))
+    spread = same + turned[:, None, None]
+    turns = (-0.5 * (square / spread + np.log(spread)) - np.log(len(turned))
+             - lasting[:, None] / MEAN_LAGS[-1])
+    as_turn = np.log(1.0 - _REST_PROBABILITY) + logsumexp(turns, axis=0)
+    assumed, never = -0.5 * (rate ** 2 / prior + np.log(prior)), -math.inf
+    own = np.log(_REST_PROBABILITY) * np.ones(count)
+    if is_known:
+        # without rests, all others are turns of one size
+        never = float(logsumexp(turns[:, :-1, -1].sum(axis=1) + (
+            count - 2) * np.log(len(turned))))
+        own[-1] = np.log(0.5)
+        as_rest[-1] += np.log(0.5 / _REST_PROBABILITY)
+        as_turn[-1], assumed = np.log(0.5) + assumed, np.zeros(count)
+    either = np.logaddexp(as_rest, as_turn)
+    np.fill_diagonal(either, own)
+    np.fill_diagonal(as_rest, own)
+    agrees = np.exp(as_rest - either)
+    chances = softmax(np.append(
+        assumed + either.sum(axis=0) - np.log(agrees.sum(axis=0)), never))
+    unrested, chances = float(chances[-1]), chances[:-1]
+    chances[-1] += unrested  # and with the bias of the calibration
+    return agrees, chances
