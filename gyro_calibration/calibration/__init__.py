@@ -13,5 +13,5 @@ Logs to a model: self-calibration, whole turns, rate table, encoder, course over
 
 Reading order: `noise_grid`, `run_faults`, `likelihood`, `self_calibration`, `whole_turns`,
 `motion_design`, `dwells`, `scatter`, `rate_table`, `selection`, `reference_noise`, `spans`,
-`heading_regression`, `encoder`.
+`heading_regression`, `reference_kind`, `encoder`.
 """

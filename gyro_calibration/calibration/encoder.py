@@ -29,8 +29,7 @@ from typing import NamedTuple
 from gyro_calibration.calibration.dwells import (
     extract_dwells, FEW_DWELLS_SHARE, few_values_remedy, find_lost_reference, format_list,
     join_dwells, MIN_DWELL_SHARE, NothingSteady)
-from gyro_calibration.calibration.heading_regression import (
-    find_motion_errors, fit_course, is_noisy, MAX_FOLLOWED_RESIDUAL)
+from gyro_calibration.calibration.heading_regression import fit_course, MAX_FOLLOWED_RESIDUAL
 from gyro_calibration.calibration.likelihood import (
     correct_shaft, fit_likelihood, MAX_BLOCK_DURATION, MISALIGNMENT_REMEDY, oblique_angle,
     ScaleBiasFit)
@@ -38,8 +37,9 @@ from gyro_calibration.calibration.noise_grid import (
     BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, GridFit,
     HierarchicalPrior, TridiagonalMatrix)
 from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.reference_kind import find_reference_kind, is_noisy
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings, is_course, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
+    drop_repeated_headings, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
     fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
@@ -109,12 +109,13 @@ def calibrate_encoder(log: Log, method: str | None = None,
     refuse_wrapped(log)
     log, repeated = drop_repeated_headings(log)
     time, output, motion, crossing = _extract_motion(log)
-    spans = None
-    if method is None and log.reference_heading is None:
-        method = 'course' if find_motion_errors(log) is not None else 'likelihood'
-    elif method is None:
-        spans = lay_out_spans(log, technology=technology)
-        method = 'course' if is_course(log) or is_noisy(log, spans) else 'likelihood'
+    spans = None if method or log.reference_heading is None else lay_out_spans(
+        log, technology=technology)
+    if method is None:
+        kind, _ = find_reference_kind(log, spans)
+        method = 'course' if kind in ('course', 'odometry') or (
+            spans is not None and is_noisy(log, spans)) else 'likelihood'
+    if spans is not None:
         longest = float(np.ptp(_find_holes(time), axis=1).max(initial=0.0))
         if longest < 0.5 * motion.duration and (
                 hole := _find_turn_in_hole(time, output, motion)):

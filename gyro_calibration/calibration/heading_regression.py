@@ -29,34 +29,27 @@ import math
 from typing import Any
 
 from gyro_calibration.calibration.dwells import find_lost_reference
-from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
+from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     average_hypotheses, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior)
-from gyro_calibration.calibration.reference_noise import (
-    MAX_GYRO_LAG, MAX_ROUNDING_STEP, MIN_COURSE_NOISE)
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
-from gyro_calibration.calibration.selection import FALSE_ALARM_RATE, TECHNOLOGY_PRIORS
+from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.spans import (
     BASE_VALUES, CauseTerm, design_matrix, DRIFT_TERM, MISALIGNMENT_TERM, Spans, WIDE_PRIOR)
-from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
-    bridge_gaps, cross_rotation, quantization_step, robust_deviation, white_noise_deviation)
+    robust_deviation)
 from gyro_calibration.model.motion import motion_from_headings
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import expit
-from scipy.stats import f as fisher
 from scipy.stats import t as student
-from scipy.stats import ttest_1samp
 
 #: Least effective number of stretches of an established value.
 MIN_STRETCHES = 3.0
 #: Least number of spans, and largest deviation in a span from a gyro that follows, rad.
 _MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 10, 3.0 * DEGREE
-#: Lags that are fitted to see whether a motion follows a rate late, to both sides, s.
-_ERROR_LAGS = np.array([0.0, 0.05, 0.1, 0.2, 0.4, 0.8])
 
 
 @dataclass(frozen=True)
@@ -158,10 +151,10 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
 
 def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Array]:
     """Return the spans with the rate corrected by first values, and variances of points."""
-    corrected, scale = replace(spans, delay=spans.delay or _find_delay(spans)), 0.0
+    corrected, scale = replace(spans, delay=spans.delay or find_reference_delay(spans)), 0.0
     for number in range(20):
-        values, left = _robust_least_squares(design_matrix(corrected, causes), corrected.observed,
-                                             spans.prior_deviations(causes))
+        values, left = robust_least_squares(design_matrix(corrected, causes), corrected.observed,
+                                            spans.prior_deviations(causes))
         corrected = corrected.with_corrected_rate(values, causes)
         change, scale = values[0] - scale, values[0]
         # the columns are of the rate by the scale before
@@ -170,14 +163,14 @@ def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Arr
     return corrected, _point_variances(corrected, left)
 
 
-def _find_delay(spans: Spans) -> float:
+def find_reference_delay(spans: Spans) -> float:
     """Return the trial delay of the best agreement of gyro and reference, s."""
     run = split_run(spans.stamps - spans.time[0], spans.output)
     return fit_profile(run, motion_from_headings(spans.time, spans.heading),
                        spans.treatment.largest_delay)[2]
 
 
-def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
+def robust_least_squares(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
     """Return values by robust weighted least squares, and the residual."""
     left: Array = observed
     values: Array = np.zeros(columns.shape[1])
@@ -430,151 +423,3 @@ def fit_course(spans: Spans) -> ScaleBiasFit:
                         reference_adds_up=spans.adds_up and bool(spans.stands.all()),
                         misalignment=fit.values[axes],
                         misalignment_covariance=covariance[axes, axes])
-
-
-def find_drift(spans: Spans) -> tuple[float, float] | None:
-    """
-    Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
-
-    The bias that the motion shows is compared with that of the rests in which the reference
-    stands. Either may change steadily with time, and what depends on the rate is not of the
-    reference. None without such rests, or where both agree as a whole (Welch's test, at 0.01 %)
-    or in the ways from rest to rest, each compared with the rests around it, as the bias may
-    wander (at 1 %).
-    """
-    rests = spans.rests[spans.stands]
-    if len(rests) < 2:
-        return None
-    time, output = np.asarray(spans.log.time), np.asarray(spans.log.output)
-    halves = [half for first, last in rests
-              for half in np.array_split(np.arange(first, last + 1), 2)]
-    middle, means = 0.5 * time[-1], np.array([output[half].mean() for half in halves])
-    spans = spans.with_corrected_rate(np.array([0.0, means.mean(), 0.0]))
-    rows = np.column_stack([spans.observed, design_matrix(
-        spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])])
-    rows = -rows[:len(spans.time) - 1]
-    rows = rows[rows[:, 2] > 0.0]
-    in_motion = np.insert(rows[:, [2, 1, 3, 6]], 1, rows[:, 5] - middle * rows[:, 2], axis=1)
-    at_rest = np.array([(1.0, time[half].mean() - middle) for half in halves])
-    if any(len(each) <= each.shape[1] for each in (in_motion, at_rest)):
-        return None
-    of_motion, one, freedom_of_one, left = _weighted_fit(in_motion, rows[:, 0], 1.0 / rows[:, 2])
-    of_rests, other, freedom_of_other, _ = _weighted_fit(
-        at_rest, means, np.array([len(half) for half in halves], dtype=float))
-    freedom = (one + other) ** 2 / (one ** 2 / freedom_of_one + other ** 2 / freedom_of_other
-                                    + 1e-300)
-    drift = of_rests[0] - of_motion[0]
-    deviation = math.hypot(math.sqrt(one + other), spans.rest_rounding)
-    # with a drifting bias, exact encoders are beyond 1 % more often than stated
-    if abs(drift) <= student.isf(5e-5, freedom) * deviation:
-        return None
-    # the bias on each way from rest to rest, and that of the rests around it
-    way = np.searchsorted(time[rests[:, 0]], in_motion[:, 1] / in_motion[:, 0] + middle) - 1
-    ways = len(rests) - 1
-    inside = (way >= 0) & (way < ways)
-    turned, duration = (np.bincount(way[inside], each[inside], ways) for each in (
-        in_motion[:, :2] @ of_motion[:2] + left, in_motion[:, 0]))
-    of_each = means.reshape(-1, 2).mean(axis=1)
-    known = duration > 0.0
-    differences = (turned[known] / duration[known]
-                   - 0.5 * (of_each[1:] + of_each[:-1])[known])
-    if len(differences) < 3 or ttest_1samp(differences, 0.0).pvalue > 0.01:
-        return None
-    return drift, float(student.ppf(0.975, freedom)) * deviation
-
-
-def _weighted_fit(columns: Array, observed: Array,
-                  weights: Array) -> tuple[Array, float, int, Array]:
-    """Return values, variance of the first, its degrees of freedom, and residual."""
-    root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
-    inverse = np.linalg.pinv(root[:, None] * columns)
-    values = inverse @ (root * observed)
-    left = observed - columns @ values
-    variance = float(weights @ left ** 2 / freedom * inverse[0] @ inverse[0])
-    return values, variance, freedom, left
-
-
-def find_motion_errors(log: Log) -> tuple[float, float] | None:
-    """
-    Return how odometry errs over a second in motion, and the gyro in rests, rad.
-
-    Such a rate is exactly 0 in rests, and such a heading constant. In motion it errs by more than
-    the gyro: the variance of the difference of their turns is more than twice that of rests
-    (F-test, at 1 %), beyond what a delay, a lag, an error once per revolution or effects of the
-    gyro explain, which are smooth functions of the rate (differences of neighbours: Rice, Annals
-    of Statistics 12, 1984). None for another reference, for one that is mostly steady in motion,
-    as of a rate table, and for one that the motion follows later than a gyro does, as a robot its
-    command.
-    """
-    time, by_rate = log.time, log.reference_rate is not None
-    reference = log.reference_rate if by_rate else log.reference_heading
-    known = np.isfinite([] if reference is None else reference)
-    if reference is None or time is None or log.output is None or not known.any():
-        return None
-    reference = np.interp(time, time[known], reference[known])
-    rate = reference if by_rate else np.gradient(reference, time)
-    turned = integrate(time, bridge_gaps(log.output))
-    powers = [integrate(time, each) for each in (
-        rate, np.abs(rate), rate ** 2, rate ** 3, (time - time.mean()) * rate)]
-    if not by_rate:
-        powers += [np.sin(reference), np.cos(reference)]
-    at = np.arange(time[0] + _ERROR_LAGS[-1], time[-1] - _ERROR_LAGS[-1], 1.0)
-    if len(at) < 2:
-        return None
-    is_lost = ~np.isfinite(log.output) | find_lost_reference(known)
-    counts = np.cumsum([np.ones(len(time)), is_lost, rate != 0.0,
-                        np.diff(rate, prepend=rate[0]) != 0.0], axis=1)
-    samples, lost, moved, changed = np.diff(counts[:, np.searchsorted(time, at)])
-    is_whole = (lost == 0.0) & (samples > 0.5 * np.median(samples))
-    in_motion, at_rest = is_whole & (moved > 0.5 * samples), is_whole & (moved == 0.0)
-    lags = np.append(-_ERROR_LAGS[:0:-1], _ERROR_LAGS)
-    columns = np.column_stack([
-        *(np.diff(np.interp(at - lag, time, powers[0])) for lag in lags),
-        *(np.diff(np.interp(at, time, each)) for each in powers[1:]),
-        np.linspace(-1.0, 1.0, len(at) - 1)[:, None] ** np.arange(4.0), in_motion])  # a warm-up
-    # the median of differences has a third of the freedom of a variance
-    freedom = (in_motion.sum() - columns.shape[1]) / 3.0, at_rest.sum() - 2.0
-    if min(freedom) < 1.0 or 2 * (in_motion & (changed == 0.0)).sum() > in_motion.sum():
-        return None
-    values, left = _robust_least_squares(
-        columns[is_whole], np.diff(np.interp(at, time, turned))[is_whole],
-        np.full(columns.shape[1], math.inf))
-    response = values[:len(lags)]
-    if response @ lags > MAX_GYRO_LAG * response.sum():
-        return None
-    order = np.argsort(columns[in_motion, _ERROR_LAGS.size - 1], kind='stable')
-    errors = robust_deviation(np.diff(left[in_motion[is_whole]][order])) / math.sqrt(2.0)
-    # in rests the rounding of an output with little noise does not scatter
-    of_rests = left[at_rest[is_whole]] - np.median(left[at_rest[is_whole]])
-    of_rests = of_rests[np.abs(of_rests) <= 5.0 * robust_deviation(of_rests)]
-    rounding = [quantization_step(log.output[np.isfinite(log.output)])]
-    if not by_rate:  # nor does that of a heading
-        rounding.append(math.sqrt(2.0) * quantization_step(reference[known]))
-    usual = math.hypot(float(np.std(of_rests)), *np.array(rounding) / math.sqrt(12.0))
-    return ((errors, usual)
-            if errors ** 2 > 2.0 * usual ** 2 * fisher.isf(FALSE_ALARM_RATE, *freedom) else None)
-
-
-def is_noisy(log: Log, spans: Spans) -> bool:
-    """Tell whether a heading drifts in motion, or has no steps and is as noisy as a course."""
-    assert log.reference_heading is not None
-    if find_drift(spans) is not None:
-        return True
-    if cross_rotation(log).size or quantization_step(
-            log.reference_heading[np.isfinite(log.reference_heading)]) > MAX_ROUNDING_STEP:
-        return False
-    count = len(spans.time) - 1
-    if count < _MIN_SPANS:
-        return False
-    spans = replace(spans, delay=_find_delay(spans))
-    # an eccentric encoder is no course
-    columns = np.column_stack([
-        spans.base_columns(), spans.acceleration_changes(),
-        spans.cause_columns(CauseTerm('reference_once_per_rev'))])[:count]
-    residual = robust_residual(columns, spans.observed[:count], 10)
-    # at a steady rate, an output with steps above its noise errs by up to half of one
-    step = spans.output_step
-    is_coarse = white_noise_deviation(np.asarray(log.output)) < 0.5 * step
-    return robust_deviation(residual) > max(
-        math.sqrt(2.0) * MIN_COURSE_NOISE,
-        is_coarse * 0.5 * step * float(np.median(np.diff(spans.time))))

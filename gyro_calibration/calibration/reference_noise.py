@@ -203,9 +203,7 @@ _BLOCK_SAMPLES = 25
 MAX_ROUNDING_RATIO = 1.5
 #: Least ratio of the noise of a course to that of the gyro: measured are 4.6 to 920, below 8 only
 #: on straight lines between slower fixes, and up to 5 for odometry.
-_COURSE_NOISE_RATIO = 8.0
-#: Least noise of a course, rad, over a second or from span to span; RTK in town has 0.4 deg.
-MIN_COURSE_NOISE = 0.25 * DEGREE
+COURSE_NOISE_RATIO = 8.0
 
 
 def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np.intp], Mask]:
@@ -417,35 +415,9 @@ def heading_noise_share(log: Log) -> float:
     # by white noise of the heading the second is half of the first; where either exceeds the noise
     # of the gyro by far, it does not matter
     if not (white > 0.0 < walks[0]
-            and walks[1] > min(0.75 * walks[0], _COURSE_NOISE_RATIO ** 2 * white)):
+            and walks[1] > min(0.75 * walks[0], COURSE_NOISE_RATIO ** 2 * white)):
         return 0.0
     return math.sqrt(walks[0] / white)
-
-
-def is_course(log: Log) -> bool:
-    """Tell whether a heading that is no attitude is lost at times and errs like a course."""
-    log, _ = keep_own_instants(log)
-    assert log.time is not None and log.output is not None and log.reference_heading is not None
-    known = np.isfinite(log.reference_heading)
-    lost = float(find_lost_reference(known).mean())
-    rows = np.flatnonzero(known)
-    if lost == 0.0 or len(rows) < 2 or cross_rotation(log).size:
-        return False
-    stamps, (first, last) = log.time[rows], rows[[0, -1]]
-    at_ends = max(stamps[0] - log.time[0], log.time[-1] - stamps[-1])
-    # a recorder does not begin, nor end, to receive all topics at once
-    if (at_ends <= max(5.0 * float(np.median(np.diff(stamps))), 0.1)
-            and not find_lost_reference(known[first:last + 1]).any()):
-        return False
-    walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
-    bent = np.abs(np.diff(log.reference_heading, 2))
-    usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    # a heading between slower fixes is on straight lines
-    larger = 2.0 if usual < 0.1 * large and lost > 0.003 else _COURSE_NOISE_RATIO
-    # an encoder errs by its rounding; a difference over a second has 3 times the variance
-    rounding = quantization_step(log.reference_heading[known]) / 2.0
-    return heading_difference(log).total_walk > max(larger * walk, MAX_ROUNDING_RATIO * rounding,
-                                                    MIN_COURSE_NOISE)
 
 
 def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> Array:

@@ -29,13 +29,12 @@ from typing import NamedTuple
 from gyro_calibration.calibration.dwells import (
     few_values_remedy, find_lost_reference, require_output)
 from gyro_calibration.calibration.encoder import choose_reference
-from gyro_calibration.calibration.heading_regression import find_drift, find_motion_errors
+from gyro_calibration.calibration.reference_kind import find_reference_kind
 from gyro_calibration.calibration.reference_noise import (
-    heading_difference, heading_noise_share, interpolate_by_splines, is_course, is_slow,
-    MAX_GYRO_LAG, MAX_ROUNDING_RATIO, MAX_ROUNDING_STEP, rate_noise_share, step_evenness)
+    heading_difference, heading_noise_share, interpolate_by_splines, is_slow,
+    MAX_GYRO_LAG, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
-from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -725,42 +724,8 @@ _MAX_RATE_NOISE_SHARE = 0.01
 
 def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
     """Return the kind of the reference of a log: as stated, or found from the log."""
-    if stated_kind is not None:
-        return Reference(stated_kind, 'as given')
-    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        return _as_odometry(log) or Reference('rate_command', 'the log has a reference rate')
-    heading = log.reference_heading
-    if heading is None or not np.isfinite(heading).any():
-        return Reference('rest', 'the log has no reference')
-    if is_course(log):
-        lost = 100.0 * float(find_lost_reference(np.isfinite(heading)).mean())
-        return Reference('course', f'the heading is lost for {lost:.2g} % of the log, as '
-                         'for a course at low speed, and its errors exceed those of the gyro')
-    if (drift := find_drift(lay_out_spans(log))) is not None:
-        return Reference('odometry', 'it stands in the rests, and in motion drifts by '
-                         f'{drift[0] / DEGREE:.2g} +- {drift[1] / DEGREE:.2g} deg/s against them')
-    step = encoder_step(heading)
-    if 0.0 < step < MAX_ROUNDING_STEP:
-        # The last digit of a file is a power of ten of a rad or a deg, or less than the noise of
-        # the heading, which is also in its difference to that of the gyro, without the motion.
-        assert log.time is not None and log.output is not None
-        powers, known = np.log10([step, step / DEGREE]), np.isfinite(heading)
-        own = integrate(log.time, bridge_gaps(log.output))
-        if np.abs(powers - np.rint(powers)).min() < 1e-4 or step < min(
-                white_noise_deviation(each[known]) for each in (heading, heading - own)):
-            step = 0.0
-    if step:
-        return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
-    return _as_odometry(log) or Reference(
-        'motion_capture', 'the heading has no steps of an encoder')
-
-
-def _as_odometry(log: Log) -> Reference | None:
-    """Return the reference as odometry, if it stands in rests and errs in motion."""
-    errors = find_motion_errors(log)
-    return None if errors is None else Reference(
-        'odometry', 'it stands in rests, and errs in motion: over a second it differs from the '
-        'gyro by {:.2g} deg there, by {:.2g} deg in rests'.format(*np.array(errors) / DEGREE))
+    return (Reference(*find_reference_kind(log)) if stated_kind is None
+            else Reference(stated_kind, 'as given'))
 
 
 def is_reference_limiting(log: Log, reference: Reference) -> bool:

@@ -15,8 +15,9 @@ import math
 
 from diagnosed import established
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.reference_kind import is_course
 from gyro_calibration.calibration.reference_noise import (
-    find_rests, heading_difference, is_course, keep_own_instants)
+    find_rests, heading_difference, keep_own_instants)
 from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import (

@@ -15,7 +15,8 @@ from dataclasses import replace
 from chance import evidence, rms_bounds, seeds
 from diagnosed import established, judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.heading_regression import find_drift, fit_spans
+from gyro_calibration.calibration.heading_regression import fit_spans
+from gyro_calibration.calibration.reference_kind import find_drift
 from gyro_calibration.calibration.reference_noise import heading_noise_share
 from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
@@ -574,13 +575,13 @@ def test_what_the_gyro_does_in_motion_is_no_drift_of_the_reference(hidden):
     assert sum(each is not None for each in drifts) <= 1
 
 
-def wheels(seed, asymmetry=0.0, slip=0.01, noise=0.3 * DEGREE, every=1, lag=0.0):
+def wheels(seed, asymmetry=0.0, slip=0.01, noise=0.3 * DEGREE, every=1, lag=0.0, rests=True):
     """Return a log of turns and rests, whose reference is the rate of wheels, and the bias."""
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, 240.0, 0.02)
     rate, end, smooth = np.zeros(len(time)), 0.0, np.hanning(21) / np.hanning(21).sum()
     while end < time[-1]:
-        begin = end + generator.choice([0.0, 0.0, generator.uniform(3.0, 8.0)])
+        begin = end + rests * generator.choice([0.0, 0.0, generator.uniform(3.0, 8.0)])
         end = begin + generator.uniform(1.0, 4.0)
         rate[(time >= begin) & (time < end)] = generator.normal(0.0, 0.6)
     rate = np.convolve(rate, smooth, 'same')
@@ -601,7 +602,7 @@ def test_the_errors_of_a_rate_by_odometry_are_no_effects_of_the_gyro(asymmetry, 
     # taken for an exact rate, they were a dead zone, steps of the bias or slips
     log, bias = wheels(5, asymmetry, every=every)
     found = diagnosed(log)
-    assert found.reference.kind == 'odometry' and 'errs in motion' in found.reference.evidence
+    assert found.reference.kind == 'odometry' and 'in turns' in found.reference.evidence
     assert [*established(found)] == ['scale_factor_asymmetry'] * bool(asymmetry)
     assert not found.unexplained
     values = {name: (size, deviation) for name, _, size, deviation in found.model.estimates()}
@@ -637,6 +638,26 @@ def test_the_errors_of_a_heading_by_odometry_are_no_effects_of_the_gyro(seed):
     assert not established(found) and not found.unexplained
     exact = integrated(wheels(seed, slip=0.0, noise=0.0)[0])
     assert classify_reference(exact).kind == 'motion_capture'
+
+
+def test_odometry_that_never_rests_is_known_by_errors_that_add_up_in_turns():
+    known = []
+    for seed in range(8):
+        log, bias = wheels(seed, noise=0.05 * DEGREE, rests=False)
+        log = integrated(log)
+        # errors of motion capture do not add up, and a gyro errs alike at one rate
+        exact = integrated(wheels(seed, 0.03, slip=0.0, noise=0.0, rests=False)[0])
+        noisy = replace(exact, reference_heading=exact.reference_heading + np.random.default_rng(
+            seed).normal(0.0, 0.05 * DEGREE, len(log.time)))
+        assert {classify_reference(each).kind for each in (exact, noisy)} == {'motion_capture'}
+        if classify_reference(log).kind == 'odometry':
+            known.append((log, bias))
+    assert len(known) >= 6  # 12 of 14 are known
+    for log, bias in known[:2]:
+        assert not established(diagnosed(log))
+        fit = calibrate_encoder(log)
+        assert fit.method == 'course'
+        assert abs(fit.fit.bias - bias) < 3.0 * np.sqrt(fit.fit.covariance[1, 1]) < 0.4 * DEGREE
 
 
 @pytest.mark.parametrize('share', [0.3, 3.0, 20.0])
