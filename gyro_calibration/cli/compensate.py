@@ -86,6 +86,10 @@ def run(given: argparse.Namespace) -> Answer:
                          'the log begins in a turn or a bend, the heading may be off by more than '
                          'its standard deviation; run self-calibrate, begin the log with a rest, '
                          'or record the column moving.')
+        if not (estimator.is_bias_assumed or data['rows_at_rest']):
+            lines.append('No rest was found: the bias of the calibration was used, and a change '
+                         'since then is not in the standard deviation; rest for some seconds now '
+                         'and then, or calibrate before each drive.')
         if estimator.bias_message:
             lines.append(as_sentence(estimator.bias_message))
         if not data['temperature_known']:
@@ -163,6 +167,7 @@ class _Totals:
         self.unknown = tuple(
             quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
+            self.counts['rows_at_rest'] += int(np.sum(columns.get('resting', 0)))
             self.heading, self.deviation = (
                 float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
             if log.reference_heading is not None:

@@ -21,7 +21,8 @@ Under another bias the rests until then were turns: the heading changes by the d
 time since its begin.
 
 A calibration is one more rest before the others, if the bias is still that of its power-on, which
-is as probable as another one. Without rests, all steady rates are bends and the calibration holds.
+is as probable as another one. The scatter of power-ons is not known for a gyro: one in ten has ten
+times the usual one. Without rests, all steady rates are bends and the calibration holds.
 
 With a known bias, either some of the steady rates near it are rests, or the vehicle never rests. A
 bend has a rate of normal distribution and an exponential duration, and a rest may last. The share
@@ -57,6 +58,8 @@ _REST_SHARES = (np.arange(5) + 0.5) / 5.0
 #: as that it does, by size of bends, then by share of rests (row) and size of bends (column).
 _LOG_PRIORS = np.log(np.outer([0.5, *np.full(len(_REST_SHARES), 0.5 / len(_REST_SHARES))],
                               np.full(len(_BENDS), 1.0 / len(_BENDS))))
+#: Variances of the bias of another power-on, relative to the usual one, and their shares.
+_TURN_ON_RATIOS, _TURN_ON_SHARES = np.array([1.0, 100.0]), np.array([0.9, 0.1])
 #: Probability below which it is not computed what follows if the vehicle never rests.
 _NEGLIGIBLE = 1e-6
 #: Probability from which on another steady rate is taken for the bias.
@@ -135,11 +138,14 @@ class SteadyRates:
                 np.exp(_LOG_PRIORS[0]).sum())
         # else the prior contains the scatter of power-ons
         self._is_calibrated = prior < 0.5 * self._turn_on_variance
-        widest = prior + self._turn_on_variance * self._is_calibrated
+        widest = prior + self._is_calibrated * self._turn_on_variance * _TURN_ON_RATIOS[-1]
         is_possible = rate ** 2 < sigmas ** 2 * (widest + white / still.duration)
         self._agreement, self._begin_time = sigmas ** 2 * white, min(
             self._begin_time, time - turn.duration)
-        self._way += not is_possible
+        # a turn is beyond what a bias may differ by, from that of the last steady rate
+        usual = self._way_rate if self._is_calibrated and self._way_rate < math.inf else 0.0
+        self._way += (rate - usual) ** 2 >= sigmas ** 2 * (
+            prior + self._turn_on_variance * self._is_calibrated + white / still.duration)
         last, freedom = self._last, still.block_count - 1
         is_steady = is_rest or freedom <= 0 or still.block_square_sum - still.angle * rate <= (
             white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas))))
@@ -301,8 +307,9 @@ class SteadyRates:
         same = (white * (1.0 / durations[:, None] + 1.0 / durations) + 2.0 * floor
                 + noise.rate_random_walk ** 2 * np.abs(ends[:, None] - ends)
                 + ((apart @ self._covariance) * apart).sum(axis=2))
-        prior += self._turn_on_variance * is_known
-        agrees, chances = _compare_rests(rate, prior, same, lasting, white, is_known)
+        turn_on = self._turn_on_variance * (_TURN_ON_RATIOS if is_known else np.zeros(1))
+        agrees, chances = _compare_rests(rate, prior + turn_on[:, None], same, lasting, white,
+                                         is_known)
         # the rate whose bias is in use: first that of the calibration
         used = int(np.argmin(np.abs(off))) if self._has_changed or not is_known else len(rates)
         if used < len(rates) and off[used] ** 2 > sigmas ** 2 * same[used, used]:
@@ -345,7 +352,9 @@ def _compare_rests(rate: Array, prior: Array, same: Array, lasting: Array, white
     turns = (-0.5 * (square / spread + np.log(spread)) - np.log(len(turned))
              - lasting[:, None] / MEAN_LAGS[-1])
     as_turn = np.log(1.0 - _REST_PROBABILITY) + logsumexp(turns, axis=0)
-    assumed, never = -0.5 * (rate ** 2 / prior + np.log(prior)), -math.inf
+    shares = _TURN_ON_SHARES if is_known else np.ones(1)
+    assumed = logsumexp(-0.5 * (rate ** 2 / prior + np.log(prior)), axis=0, b=shares[:, None])
+    never = -math.inf
     own = np.log(_REST_PROBABILITY) * np.ones(count)
     if is_known:
         # without rests, all others are turns of one size

@@ -451,12 +451,13 @@ def test_bends_do_not_replace_the_bias_of_a_rest_before_them(way):
 
 
 @pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
-@pytest.mark.parametrize('off', [0.08, 0.15])
+@pytest.mark.parametrize('off', [0.08, 0.15, -1.1])
 def test_rests_replace_a_bias_that_is_not_that_of_the_calibration(off, hindsight):
     """The gyro was without power since its calibration: 0.002 deg/s then."""
-    error, deviation = followed(6 * [(10.0, 0.0), (4.0, 30.0), (6.0, 3.0)], 0.002, hindsight,
-                                true_bias=off)
-    after = slice(round(20 * RATE), None)  # the first rest
+    error, deviation = followed(
+        [part for number in range(8) for part in ((10.0, 0.0), (4.0, 30.0), (6.0, 3.0 + number))],
+        0.002, hindsight, true_bias=off)
+    after = slice(round((60 if abs(off) > 0.2 else 20) * RATE), None)  # rests, or the first one
     assert (np.abs(error[after]) <= 4.0 * deviation[after]).all() and deviation[-1] < 1.0
 
 
