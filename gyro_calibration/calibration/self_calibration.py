@@ -85,8 +85,8 @@ class ReferenceErrors:
 
 
 def default_reference_errors(motion: Motion) -> ReferenceErrors:
-    """Return the usual errors: at commanded rates wheels slip by up to 1 % of each turn."""
-    return ReferenceErrors(0.0 if motion.rate is None else 0.01 / math.sqrt(3.0))
+    """Return the usual errors: in a commanded motion wheels slip by up to 1 % of each turn."""
+    return ReferenceErrors(0.0 if motion.is_measured else 0.01 / math.sqrt(3.0))
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
@@ -215,7 +215,7 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
                               slip_deviation=slip_deviation)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
-    if motion.rate is not None:
+    if not motion.is_measured:
         return fit
     # Against a profile the fit includes a scale difference between both senses of turning. Such an
     # error is proportional to the absolute rate; the part of that which is proportional to the
@@ -316,7 +316,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     # the noise of mount and encoder deviates too; a wobble does not accumulate in the heading
     noise_ratio = (fit.goodness.noise_ratio if fit.goodness
                    else fit.angle_random_walk / max(white_noise, 1e-300))
-    strays = (motion.rate is not None and fit.heading_difference > limits.max_unexplained_angle
+    strays = (not motion.is_measured and fit.heading_difference > limits.max_unexplained_angle
               and noise_ratio > limits.max_noise_ratio)
     if (has_slipped or strays or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
@@ -360,6 +360,14 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
             f'such gyros have, about {100.0 * prior_deviation:g} %: compare the turn of the '
             f'{reference} with a mark on the floor (calibrate by whole turns), and check radius '
             'and track of the wheels, or the sensitivity of the gyro')
+
+
+def describe_commanded_headings(motion: Motion) -> str:
+    """Return a remark on headings of a profile that may have been measured, or ''."""
+    if motion.is_measured or motion.rate is not None:
+        return ''
+    return ('the headings of the profile are taken as commanded, which wheels follow with a lag '
+            'and slip; the column of measured headings is reference_heading_deg')
 
 
 @dataclass(frozen=True)
@@ -423,7 +431,8 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     limits = RunLimits()
     end = motion.duration + max(fit.time_offset, 0.0)
     duration, rest = float(time[-1]) - end, rate[time > end]
-    if (motion.rate is None or motion.rate[-1] != 0.0 or motion.name != 'profile'
+    if (motion.is_measured or motion.rate is not None and motion.rate[-1] != 0.0
+            or motion.name != 'profile'
             or not np.isfinite(fit.covariance).all() or len(rest) < 10
             or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
         return fit
@@ -431,7 +440,7 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     variance = fit.rounding_variance + rest_variance(
         noise, duration, _deviation_of_mean(rest), _half_difference(rest))
     sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
-    stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
+    stop = float(motion.time[np.flatnonzero(np.diff(motion.heading))[-1] + 1])
     if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
         change, variance = 0.0, variance + change ** 2
     elif sigmas > _MIN_SLIP_SIGMAS:

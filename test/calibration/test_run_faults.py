@@ -247,14 +247,15 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
         check_rest(time[rest], rate[rest], fit, XV3500.noise)
 
 
-#: The built-in profile, and one that ends with 1.5 s of rest.
-PROFILES = {each.duration: each for each in (CALIBRATION_MOTION, constant_rate_motion(
-    [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]))}
+#: The built-in profile, one that ends with 1.5 s of rest, and the built-in one by its headings.
+PROFILES = [CALIBRATION_MOTION, constant_rate_motion(
+    [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]),
+    motion_from_headings(TIME[::5], CALIBRATION_MOTION.heading_at(TIME[::5]), is_measured=False)]
 
 
 @pytest.mark.parametrize('motion, degrees, rest, lasts, words', [
-    *((PROFILES[name], degrees, 0.4, 0.0, 'the robot turned throughout the run')
-      for name in PROFILES for degrees in (0.05, -0.1, 0.2, 0.3, -0.5)),
+    *((profile, degrees, 0.4, 0.0, 'the robot turned throughout the run')
+      for profile in PROFILES for degrees in (0.05, -0.1, 0.2, 0.3, -0.5)),
     *((CALIBRATION_MOTION, degrees, 0.9, lasts, 'still turned after it')
       for degrees in (0.5, -1.0) for lasts in (0.2, 0.4, 0.6))])
 def test_a_steady_turn_in_a_log_that_ends_soon_is_refused_or_in_the_interval(
@@ -399,6 +400,19 @@ def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, run)
                         output(0, time=time) + np.where(time > 20.5, 0.5 * DEGREE, 0.0))
     code, _, error = run('self-calibrate', spoiled, *words[2:])
     assert code == 1 and 'after the run, at rest' in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('column, deviation, is_said', [
+    ('heading_rad', 0.0058, True), ('reference_heading_rad', 0.0003, False)])
+def test_the_verb_takes_a_heading_as_commanded_unless_its_column_is_a_reference(
+        tmp_path, run, column, deviation, is_said):
+    time = np.arange(2500) / 100.0
+    log, profile = write_log(tmp_path / 'log.csv', time, output(0, time=time)), write_log(
+        tmp_path / 'profile.csv', TIME, CALIBRATION_MOTION.heading_at(TIME), column)
+    words = 'self-calibrate', log, '--profile', profile
+    found = json.loads(run(*words, '--json')[1])
+    assert found['scale_factor_error_standard_deviation'] == pytest.approx(deviation, rel=0.5)
+    assert ('taken as commanded' in run(*words)[1]) == is_said
 
 
 def test_the_verb_calibrates_by_turns(tmp_path, run):
