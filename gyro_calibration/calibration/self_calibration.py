@@ -30,7 +30,7 @@ from gyro_calibration.calibration.likelihood import (
 from gyro_calibration.calibration.run_faults import (
     fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
     RunPieces, split_run)
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
 from gyro_calibration.logs.stamps import even_times
@@ -38,6 +38,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
 #: Standard deviations from which on a stretch is a slip: 6 of 800 good runs exceed it, and 1 deg,
@@ -169,24 +170,40 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     return fit
 
 
-def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
+@dataclass(frozen=True)
+class OutputRounding:
     """
-    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
+    The errors of means over blocks of samples by the steps of an output.
 
-    By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
-    error, which is no noise of a fit; between codes the errors are independent, of the sizes of
-    `rounding_errors`. Shape (2, 2) and (rad/s)²; both are zero without steps.
+    At one code, as at all rests, the steps cause one error, which is no noise of a fit; between
+    codes the errors are independent, of the sizes of `rounding_errors`.
     """
+
+    block: NDArray[np.intp]  # of each sample, shape (n,)
+    mean: Array  # of each block, rad/s, shape (m,)
+    is_quiet: Mask  # whether the samples of a block show the noise at one rate, shape (m,)
+    code: NDArray[np.intp]  # of each block, shape (m,)
+    deviation: Array  # standard deviation of the error of each mean, rad/s, shape (m,)
+
+    def covariance(self, weights: Array) -> Array:
+        """Return the covariance of sums of samples with weights, (k, n), shape (k, k)."""
+        sums = np.array([np.bincount(self.code, self.deviation * np.bincount(self.block, each))
+                         for each in weights])
+        return np.asarray(sums @ sums.T)
+
+
+def find_rounding(time: Array, output: Array) -> OutputRounding | None:
+    """Return the errors by the steps of an output over five samples each; None without steps."""
     step = quantization_step(output)
     if not step:
-        return np.zeros((2, 2)), 0.0
+        return None
     length = 5.0 * float(np.median(np.diff(time)))
     block = np.unique(np.floor((time - time[0]) / length), return_inverse=True)[1]
     count = np.bincount(block)
     mean = np.bincount(block, output / step) / count
     variance = np.bincount(block, (output / step - mean[block]) ** 2) / count
     if not (quiet := variance <= 0.25).any():
-        return np.zeros((2, 2)), 0.0
+        return None
     near = np.abs(np.diff(mean)) < 1.0
     before, after = np.append(False, near), np.append(near, False)
     change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
@@ -197,13 +214,24 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     weight = count * np.where(quiet & before & after & slow, 1.0, 1e-6)
     total: Array = np.bincount(code, weight).astype(float)
     squares = rounding_errors(np.bincount(code, weight * np.minimum(variance, 1.0)) / total, total)
-    error = step * np.sqrt(np.where(quiet, squares[code], 0.0))
-    rate = (step * mean - fit.bias) / (1.0 + fit.scale_factor_error)
-    root = np.sqrt(count)[:, None]
-    weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) * root.T
-    sums = np.array([np.bincount(code, each * error) for each in weights])
-    slowest = np.where(quiet, np.abs(rate), math.inf).argmin()
-    return sums @ sums.T, float(error[slowest] ** 2)
+    return OutputRounding(block, step * mean, quiet, code,
+                          step * np.sqrt(np.where(quiet, squares[code], 0.0)))
+
+
+def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
+    """
+    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
+
+    By least squares on the blocks of `find_rounding`. Shape (2, 2) and (rad/s)²; both are zero
+    without steps.
+    """
+    if (found := find_rounding(time, output)) is None:
+        return np.zeros((2, 2)), 0.0
+    rate = (found.mean - fit.bias) / (1.0 + fit.scale_factor_error)
+    root = np.sqrt(np.bincount(found.block))[:, None]
+    weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) / root.T
+    slowest = np.where(found.is_quiet, np.abs(rate), math.inf).argmin()
+    return found.covariance(weights[:, found.block]), float(found.deviation[slowest] ** 2)
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,

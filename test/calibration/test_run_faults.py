@@ -342,6 +342,20 @@ def test_whole_turns_give_scale_and_bias_with_their_deviations(number):
     assert calibrate_turns(*turned(number), noise=XV3500.noise).turns == number, 'counted'
 
 
+def test_the_steps_of_a_coarse_output_are_in_the_deviations_of_whole_turns():
+    """A rest, and turns at one rate, err by one part of a step however long they last."""
+    step, motion = 0.6 * DEGREE, constant_rate_motion([(5, 0), (36, 50.0), (5.5, 0)])
+    time = np.arange(0.0, motion.duration, 0.04)
+    for seed in range(12):
+        generator = np.random.default_rng([seed, 7])
+        s, b = generator.uniform(-0.03, 0.03), generator.uniform(-2.0, 2.0) * DEGREE
+        noise = generator.uniform(0.05, 0.3) * generator.standard_normal(len(time))
+        rate = step * np.round(((1 + s) * motion.rate_at(time) + b) / step + noise)
+        fit = calibrate_turns(time, rate, 5, mark_deviation=0.1 * DEGREE).fit
+        errors = np.abs([fit.scale_factor_error - s, fit.bias - b])
+        assert (errors < 4.0 * np.sqrt(np.diag(fit.covariance))).all()
+
+
 CLOCK, TURNED = turned(2)
 NO_TURNS = {
     'half a turn too much': (turned(2.5), 2, 'counts 2.5'),
