@@ -451,25 +451,31 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
     bias, which the samples after the motion show. A turn that they do not show, of a prior
     deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
-    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn. The fit
+    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn, by the
+    part up to the end of the log that determines the rate best: it settles before. The fit
     is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
     a measured reference, and without a covariance. It is refused where the robot turned throughout
     the motion, or goes on turning after it.
     """
     limits = RunLimits()
     end = motion.duration + max(fit.time_offset, 0.0)
-    duration, rest = float(time[-1]) - end, rate[time > end]
+    duration = float(time[-1]) - end
     if (motion.is_measured or motion.rate is not None and motion.rate[-1] != 0.0
             or motion.name != 'profile'
-            or not np.isfinite(fit.covariance).all() or len(rest) < 10
+            or not np.isfinite(fit.covariance).all() or np.count_nonzero(time > end) < 10
             or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
         return fit
-    change = float(rest.mean()) - fit.bias
-    variance = fit.rounding_variance + rest_variance(
-        noise, duration, _deviation_of_mean(rest), _half_difference(rest))
-    sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
     stop = float(motion.time[np.flatnonzero(np.diff(motion.heading))[-1] + 1])
-    if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
+    settles = motion.duration - stop < SETTLING_TIME
+    found = []
+    for begin in np.arange(end, time[-1], 0.25).tolist() if settles else [end]:
+        if len(rest := rate[time > begin]) >= 10:
+            found.append((fit.rounding_variance + rest_variance(
+                noise, float(time[-1]) - begin, _deviation_of_mean(rest), _half_difference(rest)),
+                float(rest.mean()) - fit.bias))
+    variance, change = min(found)
+    sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
+    if settles:  # the change may be that of a settling robot
         change, variance = 0.0, variance + change ** 2
     elif sigmas > _MIN_SLIP_SIGMAS:
         raise DataRefused(

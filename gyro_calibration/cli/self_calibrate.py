@@ -31,7 +31,7 @@ from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
     check_end, check_rest, default_reference_errors, describe_commanded_headings,
     describe_implausible_scale, find_rest_after, METHODS, ReferenceErrors, RestCheck, RunLimits,
-    self_calibrate, to_model_record)
+    self_calibrate, SETTLING_TIME, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_headings
@@ -171,8 +171,10 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel,
         lines.append(f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} '
                      f'deg/s; limit: {check.limit / DEGREE:.4f} deg/s.')
     elif motion.name == 'profile' and given.method == 'likelihood':
-        lines.append('There is no rest of 3 s after the run. A steady turn of the robot '
-                     'throughout has the effect of a bias: leave it at rest after the run.')
+        wanted = max(fit.time_offset, 0.0) + SETTLING_TIME + RunLimits().rest_duration
+        lines.append(f'The log has no rest up to {wanted:.1f} s after the profile (3 s and the '
+                     'delay). A steady turn of the robot throughout has the effect of a bias: '
+                     'leave it at rest after the run, and record until then.')
     technology = model.gyro.get('technology', 'mems')
     lines += [as_sentence(remark) for remark in (
         describe_commanded_headings(motion), describe_implausible_scale(

@@ -38,6 +38,7 @@ from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 GOOD = [name for name, (_, _, word) in WAYS.items() if not word]
 BAD = [name for name in WAYS if name not in GOOD]
@@ -272,6 +273,27 @@ def test_a_steady_turn_in_a_log_that_ends_soon_is_refused_or_in_the_interval(
             assert words in str(refused)
         else:
             assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
+
+
+def test_a_robot_that_settles_before_its_log_ends_is_at_rest_then(tmp_path, run):
+    """The turn by which it settles was in the deviation of the bias, 0.3 deg/s."""
+    fine = np.arange(0.0, 22.0, 0.001)
+    lagging = lfilter([1e-3 / 0.3], [1.0, 1e-3 / 0.3 - 1.0],
+                      CALIBRATION_MOTION.rate_at(fine - 0.4))[::10]
+    deviations = []
+    for seed in range(6):
+        generator = np.random.default_rng([seed, 8])
+        s, b = generator.uniform(-0.03, 0.03), generator.uniform(-1.0, 1.0) * DEGREE
+        rate = (1 + s) * lagging + b + simulate_noise(XV3500.noise, len(lagging), 0.01, generator)
+        fit = self_calibrate(fine[::10], rate, CALIBRATION_MOTION, noise=XV3500.noise)
+        fit = check_end(fine[::10], rate, fit, CALIBRATION_MOTION, XV3500.noise)
+        deviations.append(math.sqrt(fit.covariance[1, 1]))
+        assert abs(fit.bias - b) < 4.0 * deviations[-1]
+    assert np.median(deviations) < 0.15 * DEGREE
+    words = run('self-calibrate', write_log(tmp_path / 'log.csv', fine[::10], rate), '--profile',
+                write_log(tmp_path / 'profile.csv', CALIBRATION_MOTION.time,
+                          CALIBRATION_MOTION.rate, 'rate_rad_s'))[1]
+    assert 'no rest up to 3.7 s after the profile' in words
 
 
 @pytest.mark.parametrize('off', [0.0, 3.0, -10.0])
