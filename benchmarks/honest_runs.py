@@ -20,7 +20,7 @@ robot and each gyro, how many runs were refused, the share of scale factor error
 within their 95 % intervals, the median standard deviations, and how many were accepted more than 5
 standard deviations off. The bias is compared with its mean over the rest after
 the profile. A run is checked by the rest after it, as the command line does; of the kinds named
-so, the log ends 0.5 s after the profile.
+so, the log ends 0.5 s after the profile, or the profile has headings at 20 Hz.
 """
 
 from __future__ import annotations
@@ -227,12 +227,13 @@ HONEST: dict[str, Robot] = {
     'encoder of 0.5 deg': follower, 'slip up to 1 % of each turn': slipping,
     'even slip up to 1 %': slipping_evenly, 'wobble, lag and slip': everything,
     'output in steps of 0.1 to 0.5 deg/s': lag, f'lag{SHORT}': lag,
-    f'second order{SHORT}': follower,
+    f'second order{SHORT}': follower, 'headings, slip up to 1 % of each turn': slipping,
 }
 DISHONEST: dict[str, Robot] = {
     'steady yaw': steady_yaw, 'yaw for a while': yaw_for_a_while,
     'slip above a speed': slip_above_a_speed, 'slip of 0.5 to 1.5 deg': small_slip,
     'turn by hand': hand_turn, f'steady yaw{SHORT}': steady_yaw_until_the_end,
+    f'headings, steady yaw{SHORT}': steady_yaw_until_the_end,
 }
 
 
@@ -245,6 +246,9 @@ def tried(kind: str, gyro: Gyro, seed: tuple[int, ...]) -> tuple[Array, Array] |
     output = ((1.0 + s) * rate + b + drift
               + gyro.white / math.sqrt(STEP) * draw.standard_normal(len(TIME)))
     motion = motion_from_rates(*breakpoints())
+    if kind.startswith('headings'):
+        at = np.arange(0.0, 20.01, 0.05)
+        motion = motion_from_headings(at, motion.heading_at(at), is_measured=False)
     if kind.startswith('output in steps'):
         step = draw.uniform(0.1, 0.5) * DEGREE
         output = step * np.round(output / step)

@@ -162,7 +162,8 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     # the gyro's lag is about that of a filter of 20 ms; a heading without steps may be a mean over
     # 0.2 s
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
-    fit = fit_likelihood(time, output, replace(motion, rate=None), MAX_ENCODER_OFFSET,
+    fit = fit_likelihood(time, output, replace(motion, rate=None, is_measured=True),
+                         MAX_ENCODER_OFFSET,
                          lag_deviation=_GYRO_LAG_DEVIATION if has_steps else 0.2 ** 2 / 24.0,
                          cross_rotation=crossing, bias_wanders=True)
     if motion.rate is not None:
@@ -347,7 +348,7 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion, Array]:
                               f'at least {fewest} are needed: {remedy}')
     motion, start = motion_from_log(log)
     if motion.rate is not None and rate_noise_share(log):  # else it may be a command
-        motion = replace(motion, rate=None)
+        motion = replace(motion, rate=None, is_measured=True)
     # the last value stands for an interval too; the rounding of stamps, 1 us, is no lack
     duration = motion.duration + float(np.median(np.diff(motion.time)))
     if duration < 10.0 - 1e-6:

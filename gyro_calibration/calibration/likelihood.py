@@ -175,7 +175,7 @@ class _RunAlignment:
         # rate and acceleration are differences over this time to either side, s
         self._smoothing_time = max(float(np.median(np.diff(time))), 0.01)
         self._acceleration_time = self._smoothing_time
-        self.is_measured, self._bias_wanders = motion.rate is None, bias_wanders
+        self.is_measured, self._bias_wanders = motion.is_measured, bias_wanders
         self._block_duration = block_duration(motion)
         self._points = _select_reference_points(motion, self._block_duration, slip_deviation,
                                                 cross_rotation)
@@ -280,7 +280,7 @@ def block_duration(motion: Motion) -> float:
 def _select_reference_points(motion: Motion, block: float, slip_deviation: float,
                              cross_rotation: Array) -> _ReferencePoints:
     """Return where a motion is known: at its samples, or for an encoder where it steps."""
-    if motion.rate is not None:
+    if not motion.is_measured:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
                                 *tracking_error_columns(motion, time, slip_deviation))

@@ -30,7 +30,7 @@ from gyro_calibration.calibration.likelihood import (
 from gyro_calibration.calibration.run_faults import (
     fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
     RunPieces, split_run)
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
 from gyro_calibration.logs.stamps import even_times
@@ -38,6 +38,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
 #: Standard deviations from which on a stretch is a slip: 6 of 800 good runs exceed it, and 1 deg,
@@ -85,8 +86,8 @@ class ReferenceErrors:
 
 
 def default_reference_errors(motion: Motion) -> ReferenceErrors:
-    """Return the usual errors: at commanded rates wheels slip by up to 1 % of each turn."""
-    return ReferenceErrors(0.0 if motion.rate is None else 0.01 / math.sqrt(3.0))
+    """Return the usual errors: in a commanded motion wheels slip by up to 1 % of each turn."""
+    return ReferenceErrors(0.0 if motion.is_measured else 0.01 / math.sqrt(3.0))
 
 
 def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
@@ -169,24 +170,40 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     return fit
 
 
-def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
+@dataclass(frozen=True)
+class OutputRounding:
     """
-    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
+    The errors of means over blocks of samples by the steps of an output.
 
-    By least squares on blocks of five samples. At one code, as at all rests, the steps cause one
-    error, which is no noise of a fit; between codes the errors are independent, of the sizes of
-    `rounding_errors`. Shape (2, 2) and (rad/s)²; both are zero without steps.
+    At one code, as at all rests, the steps cause one error, which is no noise of a fit; between
+    codes the errors are independent, of the sizes of `rounding_errors`.
     """
+
+    block: NDArray[np.intp]  # of each sample, shape (n,)
+    mean: Array  # of each block, rad/s, shape (m,)
+    is_quiet: Mask  # whether the samples of a block show the noise at one rate, shape (m,)
+    code: NDArray[np.intp]  # of each block, shape (m,)
+    deviation: Array  # standard deviation of the error of each mean, rad/s, shape (m,)
+
+    def covariance(self, weights: Array) -> Array:
+        """Return the covariance of sums of samples with weights, (k, n), shape (k, k)."""
+        sums = np.array([np.bincount(self.code, self.deviation * np.bincount(self.block, each))
+                         for each in weights])
+        return np.asarray(sums @ sums.T)
+
+
+def find_rounding(time: Array, output: Array) -> OutputRounding | None:
+    """Return the errors by the steps of an output over five samples each; None without steps."""
     step = quantization_step(output)
     if not step:
-        return np.zeros((2, 2)), 0.0
+        return None
     length = 5.0 * float(np.median(np.diff(time)))
     block = np.unique(np.floor((time - time[0]) / length), return_inverse=True)[1]
     count = np.bincount(block)
     mean = np.bincount(block, output / step) / count
     variance = np.bincount(block, (output / step - mean[block]) ** 2) / count
     if not (quiet := variance <= 0.25).any():
-        return np.zeros((2, 2)), 0.0
+        return None
     near = np.abs(np.diff(mean)) < 1.0
     before, after = np.append(False, near), np.append(near, False)
     change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
@@ -197,13 +214,24 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     weight = count * np.where(quiet & before & after & slow, 1.0, 1e-6)
     total: Array = np.bincount(code, weight).astype(float)
     squares = rounding_errors(np.bincount(code, weight * np.minimum(variance, 1.0)) / total, total)
-    error = step * np.sqrt(np.where(quiet, squares[code], 0.0))
-    rate = (step * mean - fit.bias) / (1.0 + fit.scale_factor_error)
-    root = np.sqrt(count)[:, None]
-    weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) * root.T
-    sums = np.array([np.bincount(code, each * error) for each in weights])
-    slowest = np.where(quiet, np.abs(rate), math.inf).argmin()
-    return sums @ sums.T, float(error[slowest] ** 2)
+    return OutputRounding(block, step * mean, quiet, code,
+                          step * np.sqrt(np.where(quiet, squares[code], 0.0)))
+
+
+def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
+    """
+    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
+
+    By least squares on the blocks of `find_rounding`. Shape (2, 2) and (rad/s)²; both are zero
+    without steps.
+    """
+    if (found := find_rounding(time, output)) is None:
+        return np.zeros((2, 2)), 0.0
+    rate = (found.mean - fit.bias) / (1.0 + fit.scale_factor_error)
+    root = np.sqrt(np.bincount(found.block))[:, None]
+    weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) / root.T
+    slowest = np.where(found.is_quiet, np.abs(rate), math.inf).argmin()
+    return found.covariance(weights[:, found.block]), float(found.deviation[slowest] ** 2)
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
@@ -215,7 +243,7 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
                               slip_deviation=slip_deviation)
                for stamps in ([time, even_stamps] if jitters else [time])),
               key=lambda found: float(np.linalg.det(found.covariance)))
-    if motion.rate is not None:
+    if not motion.is_measured:
         return fit
     # Against a profile the fit includes a scale difference between both senses of turning. Such an
     # error is proportional to the absolute rate; the part of that which is proportional to the
@@ -316,7 +344,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     # the noise of mount and encoder deviates too; a wobble does not accumulate in the heading
     noise_ratio = (fit.goodness.noise_ratio if fit.goodness
                    else fit.angle_random_walk / max(white_noise, 1e-300))
-    strays = (motion.rate is not None and fit.heading_difference > limits.max_unexplained_angle
+    strays = (not motion.is_measured and fit.heading_difference > limits.max_unexplained_angle
               and noise_ratio > limits.max_noise_ratio)
     if (has_slipped or strays or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
@@ -360,6 +388,14 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
             f'such gyros have, about {100.0 * prior_deviation:g} %: compare the turn of the '
             f'{reference} with a mark on the floor (calibrate by whole turns), and check radius '
             'and track of the wheels, or the sensitivity of the gyro')
+
+
+def describe_commanded_headings(motion: Motion) -> str:
+    """Return a remark on headings of a profile that may have been measured, or ''."""
+    if motion.is_measured or motion.rate is not None:
+        return ''
+    return ('the headings of the profile are taken as commanded, which wheels follow with a lag '
+            'and slip; the column of measured headings is reference_heading_deg')
 
 
 @dataclass(frozen=True)
@@ -415,24 +451,31 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
     bias, which the samples after the motion show. A turn that they do not show, of a prior
     deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
-    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn. The fit
+    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn, by the
+    part up to the end of the log that determines the rate best: it settles before. The fit
     is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
     a measured reference, and without a covariance. It is refused where the robot turned throughout
     the motion, or goes on turning after it.
     """
     limits = RunLimits()
     end = motion.duration + max(fit.time_offset, 0.0)
-    duration, rest = float(time[-1]) - end, rate[time > end]
-    if (motion.rate is None or motion.rate[-1] != 0.0 or motion.name != 'profile'
-            or not np.isfinite(fit.covariance).all() or len(rest) < 10
+    duration = float(time[-1]) - end
+    if (motion.is_measured or motion.rate is not None and motion.rate[-1] != 0.0
+            or motion.name != 'profile'
+            or not np.isfinite(fit.covariance).all() or np.count_nonzero(time > end) < 10
             or duration > SETTLING_TIME + 0.9 * limits.rest_duration):
         return fit
-    change = float(rest.mean()) - fit.bias
-    variance = fit.rounding_variance + rest_variance(
-        noise, duration, _deviation_of_mean(rest), _half_difference(rest))
+    stop = float(motion.time[np.flatnonzero(np.diff(motion.heading))[-1] + 1])
+    settles = motion.duration - stop < SETTLING_TIME
+    found = []
+    for begin in np.arange(end, time[-1], 0.25).tolist() if settles else [end]:
+        if len(rest := rate[time > begin]) >= 10:
+            found.append((fit.rounding_variance + rest_variance(
+                noise, float(time[-1]) - begin, _deviation_of_mean(rest), _half_difference(rest)),
+                float(rest.mean()) - fit.bias))
+    variance, change = min(found)
     sigmas = abs(change) / math.sqrt(fit.covariance[1, 1] + variance)
-    stop = float(motion.time[np.flatnonzero(motion.rate)[-1] + 1])
-    if motion.duration - stop < SETTLING_TIME:  # the change may be that of a settling robot
+    if settles:  # the change may be that of a settling robot
         change, variance = 0.0, variance + change ** 2
     elif sigmas > _MIN_SLIP_SIGMAS:
         raise DataRefused(

@@ -21,10 +21,11 @@ import math
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS, ScaleBiasFit
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import (
-    refuse_bias, refuse_samples, refuse_scale, RunLimits)
+    find_rounding, refuse_bias, refuse_samples, refuse_scale, RunLimits)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import refuse_saturated, white_noise_deviation
+from gyro_calibration.logs.quality import (
+    quantization_step, refuse_saturated, white_noise_deviation)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
@@ -66,24 +67,32 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     that of the angle between the rests on the mark, rad. The rest is that of `self_calibrate`.
     """
     refuse_samples(time, rate, limits, output)
-    refuse_saturated(rate if output is None else output)
+    output = rate if output is None else output
+    refuse_saturated(output)
     # N², rad²/s: by differences between neighbours, and at least the known one
     white_density = max(white_noise_deviation(rate) ** 2 * float(np.median(np.diff(time))),
                         noise.angle_random_walk ** 2)
-    begin, end = _find_turns(time, rate, white_density)
+    begin, end = _find_turns(time, rate, white_density, quantization_step(output))
     rest_durations, duration = (float(begin - time[0]), float(time[-1] - end)), end - begin
-    means = float(rate[time <= begin].mean()), float(rate[time >= end].mean())
+    parts = np.array([time <= begin, time >= end, (time > begin) & (time < end)])
+    weights = parts / parts.sum(axis=1)[:, None]
+    means = weights[:2] @ rate
     # variances of their difference by white noise, and by the wander of the bias
     of_white = white_density / rest_durations[0] + white_density / rest_durations[1]
     of_wander = noise.mean_change_variance(duration, min(rest_durations))
-    difference, deviation = means[1] - means[0], math.sqrt(of_white + of_wander)
+    # of the means of both rests and of the turns, by the steps of the output
+    found = find_rounding(time, output)
+    of_steps = np.zeros((3, 3)) if found is None else found.covariance(weights)
+    # a bias that wanders within one code changes its error
+    difference = float(means[1] - means[0])
+    deviation = max(math.sqrt(of_white + of_wander + of_steps[0, 0] + of_steps[1, 1]), 1e-12)
     if abs(difference) > max(-float(ndtri(0.5 * FALSE_REFUSAL_RATE)) * deviation,
                              limits.max_rest_rate):
         raise DataRefused(
             f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
             f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
             'both ends, or the gyro still warms up; wait, and run again')
-    bias, variance = 0.5 * (means[0] + means[1]), 0.25 * of_white + 0.5 * of_wander
+    bias, variance = float(means.mean()), 0.25 * of_white + 0.5 * of_wander
     refuse_bias(bias, limits, 'let the robot rest at both ends')
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
@@ -118,15 +127,21 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
                       + (scale * mark_deviation) ** 2)
     shared = -variance * duration / true_angle
     covariance = np.array([[angle_variance / true_angle ** 2, shared], [shared, variance]])
+    # s by the mean of the turns less the bias, and b
+    of_means = np.array([[-0.5, -0.5, 1.0], [0.5, 0.5, 0.0]]) * [[duration / true_angle], [1.0]]
+    covariance += of_means @ of_steps @ of_means.T
     return _TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
                             rest_durations)
 
 
-def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, float]:
+def _find_turns(time: Array, rate: Array, white_density: float,
+                step: float) -> tuple[float, float]:
     """Return the times at which the turns begin and end, s, after and before the rests."""
     part = ((time - time[0]) / _PART_DURATION).astype(int)
     means = np.bincount(part, rate) / np.maximum(np.bincount(part), 1)
-    limit = max(MAX_NOISE_SIGMAS * math.sqrt(white_density / _PART_DURATION), _MIN_MOVING_RATE)
+    # at rest, coarse samples may change by a step
+    limit = max(MAX_NOISE_SIGMAS * math.sqrt(white_density / _PART_DURATION), _MIN_MOVING_RATE,
+                step)
     lengths = []
     for name, values in (('before', means), ('after', means[:-1][::-1])):
         # number of means, from the first on, whose differences are within the noise

@@ -29,8 +29,9 @@ from gyro_calibration.calibration.run_faults import (
     fit_profile, MAX_UNEXPLAINED_SHARE, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
-    check_end, check_rest, default_reference_errors, describe_implausible_scale, find_rest_after,
-    METHODS, ReferenceErrors, RestCheck, RunLimits, self_calibrate, to_model_record)
+    check_end, check_rest, default_reference_errors, describe_commanded_headings,
+    describe_implausible_scale, find_rest_after, METHODS, ReferenceErrors, RestCheck, RunLimits,
+    self_calibrate, SETTLING_TIME, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_headings
@@ -53,7 +54,8 @@ _NEAREST = 'nearest'
 def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
-                        'rate_dps; default: the reference of the log')
+                        'rate_dps, which were commanded, or a measured '
+                        'reference_heading_deg; default: the reference of the log')
     parser.add_argument('--turns', type=_parse_turns, metavar='N', help='number of full turns '
                         'from a mark to the same mark with standstill at both ends, '
                         f'counter-clockwise positive; {_NEAREST}: the number nearest to the gyro')
@@ -66,7 +68,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     for name, unit, what in (('scale-deviation', '%%', 'the scale factor error'),
                              ('drift', 'deg/s', 'the drift'),
                              ('random-walk', 'deg/sqrt(h)', 'the angle random walk')):
-        default = '; default: 0.58 for rates of a profile' if name == 'scale-deviation' else ''
+        default = '; default: 0.58 for a commanded profile' if name == 'scale-deviation' else ''
         parser.add_argument(f'--reference-{name}', type=verb.non_negative_number, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
                             f'or of the driven profile, {unit}{default}')
@@ -169,12 +171,15 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel,
         lines.append(f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} '
                      f'deg/s; limit: {check.limit / DEGREE:.4f} deg/s.')
     elif motion.name == 'profile' and given.method == 'likelihood':
-        lines.append('There is no rest of 3 s after the run. A steady turn of the robot '
-                     'throughout has the effect of a bias: leave it at rest after the run.')
+        wanted = max(fit.time_offset, 0.0) + SETTLING_TIME + RunLimits().rest_duration
+        lines.append(f'The log has no rest up to {wanted:.1f} s after the profile (3 s and the '
+                     'delay). A steady turn of the robot throughout has the effect of a bias: '
+                     'leave it at rest after the run, and record until then.')
     technology = model.gyro.get('technology', 'mems')
-    if remark := describe_implausible_scale(
-            fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
-        lines.append(as_sentence(remark))
+    lines += [as_sentence(remark) for remark in (
+        describe_commanded_headings(motion), describe_implausible_scale(
+            fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name))
+        if remark]
     return run, {
         'time_offset_s': fit.time_offset,
         'time_offset_standard_deviation_s': fit.time_offset_deviation,

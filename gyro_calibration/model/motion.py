@@ -46,6 +46,7 @@ class Motion:
     heading: Array  # rad, continuous, shape (n,), beginning at 0
     rate: Array | None = None  # rad/s, shape (n,); None where the motion was given by its heading
     name: str = 'profile'  # in messages
+    is_measured: bool = False  # whether the heading is that of the robot, not of its command
 
     @property
     def duration(self) -> float:
@@ -63,7 +64,16 @@ class Motion:
         return self.heading[index] + since * (self.rate[index] + 0.5 * slope * since)
 
     def rate_at(self, time: Array) -> Array:
-        """Return the rate, rad/s, at any times; before and after the motion it is 0."""
+        """
+        Return the rate, rad/s, at any times; before and after the motion it is 0.
+
+        That of measured headings is a central difference, linear between the given times.
+        """
+        if self.rate is None and not self.is_measured:
+            index = np.clip(np.searchsorted(self.time, time, side='right') - 1, 0,
+                            len(self.time) - 2)
+            slope = (np.diff(self.heading) / np.diff(self.time))[index]
+            return np.where((time >= 0.0) & (time <= self.duration), slope, 0.0)
         rate = np.gradient(self.heading, self.time) if self.rate is None else self.rate
         return np.interp(time, self.time, rate, left=0.0, right=0.0)
 
@@ -74,9 +84,10 @@ def motion_from_rates(time: Array, rate: Array) -> Motion:
     return Motion(np.asarray(time, float) - time[0], heading, np.asarray(rate, float))
 
 
-def motion_from_headings(time: Array, heading: Array) -> Motion:
+def motion_from_headings(time: Array, heading: Array, is_measured: bool = True) -> Motion:
     """Return the motion through the given headings, rad, at the given times, s."""
-    return Motion(np.asarray(time, float) - time[0], np.asarray(heading, float) - heading[0])
+    return Motion(np.asarray(time, float) - time[0], np.asarray(heading, float) - heading[0],
+                  is_measured=is_measured)
 
 
 def motion_from_log(log: Log) -> tuple[Motion, float]:
@@ -145,8 +156,9 @@ def read_motion(path: str | Path) -> Motion:
     """
     Read a motion profile from a CSV file, or raise `MotionError`.
 
-    It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s. The reference of a log
-    is a profile too: its heading where it has both, and without the rows where it was lost.
+    It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s, which were commanded.
+    The reference of a log is a profile too: its heading, which was measured, where it has both,
+    and without the rows where it was lost.
     """
     try:
         lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
@@ -183,7 +195,11 @@ def read_motion(path: str | Path) -> Motion:
     time, values = time[known], values[known] * _COLUMN_UNITS[name]
     if len(time) < 2 or not (np.diff(time) >= MIN_SAMPLE_INTERVAL).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
-    return (motion_from_rates if 'rate' in name else motion_from_headings)(time, values)
+    if 'rate' in name:
+        return motion_from_rates(time, values)
+    is_measured = name.startswith('reference_')
+    # changes of commanded headings by less than a nanoradian are rounding errors
+    return motion_from_headings(time, values if is_measured else np.round(values, 9), is_measured)
 
 
 def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,

@@ -33,8 +33,8 @@ from types import SimpleNamespace
 
 from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
-    calibrate_bias, check_rest, describe_implausible_scale, find_rest_after, ReferenceErrors,
-    RunLimits, self_calibrate, SETTLING_TIME, to_model_record)
+    calibrate_bias, check_rest, describe_commanded_headings, describe_implausible_scale,
+    find_rest_after, ReferenceErrors, RunLimits, self_calibrate, SETTLING_TIME, to_model_record)
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
@@ -483,8 +483,9 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:
         remarks.append(str(fit.goodness))
-    if implausible := describe_implausible_scale(fit, TECHNOLOGY_PRIORS['mems'][0], motion.name):
-        remarks.append(implausible)
+    remarks += filter(None, [
+        describe_commanded_headings(motion),
+        describe_implausible_scale(fit, TECHNOLOGY_PRIORS['mems'][0], motion.name)])
     # After odometry the robot may drive on; a profile ends at rest.
     after = (find_rest_after(time, rate, fit, motion, limits) if by_odometry
              else time > motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME)

@@ -38,6 +38,7 @@ from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 GOOD = [name for name, (_, _, word) in WAYS.items() if not word]
 BAD = [name for name in WAYS if name not in GOOD]
@@ -247,14 +248,15 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
         check_rest(time[rest], rate[rest], fit, XV3500.noise)
 
 
-#: The built-in profile, and one that ends with 1.5 s of rest.
-PROFILES = {each.duration: each for each in (CALIBRATION_MOTION, constant_rate_motion(
-    [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]))}
+#: The built-in profile, one that ends with 1.5 s of rest, and the built-in one by its headings.
+PROFILES = [CALIBRATION_MOTION, constant_rate_motion(
+    [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]),
+    motion_from_headings(TIME[::5], CALIBRATION_MOTION.heading_at(TIME[::5]), is_measured=False)]
 
 
 @pytest.mark.parametrize('motion, degrees, rest, lasts, words', [
-    *((PROFILES[name], degrees, 0.4, 0.0, 'the robot turned throughout the run')
-      for name in PROFILES for degrees in (0.05, -0.1, 0.2, 0.3, -0.5)),
+    *((profile, degrees, 0.4, 0.0, 'the robot turned throughout the run')
+      for profile in PROFILES for degrees in (0.05, -0.1, 0.2, 0.3, -0.5)),
     *((CALIBRATION_MOTION, degrees, 0.9, lasts, 'still turned after it')
       for degrees in (0.5, -1.0) for lasts in (0.2, 0.4, 0.6))])
 def test_a_steady_turn_in_a_log_that_ends_soon_is_refused_or_in_the_interval(
@@ -271,6 +273,27 @@ def test_a_steady_turn_in_a_log_that_ends_soon_is_refused_or_in_the_interval(
             assert words in str(refused)
         else:
             assert abs(fit.bias - B) < 5.0 * math.sqrt(fit.covariance[1, 1])
+
+
+def test_a_robot_that_settles_before_its_log_ends_is_at_rest_then(tmp_path, run):
+    """The turn by which it settles was in the deviation of the bias, 0.3 deg/s."""
+    fine = np.arange(0.0, 22.0, 0.001)
+    lagging = lfilter([1e-3 / 0.3], [1.0, 1e-3 / 0.3 - 1.0],
+                      CALIBRATION_MOTION.rate_at(fine - 0.4))[::10]
+    deviations = []
+    for seed in range(6):
+        generator = np.random.default_rng([seed, 8])
+        s, b = generator.uniform(-0.03, 0.03), generator.uniform(-1.0, 1.0) * DEGREE
+        rate = (1 + s) * lagging + b + simulate_noise(XV3500.noise, len(lagging), 0.01, generator)
+        fit = self_calibrate(fine[::10], rate, CALIBRATION_MOTION, noise=XV3500.noise)
+        fit = check_end(fine[::10], rate, fit, CALIBRATION_MOTION, XV3500.noise)
+        deviations.append(math.sqrt(fit.covariance[1, 1]))
+        assert abs(fit.bias - b) < 4.0 * deviations[-1]
+    assert np.median(deviations) < 0.15 * DEGREE
+    words = run('self-calibrate', write_log(tmp_path / 'log.csv', fine[::10], rate), '--profile',
+                write_log(tmp_path / 'profile.csv', CALIBRATION_MOTION.time,
+                          CALIBRATION_MOTION.rate, 'rate_rad_s'))[1]
+    assert 'no rest up to 3.7 s after the profile' in words
 
 
 @pytest.mark.parametrize('off', [0.0, 3.0, -10.0])
@@ -341,6 +364,20 @@ def test_whole_turns_give_scale_and_bias_with_their_deviations(number):
     assert calibrate_turns(*turned(number), noise=XV3500.noise).turns == number, 'counted'
 
 
+def test_the_steps_of_a_coarse_output_are_in_the_deviations_of_whole_turns():
+    """A rest, and turns at one rate, err by one part of a step however long they last."""
+    step, motion = 0.6 * DEGREE, constant_rate_motion([(5, 0), (36, 50.0), (5.5, 0)])
+    time = np.arange(0.0, motion.duration, 0.04)
+    for seed in range(12):
+        generator = np.random.default_rng([seed, 7])
+        s, b = generator.uniform(-0.03, 0.03), generator.uniform(-2.0, 2.0) * DEGREE
+        noise = generator.uniform(0.05, 0.3) * generator.standard_normal(len(time))
+        rate = step * np.round(((1 + s) * motion.rate_at(time) + b) / step + noise)
+        fit = calibrate_turns(time, rate, 5, mark_deviation=0.1 * DEGREE).fit
+        errors = np.abs([fit.scale_factor_error - s, fit.bias - b])
+        assert (errors < 4.0 * np.sqrt(np.diag(fit.covariance))).all()
+
+
 CLOCK, TURNED = turned(2)
 NO_TURNS = {
     'half a turn too much': (turned(2.5), 2, 'counts 2.5'),
@@ -399,6 +436,19 @@ def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, run)
                         output(0, time=time) + np.where(time > 20.5, 0.5 * DEGREE, 0.0))
     code, _, error = run('self-calibrate', spoiled, *words[2:])
     assert code == 1 and 'after the run, at rest' in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('column, deviation, is_said', [
+    ('heading_rad', 0.0058, True), ('reference_heading_rad', 0.0003, False)])
+def test_the_verb_takes_a_heading_as_commanded_unless_its_column_is_a_reference(
+        tmp_path, run, column, deviation, is_said):
+    time = np.arange(2500) / 100.0
+    log, profile = write_log(tmp_path / 'log.csv', time, output(0, time=time)), write_log(
+        tmp_path / 'profile.csv', TIME, CALIBRATION_MOTION.heading_at(TIME), column)
+    words = 'self-calibrate', log, '--profile', profile
+    found = json.loads(run(*words, '--json')[1])
+    assert found['scale_factor_error_standard_deviation'] == pytest.approx(deviation, rel=0.5)
+    assert ('taken as commanded' in run(*words)[1]) == is_said
 
 
 def test_the_verb_calibrates_by_turns(tmp_path, run):

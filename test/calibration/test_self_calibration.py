@@ -15,6 +15,7 @@ The methods reproduce the paper's numbers, and the fit finds the truth with its 
 """
 
 import contextlib
+from dataclasses import replace
 
 from chance import fewest, mean_bound, most, rms_bounds
 from coarse_output import run as run_coarse
@@ -127,13 +128,35 @@ def test_fits_are_unbiased_with_true_intervals_near_the_cramer_rao_bound(referen
 
 
 @pytest.mark.parametrize('kind', ['lag', 'ramps softer than commanded', 'second order',
-                                  'slip up to 1 % of each turn'])
+                                  'slip up to 1 % of each turn',
+                                  'headings, slip up to 1 % of each turn'])
 def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_interval(kind):
     """Earlier, soft ramps were refused, and half of the intervals contained such a slip."""
     found = [tried(kind, GYROS['XV-3500'], (4, seed)) for seed in range(6)]
     assert not [each for each in found if isinstance(each, str)]
     sizes = np.array([np.abs(errors / deviations) for errors, deviations in found])
     assert (np.sqrt(np.mean(sizes ** 2, axis=0)) < rms_bounds(6)[1]).all(), np.round(sizes, 1)
+
+
+def test_a_commanded_profile_of_headings_is_as_good_as_that_of_its_rates():
+    for seed in range(3):
+        fits = [self_calibrate(TIME, run(seed), motion) for motion in (CALIBRATION_MOTION, replace(
+            sampled(CALIBRATION_MOTION), is_measured=False))]
+        of_rates, of_headings = (np.array([each.scale_factor_error, each.bias]) for each in fits)
+        deviations, others = (np.sqrt(np.diag(each.covariance)) for each in fits)
+        assert (np.abs(of_headings - of_rates) < 0.3 * deviations).all()
+        assert others == pytest.approx(deviations, rel=0.3)
+
+
+def test_measured_headings_that_are_taken_as_commanded_give_a_wider_interval():
+    for seed in range(3):
+        measured = sampled(CALIBRATION_MOTION, 20.0, 0.5 * DEGREE, 0.1 * seed * DEGREE)
+        commanded = replace(measured, is_measured=False)
+        fits = [self_calibrate(TIME, run(seed), motion) for motion in (measured, commanded)]
+        assert fits[1].covariance[0, 0] > 0.0057 ** 2 > fits[0].covariance[0, 0]
+        for fit in fits:
+            errors = np.array([fit.scale_factor_error - XV3500_S, fit.bias - XV3500_B])
+            assert (np.abs(errors) < 4.0 * np.sqrt(np.diag(fit.covariance))).all()
 
 
 @pytest.mark.parametrize('kind', ['wobble of 0.3 deg', 'output in steps of 0.1 to 0.5 deg/s'])

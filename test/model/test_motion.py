@@ -48,6 +48,16 @@ def test_a_profile_of_headings_or_rates_is_read(tmp_path, prefix, column, factor
     assert motion.duration == 2.0 and motion.heading_at(2.0) == pytest.approx(3.0 * factor)
     assert (motion.rate.tolist() if is_rate else motion.heading.tolist()) == pytest.approx(
         [0.0, 3.0 * factor]) and (motion.rate is not None) == is_rate
+    assert motion.is_measured == (prefix + column).startswith('reference_heading')
+
+
+def test_the_rate_of_commanded_headings_is_that_between_the_rows(tmp_path):
+    """A robot that drives it turns to the headings of the rows; changes by rounding are none."""
+    (tmp_path / 'profile.csv').write_text(
+        'time_s,heading_rad\n0,0\n1,1e-15\n3,4\n4,4.000000000000001\n')
+    motion = read_motion(tmp_path / 'profile.csv')
+    assert motion.rate_at(np.array([-0.1, 0.5, 1.5, 2.9, 3.5, 4.1])).tolist() == [
+        0.0, 0.0, 2.0, 2.0, 0.0, 0.0]
 
 
 def test_the_reference_of_a_log_is_a_profile_by_its_heading_and_without_what_was_lost(tmp_path):
