@@ -31,11 +31,13 @@ from gyro_calibration.calibration.scatter import (
     cross_validation_parts, estimate_scatter, estimate_tolerance, rms, Scatter, sum_by_part,
     Uncertainty, Whitener)
 from gyro_calibration.calibration.self_calibration import refuse_scale
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
-from gyro_calibration.model.effects import Channels, CUBIC_NONLINEARITY, Effect, SINE_RESPONSE
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.model.effects import (
+    Channels, CUBIC_NONLINEARITY, Effect, SCALE_FACTOR_ERROR, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.optimize import minimize_scalar
 from scipy.stats import f as fisher
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
@@ -232,6 +234,20 @@ class Calibration:
         return float(np.abs(rate[folded]).min()) if folded.any() else None
 
     @property
+    def is_ambiguous(self) -> bool:
+        """
+        Tell whether the output decreases anywhere between the rates of the dwells.
+
+        It may do so with the scale factor error or without: a fast sine that passes through all
+        dwells needs a large one.
+        """
+        rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
+        channels = Channels(rate, rate, self.given.reference_temperature)
+        others = tuple(each for each in self.terms if each.effect is not SCALE_FACTOR_ERROR)
+        return any(bool((np.diff(rate + GyroModel(terms).error(channels)) < 0.0).any())
+                   for terms in (self.terms, others))
+
+    @property
     def uncorrected_rms(self) -> float:
         """Return the root mean square of output less rate of what was fitted, rad/s."""
         return rms(self.used.output - self.used.rate)
@@ -366,12 +382,17 @@ def sensitivity_columns(channels: Channels, terms: Sequence[Term]) -> Array:
 
 
 def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
-    """Set each fitted shape in turn to the best of a grid over its bounds."""
+    """
+    Set each fitted shape in turn to the best of a grid over its bounds.
+
+    A smaller one is preferred that is not significantly worse: at evenly spaced rates, fast sines
+    pass through the same dwells as a slow one.
+    """
     channels = channels_of(dwells)
 
-    def misfit(tried: Sequence[Term]) -> float:
-        """Return the residual sum of squares with the coefficients fitted, the shapes fixed."""
-        columns = []
+    def misfit(logarithm: float, terms: tuple[Term, ...], number: int, place: int) -> float:
+        """Return the residual sum of squares with a shape, and the coefficients fitted."""
+        tried, columns = _with_shape(terms, number, place, logarithm), []
         for term in tried:
             shapes = len(term.effect.nonlinear_parameters)
             columns += [term.columns(channels)[place - shapes]
@@ -382,11 +403,30 @@ def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
 
     for number, term in enumerate(terms):
         for place in term.fitted_indices:
-            if place < len(term.effect.nonlinear_parameters):
-                grid = np.geomspace(*term.effect.nonlinear_parameters[place].bounds, 60).tolist()
-                terms = min(((*terms[:number], _replace_value(term, place, value),
-                              *terms[number + 1:]) for value in grid), key=misfit)
+            if place >= len(term.effect.nonlinear_parameters):
+                continue
+            low, high = map(math.log, term.effect.nonlinear_parameters[place].bounds)
+            grid = np.linspace(low, high, 60).tolist()
+            sizes = [misfit(each, terms, number, place) for each in grid]
+            best = int(np.argmin(sizes))
+            found = grid[best]
+            # slower minima of the grid, each refined between its neighbours
+            minima = [at for at in range(1, best) if sizes[at] <= min(sizes[at - 1:at + 2])]
+            if minima:
+                refined = [minimize_scalar(misfit, args=(terms, number, place), method='bounded',
+                                           bounds=(grid[at - 1], grid[min(at + 1, 59)]))
+                           for at in [*minima, best]]
+                dof = max(len(dwells) - len(value_owners(terms)), 1)
+                limit = (1.0 + NORMAL_QUANTILE_975 ** 2 / dof) * min(each.fun for each in refined)
+                found = next(float(each.x) for each in refined if each.fun <= limit)
+            terms = _with_shape(terms, number, place, found)
     return terms
+
+
+def _with_shape(terms: tuple[Term, ...], number: int, place: int,
+                logarithm: float) -> tuple[Term, ...]:
+    return (*terms[:number], _replace_value(terms[number], place, math.exp(logarithm)),
+            *terms[number + 1:])
 
 
 def _replace_value(term: Term, index: int, value: float) -> Term:

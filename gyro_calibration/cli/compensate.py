@@ -38,6 +38,7 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, wri
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 
@@ -71,6 +72,11 @@ def run(given: argparse.Namespace) -> Answer:
         data.update(heading_rad=found.heading, heading_std_rad=deviation)
         known = '' if deviation is None else f' +- {deviation / DEGREE:.2f}'
         lines.append(f'Heading at the end: {found.heading / DEGREE:.2f}{known} deg.')
+        data['noise_is_known'] = model.noise != Noise()
+        if deviation is not None and not data['noise_is_known']:
+            lines.append('The model has no noise figures: noise and wander of the bias are not in '
+                         'the standard deviation; record the gyro at rest, and run allan to add '
+                         'them to the model.')
     estimator = found.estimator
     if estimator is None:
         data['bias_is_calibrated'] = bool(model.self_calibration or model.fits_scale_and_bias[1])

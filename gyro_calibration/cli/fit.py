@@ -25,6 +25,7 @@ from typing import Any
 
 from gyro_calibration.calibration.dwells import format_list
 from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
+from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.rate_table import bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS, rms
 from gyro_calibration.calibration.selection import SelectedEffects, TECHNOLOGY_EFFECTS
@@ -39,6 +40,7 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np
+from scipy.stats import chi2
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -120,7 +122,8 @@ def run(given: argparse.Namespace) -> Answer:
             lines.append(f'--technology {given.technology} is stored in the model; it had no '
                          'influence, since the effects were given.')
         data |= {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
-                 'remarks': list(found.calibration.dwells.remarks)}
+                 'remarks': [*found.calibration.dwells.remarks,
+                             *_describe_excess(found.calibration)]}
     else:
         ((path, log),), fit = logs.items(), found.fit
         lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.',
@@ -271,6 +274,24 @@ def _value_lines(model: GyroModel) -> Iterator[str]:
         yield f'Temperatures are counted from {temperature:g} degC.'
 
 
+def _describe_excess(fit: Calibration) -> Iterator[str]:
+    """Give a sentence where the residual exceeds the scatter, or the noise that is known."""
+    if not fit.dof:
+        return
+    excess, used = math.sqrt(fit.misfit / fit.dof), fit.used
+    if excess > 1.2:
+        yield (f'The residual is {excess:.1f} times the scatter of the dwells about a smooth '
+               'surface: the model lacks an effect. The intervals are widened by this factor.')
+    # Where most rates occur once, nothing shows the scatter of dwells beyond their own noise.
+    places = np.rint(used.rate / max(0.005 * float(np.abs(used.rate).max()), 1e-9))
+    squares = float(np.sum((fit.residual[fit.scatter.inliers] / used.deviation) ** 2))
+    if 2 * len(np.unique(places)) > len(used) and (
+            chi2.sf(squares, fit.dof) < MIN_FIT_PROBABILITY):
+        yield (f'The residual is {math.sqrt(squares / fit.dof):.1f} times the noise within the '
+               'dwells. Either they scatter by more than that, or the model lacks an effect, and '
+               'the intervals do not contain its error; repeat the rates in a second sweep.')
+
+
 def _quality_lines(fit: Calibration) -> Iterator[str]:
     scatter, sweeps = fit.scatter, len(np.unique(fit.dwells.sweep))
     part = 'sweeps' if sweeps >= MIN_SWEEPS else 'blocks of time'
@@ -285,11 +306,7 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
     yield wrap_line(f'Dwells scatter by {scatter.dwell_bias / DEGREE:.4f} deg/s '
                     f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {sweep_scatter}. '
                     f'Condition number {fit.condition_number:.1f}.')
-    excess = math.sqrt(fit.misfit / fit.dof) if fit.dof else 1.0
-    if excess > 1.2:
-        yield wrap_line(f'The residual is {excess:.1f} times the scatter of the dwells about a '
-                        'smooth surface: the model lacks an effect. The intervals are widened by '
-                        'this factor.')
+    yield from map(wrap_line, _describe_excess(fit))
     if fit.min_non_monotonic_rate is not None:
         yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s the modelled '
                         'output does not increase with the rate, so one output has two rates: do '

@@ -12,7 +12,8 @@
 
 from dataclasses import replace
 
-from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, select_dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells, dwells_from_table, join_dwells, select_dwells)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, MIN_DISTINGUISHING_SIGMAS, select_effects, TECHNOLOGY_EFFECTS)
 from gyro_calibration.logs.log import DEGREE, read_log
@@ -34,7 +35,16 @@ WANDERING = Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)
 
 
 def names(selection):
-    return {effect.name for effect in selection.calibration.effects}
+    return names_of(selection.calibration)
+
+
+def names_of(fit):
+    return {effect.name for effect in fit.effects}
+
+
+def of_table(rate, output):
+    return Dwells(rate, output, None, np.full(len(rate), np.nan),
+                  np.zeros(len(rate), dtype=int), ('',) * len(rate))
 
 
 def measured(table, terms, seed=1):
@@ -100,6 +110,33 @@ def test_a_sine_that_passes_through_evenly_spaced_rates_is_not_taken_for_a_cubic
     terms = (*LINEAR, Term(CUBIC_NONLINEARITY, (0.001,)))
     table = measured(Table(sweeps=16, rates=11, dwell=0.01 * DEGREE), terms)
     assert 'cubic_nonlinearity' in names(select_effects(table, technology))
+
+
+def test_two_effects_in_few_dwells_are_found_where_each_alone_is_not_significant():
+    rate = np.linspace(-50.0, 50.0, 9) * DEGREE
+    for seed in range(10):
+        generator = np.random.default_rng(seed)
+        noise = 1e-5 * generator.standard_normal(9)
+        output = np.sin(0.25 * rate) / 0.25 - 0.002 * rate + 0.0025 * np.abs(rate) + noise
+        fit = select_effects(of_table(rate, output), 'open_loop_fog').calibration
+        assert {'sine_response', 'scale_factor_asymmetry'} < names_of(fit)
+        assert fit.terms[-1].effect is not SINE_RESPONSE or fit.terms[-1].values[
+            0] == pytest.approx(0.25, rel=0.02)
+
+
+def test_a_sine_is_taken_up_to_its_fringe_and_beyond_it_the_reason_says_so():
+    rate = np.tile(np.linspace(-300.0, 300.0, 5), 4) * DEGREE
+    for angle in (1.5, 1.8):
+        k = angle / rate.max()
+        output = np.sin(k * rate) / k + 9e-5 * np.random.default_rng(0).standard_normal(20)
+        selection = select_effects(of_table(rate, output), 'open_loop_fog')
+        reason, = (each.reason for each in selection.choices if each.effect == 'sine_response')
+        if angle < 0.5 * np.pi:
+            k_found = selection.calibration.terms[-1].values[0]
+            assert names(selection) == {'bias', 'scale_factor_error', 'sine_response'}
+            assert k_found == pytest.approx(k, rel=1e-3)
+        else:
+            assert 'beyond its fringe' in reason and '--effects' in reason
 
 
 def test_every_effect_has_its_reason():

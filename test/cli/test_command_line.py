@@ -153,6 +153,14 @@ def test_compensate_looks_for_rests(run, compensate, tmp_path, words, resting):
             else seen is None)
 
 
+@pytest.mark.parametrize('noise', ['', '\nnoise: {angle_random_walk: 1.0e-4}'])
+def test_compensate_warns_of_a_model_without_noise_figures(compensate, noise):
+    log = Log(output=np.full(300, 0.1), time=np.arange(300) / 100.0)
+    model = f'effects: {{bias: {{bias: 0.01}}}}\ncovariance: [[1.0e-8]]{noise}'
+    assert ('no noise figures' in compensate(log, model).text) == (not noise)
+    assert json.loads(compensate(log, model, '--json').text)['noise_is_known'] == bool(noise)
+
+
 @pytest.mark.parametrize('words, said', [((), '0 was used'), (('--rest',), 'first steady rate')])
 @pytest.mark.parametrize('effects, known', [
     ('{scale_factor_error: {scale_factor_error: 0.01}}', False), ('{bias: {bias: 0.01}}', True)])

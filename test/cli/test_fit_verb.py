@@ -51,6 +51,22 @@ def test_a_model_that_lacks_an_effect_is_reported(run, table):
     assert code == 0 and 'the model lacks an effect' in ' '.join(text.split())
 
 
+def test_a_residual_above_the_noise_of_dwells_whose_rates_occur_once_is_reported(run, tmp_path):
+    """An asymmetry, in dwells of 12 s, that so few dwells do not show beside their scatter."""
+    generator = np.random.default_rng(2)
+    rate = np.repeat([0.0, -50.0, -20.0, 20.0, 50.0, 0.0], 600)
+    path, time = tmp_path / 'log.csv', np.arange(3600) / 50.0
+    output = rate + 0.001 * np.abs(rate) + 0.02 * generator.standard_normal(3600)
+    np.savetxt(path, np.column_stack([time, rate, output]), delimiter=',', comments='',
+               header='time_s,reference_rate_dps,gyro_dps')
+    for words, is_reported in ((('--effects', 'bias,scale_factor_error'), True),
+                               (('--effects', 'bias,scale_factor_error,scale_factor_asymmetry'),
+                                False)):
+        remarks = strict(run('fit', path, '--json', *words)[1])['remarks']
+        assert any('times the noise within the dwells' in each
+                   for each in remarks) == is_reported, remarks
+
+
 def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     # the record player of the blog, an L3G4200D at 70 mdps a count, turned clockwise
     (tmp_path / 'player.csv').write_text(
