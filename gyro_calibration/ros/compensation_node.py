@@ -357,7 +357,7 @@ class CompensationReport:
                 / seconds if seconds > 0.0 else 0.0)
         self._previous_counts, self._last_report_time = dict(counts), now
         has_noise = model.noise.angle_random_walk > 0.0
-        deviation = math.sqrt(tracker.variance) / DEGREE if has_noise else math.nan
+        deviation = math.sqrt(pipeline.heading_variance) / DEGREE if has_noise else math.nan
         low, high = model.temperature_range
         commands, samples = pipeline.session.max_lateness
         values: dict[str, object] = {
@@ -417,7 +417,7 @@ class CompensationReport:
                    if count - self._previous_counts[name] > tolerated.get(name, 0)}
         silent = self._clock.steady() - journal.last_received
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
-                     or pipeline.repeat_fault):
+                     or pipeline.repeat_fault or pipeline.repeat_doubt):
             return ERROR, error
         if pipeline.ros_time.paused_duration > 1.0:
             return ERROR, ROS_TIME_PAUSED
