@@ -440,6 +440,8 @@ class CompensationReport:
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
             f'{high:g} degC; the correction is extrapolated, and its variance increases',
         }.items() if name in growing]
+        warnings += filter(None, (
+            pipeline.session.warning, *pipeline.faults.values(), pipeline.heading_loss))
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
             warnings.append('no temperature comes; the model is used at its reference temperature '
                             f'of {estimator.model.reference_temperature:g} degC')
@@ -452,9 +454,9 @@ class CompensationReport:
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
         warnings += filter(None, (
-            pipeline.session.warning, *pipeline.faults.values(), pipeline.output_conflict,
-            store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
-            estimator.calibration_message, estimator.bias_message, store.table_hint))
+            pipeline.output_conflict, store.calibration_hint, store.shared_hint,
+            monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,
+            estimator.bias_message, store.table_hint))
         if warnings:
             return WARN, warnings[0]
         tracked = estimator.tracker.slowest_detectable_rate > 0.0

@@ -304,9 +304,9 @@ class HealthMonitor:
         elif (is_announced or abs(rest.bias) < self.standstill_rate
               or several and stays and not any(each.is_bias_normal for each in last)
               and (is_resting or abs(rest.bias) < self._largest_bias)):
-            where = ('at rest' if is_announced or is_resting
-                     or abs(rest.bias) < self.standstill_rate else 'unless the robot turns evenly,')
-            self.bias_alarm = (f'{where} the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
+            is_rest = is_announced or is_resting or abs(rest.bias) < self.standstill_rate
+            self.bias_alarm = (f'{"at rest" if is_rest else "unless the robot turns evenly,"} '
+                               f'the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
                                f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
                                'occurs again, diagnose a log')
         return rest

@@ -151,7 +151,8 @@ class Pipeline:
                 values.maximum_gap), clock.date())
         # false alarms: 0.001 per hour of rest
         # three deviations of the bias of an uncalibrated gyro
-        self.monitor = HealthMonitor(noise, 0.001, self._standstill_rate, 3.0 * values.assumed_bias)
+        self.monitor = HealthMonitor(noise, 0.001, self._standstill_rate,
+                                     3.0 * values.assumed_bias)
         self.wheels, self.journal = Wheels(), _Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
@@ -173,6 +174,7 @@ class Pipeline:
         self._frozen_stamp: tuple[float, float] | None = None
         # that the gyro is dead, or may be so
         self.repeat_fault = self.repeat_doubt = ''
+        self.heading_loss, self._last_variance = '', 0.0  # why the heading is unknown; rad²
         self._repeat_detector = RepeatedOutputDetector(noise)
         self._pulse_detector, self._outlier_count = PulseDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
@@ -285,7 +287,7 @@ class Pipeline:
 
     @property
     def heading_variance(self) -> float:
-        """Return the variance of the heading, rad², with a full turn while the gyro is in doubt."""
+        """Return the variance of the heading, rad², with a turn while the gyro is in doubt."""
         return self.estimator.tracker.variance + bool(self.repeat_doubt) * math.tau ** 2
 
     @property
@@ -507,6 +509,15 @@ class Pipeline:
                                 estimator.rate, tracker.rate_variance + spread)
         if not math.isfinite(sum(found[1:])):
             return None
+        before, self._last_variance = self._last_variance, found.heading_variance
+        if not known or self._last_variance < math.tau ** 2:
+            self.heading_loss = ''
+        elif before < math.tau ** 2:
+            cause = (next(filter(None, self.faults.values()), self.journal.event)
+                     if self._last_variance - before > 0.5 * math.tau ** 2 else
+                     'the errors of scale factor and bias have added up since the last reset')
+            self.heading_loss = (f'the heading is unknown ({cause}): call reset_heading where it '
+                                 'is to be zero')
         if estimator.restart_count != self._known_beginnings:  # another calibration is in use
             self._known_beginnings = estimator.restart_count
             self._recent_rates.clear()

@@ -732,6 +732,30 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
     assert (rig.error(first)[1] > math.tau) == warns
 
 
+@pytest.mark.parametrize('fault, words', [
+    (lambda rig: rig.go(3.0), 'no samples for 3.0'), (lambda rig: None, 'jumps back by 0.99')],
+    ids=['unplugged', 'a jump back'])
+def test_while_the_heading_is_unknown_a_warning_says_why_until_a_reset(
+        tmp_path, reported, fault, words):
+    rig = rested(tmp_path)
+    rig.turn(0.5, 2.0)
+    rig.robot.unplugged = True
+    fault(rig)
+    rig.robot.unplugged = False
+    if 'back' in words:
+        rig.stamp = lambda reading, stamp=rig.stamp: stamp(reading) - 10 ** 9
+    for _ in range(3):
+        rig.go(5.0)
+        reported(rig)
+        level, message, values = reported(rig)
+        assert level == WARN and 'the heading is unknown (' in message, message
+        assert words in message and 'call reset_heading' in message
+        assert float(values['heading_standard_deviation_deg']) >= 360.0
+    rig.pipeline.reset_heading()
+    rig.go(2.0)
+    assert reported(rig)[:2] == (OK, 'the heading is published')
+
+
 def test_a_count_is_a_warning_only_while_it_grows(tmp_path, reported):
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(200, 0.5))
