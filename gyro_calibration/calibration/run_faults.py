@@ -217,16 +217,16 @@ def _try_motions(run: RunPieces, motion: Motion,
             yield (run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
                    f"the robot stopped at about {end:.1f} s of the profile's {duration:.1f} s: "
                    'drive the whole profile' if is_profile else
-                   f'the gyro follows the {motion.name} until about {end:.1f} s of {duration:.1f} s '
-                   'only: repair the line that stopped, and record again')
+                   f'the gyro follows the {motion.name} until about {end:.1f} s of '
+                   f'{duration:.1f} s only: repair the line that stopped, and record again')
         for speed in (2.0 ** (each / 16.0) for each in range(-32, 33)):
             if max(speed, 1.0 / speed) > UNIT_TOLERANCE:
                 yield (run.fit_scale(run.reference_angle(motion, offset, speed))[0],
                        f'the robot drove the profile {speed:.2f} times as fast as given, in '
                        f'{duration / speed:.1f} s instead of {duration:.1f} s: drive it at its '
                        'own speed, or give the profile that was driven' if is_profile else
-                       f'the gyro follows the {motion.name} at {speed:.2f} times its speed: correct '
-                       f'the time of the {motion.name}')
+                       f'the gyro follows the {motion.name} at {speed:.2f} times its speed: '
+                       f'correct the time of the {motion.name}')
     for offset in _trial_offsets(0.6 * duration):
         if abs(offset) > largest_offset:
             yield (run.fit_scale(run.reference_angle(motion, offset))[0],

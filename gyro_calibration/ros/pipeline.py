@@ -138,7 +138,7 @@ class Pipeline:
         self.store = store = StateStore(
             values.model_file, calibration_file,
             calibration_file.with_name(f'{calibration_file.stem}_biases.yaml'),
-            Prior(coefficient=coefficient))
+            Prior(coefficient=coefficient), values.calibration_maximum_bias)
         noise = store.model.noise
         method = values.stationary_method
         self._standstill_rate = 0.0 if method == 'none' else values.stationary_threshold
