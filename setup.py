@@ -80,8 +80,8 @@ setup(
     }, zip_safe=False, entry_points={
         'console_scripts': [
             'gyro_calibration = gyro_calibration.cli.main:main',
-            'driver_node = gyro_calibration.ros.driver_node:main',
-            'compensation_node = gyro_calibration.ros.compensation_node:main',
+            'driver_node = gyro_calibration.ros.start:start_driver',
+            'compensation_node = gyro_calibration.ros.start:start_compensation',
         ],
     }, data_files=[('share/ament_index/resource_index/packages', [f'resource/{name}']),
                    (f'share/{name}', ['package.xml']),

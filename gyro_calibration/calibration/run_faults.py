@@ -217,29 +217,31 @@ def _try_motions(run: RunPieces, motion: Motion,
             yield (run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
                    f"the robot stopped at about {end:.1f} s of the profile's {duration:.1f} s: "
                    'drive the whole profile' if is_profile else
-                   f'the gyro follows the reference until about {end:.1f} s of {duration:.1f} s '
-                   'only: repair the line that stopped, and record again')
+                   f'the gyro follows the {motion.name} until about {end:.1f} s of '
+                   f'{duration:.1f} s only: repair the line that stopped, and record again')
         for speed in (2.0 ** (each / 16.0) for each in range(-32, 33)):
             if max(speed, 1.0 / speed) > UNIT_TOLERANCE:
                 yield (run.fit_scale(run.reference_angle(motion, offset, speed))[0],
                        f'the robot drove the profile {speed:.2f} times as fast as given, in '
                        f'{duration / speed:.1f} s instead of {duration:.1f} s: drive it at its '
                        'own speed, or give the profile that was driven' if is_profile else
-                       f'the gyro follows the reference at {speed:.2f} times its speed: correct '
-                       'the time of the reference')
+                       f'the gyro follows the {motion.name} at {speed:.2f} times its speed: '
+                       f'correct the time of the {motion.name}')
     for offset in _trial_offsets(0.6 * duration):
         if abs(offset) > largest_offset:
             yield (run.fit_scale(run.reference_angle(motion, offset))[0],
                    f'the robot began {abs(offset):.1f} s {"after" if offset > 0 else "before"} '
                    'the profile: begin with it, or allow a larger time offset' if is_profile else
                    f'the gyro is {abs(offset):.1f} s {"behind" if offset > 0 else "ahead of"} the '
-                   'reference: correct the time of the reference')
+                   f'{motion.name}: correct the time of the {motion.name}')
 
 
 def format_slip(motion: Motion, angle: float, time: float, sigmas: float = math.nan) -> str:
     """Say that the robot slipped or was bumped, or that a mount or a reference slipped."""
     significance = '' if math.isnan(sigmas) else f' ({sigmas:.0f} standard deviations)'
     cause = ('a slip or a bump; run again on free ground' if motion.name == 'profile' else
+             'a slip of the wheels or a jump of odom; run again on free ground'
+             if motion.name == 'odometry' else
              'a slip of the mount or an error of the reference; mend it and run again')
     return (f'a stretch of the run differs by {angle / DEGREE:.1f} deg from the '
             f'{motion.name}{significance}, at about {time:.1f} s: {cause}')

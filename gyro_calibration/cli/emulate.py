@@ -27,7 +27,7 @@ from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.logs.log import DataRefused
-from gyro_calibration.ros.inputs import handle_end_signals
+from gyro_calibration.ros.start import handle_end_signals
 import numpy as np
 
 

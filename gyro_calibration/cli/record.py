@@ -45,7 +45,7 @@ from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
 from gyro_calibration.logs.recording import format_seconds, read_recording, Topics
 from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message
-from gyro_calibration.ros.inputs import handle_end_signals
+from gyro_calibration.ros.start import handle_end_signals
 
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'

@@ -122,8 +122,12 @@ class _SampleCounter:
         self._time: float | None = None
         self._outlier_time: float | None = None
 
-    def advance(self, sample: Sample, max_advance: float) -> tuple[float, int]:
-        """Return the advance to this sample, and the number of samples lost before it."""
+    def advance(self, sample: Sample, max_advance: float, following: int) -> tuple[float, int]:
+        """
+        Return the advance to this sample, and the number of samples lost before it.
+
+        `following` is the number of samples that arrived with it, after it.
+        """
         # A time of the device beyond `max_advance` is wrong: the sample came too early.
         missing = sample.missing
         if self._modulus and sample.sequence is not None:
@@ -144,8 +148,13 @@ class _SampleCounter:
             largest = max_advance / self._rate
             for earlier in (self._time, self._outlier_time):
                 if earlier is not None and _MIN_STAMP_STEP <= time - earlier <= largest:
+                    has_restarted = earlier == self._outlier_time
                     self._time, self._outlier_time = time, None
                     by_time = (time - earlier) * self._rate
+                    if has_restarted and _LATE_DURATION < largest < math.inf:
+                        # a gyro that was off meanwhile: only the arrival shows how long
+                        lost = max(0, math.floor(max_advance / self.mean_advance) - 1 - following)
+                        return (1 + lost) * self.mean_advance, lost
                     self._advances.append(by_time)
                     self.mean_advance = median(self._advances)
                     is_known = len(self._advances) == _MEDIAN_SIZE
@@ -232,13 +241,14 @@ class SampleClock:
             return []
         self._last_arrival = arrival = max(arrival, self._last_arrival)
         line, number, before, numbers = self._line, self._last_number, self.lost_count, []
-        for sample in samples:
+        for following, sample in zip(reversed(range(len(samples))), samples):
             # the largest advance to a sample that has arrived
             margin = (0.5 * max(self.period, _MIN_LATENESS) if self.is_settled
                       else _OUTLIER_LATENESS)
             left = (arrival + margin - line.value_at(number)) / line.slope
             advance, lost = self._counter.advance(
-                sample, max(left, 1.5 * self._counter.mean_advance) if line.points else math.inf)
+                sample, max(left, 1.5 * self._counter.mean_advance) if line.points else math.inf,
+                following)
             number += advance
             self.lost_count += lost
             numbers.append(number)

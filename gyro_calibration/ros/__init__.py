@@ -14,6 +14,6 @@ ROS 2 nodes: the computing modules with topics, services and parameters.
 `pipeline` and `calibration_session` process samples, commands and time without rclpy; the nodes
 connect them to topics.
 
-Reading order: `inputs`, `runner`, `health_monitor`, `state_store`, `driver_node`, `recorder_node`,
-`calibration_session`, `pipeline`, `compensation_node`.
+Reading order: `start`, `inputs`, `runner`, `health_monitor`, `state_store`, `driver_node`,
+`recorder_node`, `calibration_session`, `pipeline`, `compensation_node`.
 """

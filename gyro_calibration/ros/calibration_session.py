@@ -228,6 +228,9 @@ class CalibrationSession:
             return 'a calibration is in progress; wait for its end, or call cancel_calibration'
         if self._store.problem:
             return self._store.problem
+        if kind in (ODOMETRY, TURNS) and values.calibration_drive:
+            return (f'calibration.drive drives the profile, which is no calibration by {kind}: '
+                    'set calibration.reference to profile, or calibration.drive to false')
         motion, drives = None, kind == PROFILE and values.calibration_drive
         duration = {ODOMETRY: values.calibration_duration, REST: 15.0}.get(kind, math.inf)
         if kind == PROFILE:
@@ -467,14 +470,22 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     else:
         rows = np.array([each for each in run.odometry if each[0] <= time[0] + run.duration])
         increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
-        if len(rows) < 10 or not increases or np.ptp(rows[:, 0]) < 0.8 * run.duration:
+        if len(rows) < 10:
             raise DataRefused(
-                f'{len(rows)} messages came on odom in {run.duration:.0f} s, but at least 10 with '
-                'increasing stamps over most of the run are needed: check the odometry')
+                f'{len(rows)} messages came on odom with an orientation and a rate in '
+                f'{run.duration:.0f} s, but at least 10 are needed: check the topic, its '
+                'quaternions, which have the length 1, and its twist')
+        if not increases:
+            raise DataRefused('the messages on odom do not have increasing stamps: check that '
+                              'one node publishes them')
+        if (covered := float(np.ptp(rows[:, 0]))) < 0.8 * run.duration:
+            raise DataRefused(f'{len(rows)} messages came on odom, but in {covered:.0f} s of '
+                              f'{run.duration:.0f} s only: check that it does not stop')
         at, headings, rates = rows.T
         begin, headings = at[0], np.unwrap(headings)
         motion = (motion_from_headings(at, headings) if np.ptp(headings) > MIN_TURN_ANGLE
                   else motion_from_rates(at - begin, rates))
+        motion = replace(motion, name='odometry')
     time = time - begin
     inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,

@@ -357,7 +357,7 @@ class CompensationReport:
                 / seconds if seconds > 0.0 else 0.0)
         self._previous_counts, self._last_report_time = dict(counts), now
         has_noise = model.noise.angle_random_walk > 0.0
-        deviation = math.sqrt(tracker.variance) / DEGREE if has_noise else math.nan
+        deviation = math.sqrt(pipeline.heading_variance) / DEGREE if has_noise else math.nan
         low, high = model.temperature_range
         commands, samples = pipeline.session.max_lateness
         values: dict[str, object] = {
@@ -417,7 +417,7 @@ class CompensationReport:
                    if count - self._previous_counts[name] > tolerated.get(name, 0)}
         silent = self._clock.steady() - journal.last_received
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
-                     or pipeline.repeat_fault):
+                     or pipeline.repeat_fault or pipeline.repeat_doubt):
             return ERROR, error
         if pipeline.ros_time.paused_duration > 1.0:
             return ERROR, ROS_TIME_PAUSED
@@ -440,6 +440,8 @@ class CompensationReport:
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
             f'{high:g} degC; the correction is extrapolated, and its variance increases',
         }.items() if name in growing]
+        warnings += filter(None, (
+            pipeline.session.warning, *pipeline.faults.values(), pipeline.heading_loss))
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
             warnings.append('no temperature comes; the model is used at its reference temperature '
                             f'of {estimator.model.reference_temperature:g} degC')
@@ -452,9 +454,9 @@ class CompensationReport:
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
         warnings += filter(None, (
-            pipeline.session.warning, *pipeline.faults.values(), pipeline.output_conflict,
-            store.calibration_hint, store.shared_hint, monitor.bias_alarm, monitor.noise_alarm,
-            estimator.calibration_message, estimator.bias_message, store.table_hint))
+            pipeline.output_conflict, store.calibration_hint, store.shared_hint,
+            monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,
+            estimator.bias_message, store.table_hint))
         if warnings:
             return WARN, warnings[0]
         tracked = estimator.tracker.slowest_detectable_rate > 0.0

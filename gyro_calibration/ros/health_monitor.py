@@ -69,10 +69,15 @@ class RepeatedOutputDetector:
     larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
     a repeated zero counts only after a deceleration that no robot has, 20 rad/s², or if a whole
     stretch at rest had the noise of the model before the first such zero. Two neighbouring codes,
-    as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above.
+    as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above. What
+    counts does so until the value changes.
+
+    A gyro with noise `is_doubtful` while it repeats the value of its first sample, whose step is
+    not known, or zero against chance for the first time: it is dead, or shows that at rest.
 
     A value that was held for less time, but longer than usual and not by chance, leaves a possible
-    error of the integrated rate, `unseen_turn`, rad, with the sample that ends it.
+    error of the integrated rate, `unseen_turn`, rad, with the sample that ends it; a full turn
+    where the first value shows later, by step and noise, to have been that of a dead gyro.
     """
 
     def __init__(self, noise: Noise):
@@ -80,6 +85,8 @@ class RepeatedOutputDetector:
         self._value, self._since, self._count = math.nan, 0.0, 0
         self._last_step = self._acceleration = 0.0  # to this value, rad/s, and rad/s² less noise
         self._reports_zero, self._holds = False, Intervals()
+        self._is_fault = self.is_doubtful = self._has_left_zero = False
+        self._first = 0.0, 0  # value, rad/s, and number of samples before the first change
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # Smallest and largest value since a time, s, and the number of samples after the first.
         self._band = math.nan, math.nan, 0.0, 0
@@ -119,6 +126,16 @@ class RepeatedOutputDetector:
                     self.unseen_turn = math.hypot(
                         math.hypot(step, self._last_step) * (held + usual) / math.sqrt(3.0),
                         0.25 * MAX_ANGULAR_ACCELERATION * (held + usual) ** 2)
+            if self._changes == 1:
+                self._first = self._value, self._count
+            elif self._first[1] >= 20 and self._changes > 100 and (
+                    self._first[0] or has_noise_at_rest):
+                sample = self._noise.angle_random_walk / math.sqrt(self._holds.usual_interval)
+                if sample and self._excludes_chance(self._step, self._first[1], sample):
+                    self.unseen_turn = math.tau
+                self._first = 0.0, 0
+            self._is_fault = self.is_doubtful = False
+            self._has_left_zero = self._reports_zero
             self._last_step = step
             self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
                                   / max(changed_after, MIN_SAMPLE_INTERVAL))
@@ -127,21 +144,25 @@ class RepeatedOutputDetector:
             return toggles
         self._count, self._until = self._count + 1, time
         lasts = time - self._since
-        if toggles or self._count < 20 or lasts < FAULT_DURATION:
-            return toggles
-        if (lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
-                and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
-            return True
+        self._is_fault = self._is_fault or (
+            lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
+            and abs(output - odometry_rate) > 0.5 * abs(odometry_rate))
+        if toggles or self._is_fault or self._count < 20 or lasts < FAULT_DURATION:
+            return toggles or self._is_fault
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
         is_sudden = self._acceleration > _MAX_DECELERATION
         self._reports_zero = self._reports_zero or output == 0.0 and not (
             has_noise_at_rest or is_sudden)
-        # the step of the output is known after 100 changes
-        if (output == 0.0 and self._reports_zero and not is_sudden
-                or self._changes <= 100 or not sample):
-            return False
-        return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
-                or self._excludes_chance(self._step, self._count, sample))
+        # the step of the output is known after 100 changes; the first sample is one
+        is_chance = self._changes <= 100 or not sample or not (
+            2.0 * _MAX_NOISE_REDUCTION * self._step < sample
+            or self._excludes_chance(self._step, self._count, sample))
+        if output == 0.0 and self._reports_zero and not is_sudden:
+            self.is_doubtful = not (is_chance or self._has_left_zero)
+        else:
+            self._is_fault = not is_chance
+        self.is_doubtful = self.is_doubtful or sample > 0.0 and self._changes == 1
+        return self._is_fault
 
     def _excludes_chance(self, width: float, count: float, sample: float,
                          level: float = 100.0) -> bool:
@@ -206,14 +227,17 @@ class HealthMonitor:
     `has_noise_at_rest` tells whether one had the noise and the bias of the model.
     """
 
-    def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0):
+    def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0,
+                 largest_bias: float = math.inf):
         """
         Start without samples; `noise` is that of the model.
 
         The largest rate of false alarms at rest is in 1/h. Means below the standstill rate, rad/s,
-        are rest; one above may be a steady turn, and counts only if it stays in several stretches.
+        are rest; one above may be a steady turn, and counts only if it stays in several stretches,
+        and, unless a rest is known otherwise, is below the largest bias, rad/s.
         """
         self._noise, self.standstill_rate = noise, standstill_rate
+        self._largest_bias = largest_bias
         # Four tests: noise and bias, upwards and downwards.
         self._level = 0.25 * false_alarm_rate * REST_DURATION / 3600.0
         self.is_enabled = noise.angle_random_walk > 0.0 and self._level > 0.0
@@ -241,10 +265,15 @@ class HealthMonitor:
         self._samples.append((time, output, rate))
         return time - self._samples[0][0] >= REST_DURATION
 
-    def examine_stretch(self, bias_variance: float, age: float,
-                        is_announced: bool) -> _RestResult | None:
-        """Test the complete stretch as `examine_stretch` does, and start the next one."""
-        time, output, rate = np.array(self._samples).T
+    def examine_stretch(self, bias_variance: float, age: float, is_announced: bool,
+                        is_resting: bool = False) -> _RestResult | None:
+        """
+        Test the complete stretch as `examine_stretch` does, and start the next one.
+
+        A rest is announced by a run, or shown by wheels or tracker; else the robot may turn.
+        """
+        # the last sample is alone in its part, and may be the first of a turn
+        time, output, rate = np.array(self._samples[:-1]).T
         self.restart()
         if np.ptp(output) > 0.0:
             self._step = min(self._step, quantization_step(output))
@@ -253,8 +282,10 @@ class HealthMonitor:
         if rest is None:
             return None
         self.last_rest, self.examined_count = rest, self.examined_count + 1
-        self.has_noise_at_rest = (self.has_noise_at_rest
-                                  or rest.is_noise_normal and rest.is_bias_normal)
+        # not only normal as of a coarse output, which may hide all noise
+        self.has_noise_at_rest = (
+            self.has_noise_at_rest or rest.is_noise_normal and rest.is_bias_normal
+            and 1.0 / _MAX_NOISE_REDUCTION < rest.noise_ratio < _MAX_NOISE_REDUCTION)
         self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
         last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
         # the mean was the same in the last stretches, unlike in turns
@@ -271,8 +302,11 @@ class HealthMonitor:
         if rest.is_bias_normal:
             self.bias_alarm = ''
         elif (is_announced or abs(rest.bias) < self.standstill_rate
-              or several and stays and not any(each.is_bias_normal for each in last)):
-            self.bias_alarm = (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
+              or several and stays and not any(each.is_bias_normal for each in last)
+              and (is_resting or abs(rest.bias) < self._largest_bias)):
+            is_rest = is_announced or is_resting or abs(rest.bias) < self.standstill_rate
+            self.bias_alarm = (f'{"at rest" if is_rest else "unless the robot turns evenly,"} '
+                               f'the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
                                f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
                                'occurs again, diagnose a log')
         return rest

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-What a node takes from outside, without rclpy: signals, parameters, clocks, motion of the wheels.
+What a node takes from outside, without rclpy: parameters, clocks, motion of the wheels.
 
 Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
 ROS time, which may be paused. The motion is that of odometry and commands of the last second.
@@ -22,19 +22,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 import math
 import reprlib
-import signal
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Protocol
 
 from gyro_calibration.calibration.self_calibration import RunLimits
-
-
-def handle_end_signals(handler: Any) -> dict[int, Any]:
-    """Handle Ctrl-C, SIGTERM and, but for nohup, a lost terminal; return the handlers before."""
-    return {number: signal.signal(number, handler)
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN}
-
 
 _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
                                 str: 'text', list: 'a list of strings'}

@@ -17,7 +17,9 @@ the steady clock.
 
 Two publishers are detected by their stamps: a sample of a second one divides an interval so that
 one part is at most half of it. Two such intervals while the graph lists several publishers are the
-proof. The graph alone is not, since it lists a killed driver for up to 20 s.
+proof. The graph alone is not, since it lists a killed driver for up to 20 s. A stamp that jumps
+back is one of several gyros, of a clock that was set, or of a late sample, for which the stamps
+before it have left a gap of one and a half intervals or more.
 """
 
 from __future__ import annotations
@@ -95,6 +97,7 @@ _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bi
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
 _INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several publishers
+_MAX_LATE_SAMPLES = 8  # samples after which one that was overtaken by them is not expected
 
 
 class CorrectedSample(NamedTuple):
@@ -135,7 +138,7 @@ class Pipeline:
         self.store = store = StateStore(
             values.model_file, calibration_file,
             calibration_file.with_name(f'{calibration_file.stem}_biases.yaml'),
-            Prior(coefficient=coefficient))
+            Prior(coefficient=coefficient), values.calibration_maximum_bias)
         noise = store.model.noise
         method = values.stationary_method
         self._standstill_rate = 0.0 if method == 'none' else values.stationary_threshold
@@ -147,7 +150,9 @@ class Pipeline:
                 self._standstill_rate, angle_random_walk=noise.angle_random_walk),
                 values.maximum_gap), clock.date())
         # false alarms: 0.001 per hour of rest
-        self.monitor = HealthMonitor(noise, 0.001, self._standstill_rate)
+        # three deviations of the bias of an uncalibrated gyro
+        self.monitor = HealthMonitor(noise, 0.001, self._standstill_rate,
+                                     3.0 * values.assumed_bias)
         self.wheels, self.journal = Wheels(), _Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
@@ -158,6 +163,7 @@ class Pipeline:
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last_time, self._usual_interval = -math.inf, math.inf
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
+        self._stamps = deque[int](maxlen=_MAX_LATE_SAMPLES)  # the last ones, in order of arrival
         self._first_frame: str | None = None
         self._frame: str | None = None
         # that the graph lists several publishers, and samples too soon after the one before
@@ -166,7 +172,10 @@ class Pipeline:
         self._trusted_heading = 0.0, 0.0
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
-        self.repeat_fault, self._repeat_detector = '', RepeatedOutputDetector(noise)
+        # that the gyro is dead, or may be so
+        self.repeat_fault = self.repeat_doubt = ''
+        self.heading_loss, self._last_variance = '', 0.0  # why the heading is unknown; rad²
+        self._repeat_detector = RepeatedOutputDetector(noise)
         self._pulse_detector, self._outlier_count = PulseDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
         self._stamp_delay = self._new_stamp_delay()
@@ -277,6 +286,11 @@ class Pipeline:
         return self.estimator.heading_before_resets + self.estimator.tracker.heading
 
     @property
+    def heading_variance(self) -> float:
+        """Return the variance of the heading, rad², with a turn while the gyro is in doubt."""
+        return self.estimator.tracker.variance + bool(self.repeat_doubt) * math.tau ** 2
+
+    @property
     def _is_odometry_contradictory(self) -> bool:
         return self._clock.steady() - self._contradiction_time <= 600.0  # s
 
@@ -337,6 +351,10 @@ class Pipeline:
                              'time; the sample is not used')
             return None
         silence = now - self._last_arrival
+        if self._is_late(stamp, frame):
+            journal.event = ('a sample came after the next one and is not used: the connection to '
+                             'the driver changes their order')
+            return None
         self._detect_several_gyros(stamp, frame, now, silence)
         self._last_stamp, self._last_arrival = stamp, now
         if self.conflict:
@@ -379,14 +397,28 @@ class Pipeline:
         self._stamp_delay.add(time, self._heading)
         self._check_repeats(time, output, now)
         self._alternate_turns.add(time, output)
-        run = self.session.run
-        if self.monitor.is_enabled and self.monitor.add(time, output,
-                                                        self.estimator.corrected_rate):
+        run, moving = self.session.run, self.wheels.is_moving(now)
+        if moving:
+            self.monitor.restart()
+        elif self.monitor.is_enabled and self.monitor.add(time, output,
+                                                          self.estimator.corrected_rate):
             self.monitor.examine_stretch(self.estimator.bias_variance,
                                          self.estimator.bias_age(self._clock.date()),
-                                         run is not None and run.kind == REST)
+                                         run is not None and run.kind == REST,
+                                         self.estimator.tracker.is_resting or moving is False)
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
+
+    def _is_late(self, stamp: int, frame: str) -> bool:
+        """Tell whether a sample was overtaken by the last ones, whose stamps left a gap for it."""
+        # two gyros of the same rate leave no gap of one and a half intervals
+        stamps, behind = self._stamps, 1e-9 * (self._last_stamp - stamp)
+        usual = self.estimator.tracker.intervals.usual_interval
+        is_late = (0.0 < behind < _MAX_LATE_SAMPLES * usual < math.inf and frame == self._frame
+                   and not self.publisher_conflict and min(stamps) < stamp
+                   and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
+        stamps.append(stamp)
+        return is_late
 
     def _detect_several_gyros(self, stamp: int, frame: str, now: float, silence: float) -> None:
         """Detect stamps that jump back, frames that alternate, and samples that interleave."""
@@ -472,10 +504,20 @@ class Pipeline:
         # After a reset the variance is that of one sample; zero would state an exact heading.
         least = tracker.rate_variance * min(self._usual_interval, 1.0) ** 2
         found = CorrectedSample(stamp + self._stamp_offset, tracker.heading,
-                                max(tracker.variance, least) if known else UNMEASURED_VARIANCE,
+                                max(self.heading_variance, least) if known
+                                else UNMEASURED_VARIANCE,
                                 estimator.rate, tracker.rate_variance + spread)
         if not math.isfinite(sum(found[1:])):
             return None
+        before, self._last_variance = self._last_variance, found.heading_variance
+        if not known or self._last_variance < math.tau ** 2:
+            self.heading_loss = ''
+        elif before < math.tau ** 2:
+            cause = (next(filter(None, self.faults.values()), self.journal.event)
+                     if self._last_variance - before > 0.5 * math.tau ** 2 else
+                     'the errors of scale factor and bias have added up since the last reset')
+            self.heading_loss = (f'the heading is unknown ({cause}): call reset_heading where it '
+                                 'is to be zero')
         if estimator.restart_count != self._known_beginnings:  # another calibration is in use
             self._known_beginnings = estimator.restart_count
             self._recent_rates.clear()
@@ -490,6 +532,10 @@ class Pipeline:
         pulse, size = self._pulse_detector.add(time, output)
         is_repeated = self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
                                                 self.monitor.has_noise_at_rest)
+        self.repeat_doubt = (
+            f'the gyro repeats the rate {output:g} rad/s without the noise of its model: it is '
+            'dead, or shows this at rest; turn the robot to find out'
+            if self._repeat_detector.is_doubtful and not is_repeated else '')
         if not is_repeated:
             if self._outlier_count > outliers:  # the tracker has not used the sample
                 pulse = 0.0

@@ -30,7 +30,8 @@ import threading
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gyro_calibration.ros.inputs import handle_end_signals, NodeParameter, parameter_values
+from gyro_calibration.ros.inputs import NodeParameter, parameter_values
+from gyro_calibration.ros.start import handle_end_signals
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 import rclpy

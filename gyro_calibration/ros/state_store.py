@@ -17,15 +17,19 @@ If they differ from the model in use, the self-calibration is not used.
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
+from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.files import (
     describe_error, file_version, keep_aside, remedy, remove_leftovers, to_printable)
 from gyro_calibration.heading.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
 from gyro_calibration.model.gyro_model import (
     GyroModel, have_same_effects, SelfCalibration, with_self_calibration)
 from gyro_calibration.model.model_file import ModelError, ModelNotFound, read_model, write_model
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.settings_file import InvalidValue
 
 
 class StateStore:
@@ -37,8 +41,14 @@ class StateStore:
     file, each in a sentence or ''. `table_written_time` is in s since 1970, None before the first.
     """
 
-    def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior):
-        """Read the files, use those without a fault, and remove temporary files of killed runs."""
+    def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior,
+                 max_bias: float = RunLimits.max_bias):
+        """
+        Read the files, use those without a fault, and remove temporary files of killed runs.
+
+        A model with a bias beyond the largest one, rad/s, is a fault.
+        """
+        self._max_bias = max_bias
         for file in (calibration_file, bias_file):
             remove_leftovers(file)
         self._calibration_file, self._bias_file = calibration_file, bias_file
@@ -67,7 +77,12 @@ class StateStore:
         model = GyroModel()
         if model_file:
             try:
-                model = read_model(os.path.expanduser(model_file))
+                read = read_model(os.path.expanduser(model_file))
+                try:
+                    refuse_implausible_model(read, self._max_bias)
+                except InvalidValue as error:
+                    raise ModelError(f'{model_file}: {error}') from None
+                model = read
             except ModelError as error:
                 self.problem = f'uncalibrated: {error}'
                 return model
@@ -126,6 +141,28 @@ class StateStore:
             self.table_hint = to_printable('the bias table cannot be written '
                                            f'({describe_error(error)}): '
                                            f'{remedy(error, self._bias_file)}')
+
+
+def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
+    """
+    Raise `InvalidValue` for a model by which no gyro of a robot can be compensated.
+
+    Bias, rad/s, and scale factor error are limited as those of a run are. By its noise a heading
+    must not be unknown within a second, as one of any direction, with a deviation of pi / sqrt(3).
+    """
+    limits = {'scale_factor_error': (RunLimits.max_scale_factor_error, 'a fraction, not in %'),
+              'bias': (max_bias, 'in rad/s; calibration.maximum_bias allows another one')}
+    for term in model.terms:
+        name = term.effect.name
+        if name in limits and not abs(term.values[0]) <= limits[name][0]:
+            limit, remedy = limits[name]
+            raise InvalidValue(f'effects.{name}.{name}', term.values[0],
+                               f'at most {limit:.4g} of either sign, {remedy}')
+    for name, value in vars(model.noise).items():
+        if not math.sqrt(Noise(**{name: value}).heading_variance(1.0)) < math.pi / math.sqrt(3.0):
+            raise InvalidValue(f'noise.{name}', value,
+                               'SI units, rad and s: with this noise the heading is unknown '
+                               'within 1 s')
 
 
 def _existing_version(file: Path) -> tuple[int, int] | None:

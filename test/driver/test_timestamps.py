@@ -226,6 +226,19 @@ def test_a_device_that_was_restarted_begins_anew(generator):
     assert run.error() < 0.003
 
 
+@pytest.mark.parametrize('outage', [0.5, 1.5, 2.5])
+def test_what_a_device_has_not_sent_while_it_restarted_is_lost(outage, generator):
+    """It is silent, and its time begins anew; the line was not reopened."""
+    times = true_times(100.0, 0.0, 40.0)
+    kept = (times < 15.0) | (times > 15.0 + outage)
+    clock = SampleClock(100.0)
+    run = play(clock, times, arrivals_of(times, generator), kept,
+               time=np.where(times < 15.0, times + 500.0, times - 14.0))
+    assert clock.lost_count == pytest.approx(run.truly_lost, abs=5)
+    errors = np.abs(run.stamps - run.times)[run.times > 15.1 + outage]
+    assert errors.max() < 0.05 and np.median(errors) < 0.02
+
+
 @pytest.mark.parametrize(('outage', 'first'), [(0.0, 0), (0.3, 64), (0.55, 0), (1.0, 64)])
 def test_after_a_sequence_that_began_anew_stamps_are_soon_right_to_a_burst(
         outage, first, generator):

@@ -441,7 +441,8 @@ def test_odometry_is_a_reference(tmp_path, has_yaw):
 
 
 @pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
-                                           (lambda given: given[:20], '20 messages came'),
+                                           (lambda given: given[:20],
+                                            '20 messages came on odom, but in 0 s of 20 s only'),
                                            (lambda given: given[::-1], 'increasing stamps')],
                          ids=['none', 'too few', 'out of order'])
 def test_odometry_that_cannot_be_used_is_refused(tmp_path, spoil, reason):
@@ -450,6 +451,30 @@ def test_odometry_that_cannot_be_used_is_refused(tmp_path, spoil, reason):
     rig.session.run.odometry = spoil(rig.session.run.odometry)
     success, message = rig.session.conclude()
     assert not success and reason in message, message
+
+
+@pytest.mark.parametrize('spoil, reason', [
+    (lambda time, heading: heading + 0.15 * (time > 6.0), 'differs by .* deg from the odometry'),
+    (lambda time, heading: heading * (time < 6.0), 'of the odometry|the gyro .* the odometry'),
+    (lambda time, heading: heading / DEGREE, 'the odometry in deg and read as rad'),
+    (lambda time, heading: -heading, 'the other way than the odometry'),
+    (lambda time, heading: 0.0, 'the odometry does not turn')],
+    ids=['a jump', 'a reset', 'deg', 'sense', 'no turn'])
+def test_what_is_wrong_with_odometry_is_not_said_of_a_profile(tmp_path, spoil, reason):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    begin = rig.clock.now
+    rig.odometry = lambda stamp, reading: rig.pipeline.add_odometry(
+        stamp, math.remainder(spoil(rig.clock.now - begin, reading.heading), math.tau),
+        Velocity())
+    turn_to_and_fro(rig, 13.5)
+    success, message = rig.session.conclude()
+    assert not success and re.search(reason, message) and 'profile' not in message, message
+
+
+@pytest.mark.parametrize('kind', [ODOMETRY, TURNS])
+def test_only_a_profile_is_driven(tmp_path, kind):
+    rig = rested(tmp_path, calibration_reference=kind, calibration_drive=True)
+    assert 'calibration.drive drives the profile' in rig.begin(kind) and not rig.session.run
 
 
 def test_odometry_that_is_computed_from_the_gyro_is_no_reference(tmp_path):

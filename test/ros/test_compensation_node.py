@@ -73,8 +73,9 @@ def test_what_is_published(hold, tmp_path):
     """Only z and the orientation of the incoming message change; no variance is zero."""
     held = hold(model_file=tmp_path / 'model.yaml', stationary__method='none')
     held.tick()  # now it knows who subscribes
-    for number in range(100):
-        held.send('/imu/data_raw', sample(number, 0.5))
+    for number in range(100):  # that never change are those of a dead gyro
+        held.send('/imu/data_raw', sample(
+            number, 0.5 + 0.001 * ((number == 51) - (number == 50))))
     message = sample(100, 0.5)  # with the other axes, of a driver that measures them
     message.angular_velocity.x, message.angular_velocity.y = 0.1, -0.2
     message.angular_velocity_covariance = [1e-4, 1e-6, 0.0, 1e-6, 2e-4, 0.0, 0.0, 0.0, 9.0]

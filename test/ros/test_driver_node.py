@@ -259,6 +259,16 @@ def test_a_gyro_is_published_end_to_end(ros, start_node, wait_until):
         (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)}
 
 
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize('program', ['start_driver', 'start_compensation'])
+def test_a_signal_during_the_imports_ends_a_node_with_code_0(program, number):
+    script = (f'import os; from gyro_calibration.ros import start; '
+              f'start.import_module = lambda name: os.kill(os.getpid(), {int(number)}); '
+              f'start.{program}()')
+    ended = subprocess.run([sys.executable, '-c', script], capture_output=True, timeout=60.0)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b'', b'')
+
+
 def test_an_impossible_parameter_ends_it_with_one_sentence(start_node):
     node = start_node('driver_node', {'protocol': 'fizoptika'})
     assert node.wait() == 2

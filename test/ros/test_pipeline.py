@@ -82,7 +82,7 @@ def test_a_short_gap_is_bridged_and_after_a_jump_of_the_stamps_integration_begin
 @pytest.mark.parametrize('rate', [0.5, 0.0])
 def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path, rate):
     rig = Rig(tmp_path, model=CERTAIN)
-    before = rig.feed(np.full(100, 0.01))[-1]
+    before = rig.feed(np.resize([0.009, 0.01, 0.011], 100))[-1]
     for _ in range(300):
         rig.skip(-INTERVAL, steady=0.0)
         assert rig.feed([rate]) == [None]
@@ -185,6 +185,50 @@ def test_repeated_values_are_a_fault_where_no_gyro_gives_them_by_itself(
     rig.pipeline.reset_heading()
     shown = rig.feed(noisy(1.0), SLOW)[-1]
     assert not is_fault or shown.heading_variance > math.pi ** 2, 'a reset shows nothing'
+
+
+@pytest.mark.parametrize('value', [0.0, 2e-4])
+@pytest.mark.parametrize('alive', [0.0, 5.0], ids=['from the first sample on', 'after 5 s'])
+def test_a_gyro_that_is_dead_in_the_first_seconds_is_an_error_and_the_heading_claims_nothing(
+        tmp_path, reported, alive, value):
+    rig = rested(tmp_path, seconds=0.0, model=CERTAIN)
+    rig.go(alive)
+    right, rig.robot.distort = rig.robot.distort, lambda _: value
+    for rate in (0.0, 0.7, 0.0):
+        rig.turn(rate, 5.0)
+        level, message, values = reported(rig)
+        assert level == ERROR and 'the gyro repeats' in message, message
+        assert float(values['heading_standard_deviation_deg']) > 300.0
+        assert rig.outputs[-1].heading_variance > math.pi ** 2
+    rig.robot.distort = right
+    rig.go(20.0)
+    error, deviation = rig.error()
+    assert abs(error) > 2.0 and (deviation > math.pi or alive and not value), 'it has been dead'
+
+
+@pytest.mark.parametrize('first', [np.zeros(500), np.full(500, 0.3)], ids=['zeros', 'one code'])
+def test_a_gyro_that_repeats_its_value_at_rest_is_in_doubt_until_it_has_turned(
+        tmp_path, reported, first):
+    """It reports zero at rest, or its steps are larger than its noise."""
+    rig = Rig(tmp_path, model=CERTAIN)
+    found, step = rig.feed(first, SLOW), 0.3
+    assert reported(rig)[0] == ERROR and found[-1].heading_variance > math.pi ** 2
+    assert found[3].heading_variance < 0.1, 'before 20 of them'
+    turn = noisy(10.0, 0.5)
+    found = rig.feed(np.round(turn / step) * step if first[0] else turn, SLOW)
+    assert reported(rig)[0] != ERROR and found[-1].heading_variance < 0.1
+    rig.feed(first, SLOW)
+    assert reported(rig)[0] != ERROR, 'it is known to do so'
+
+
+def test_a_gyro_that_odometry_has_shown_to_be_dead_stays_so_at_the_next_stop(tmp_path, reported):
+    rig = Rig(tmp_path, model=KNOWN.split('noise')[0])  # without noise figures
+    for moving in (0.0, 0.3, 0.0):
+        rig.feed(np.zeros(200), SLOW, moving=moving)
+        assert ('it is dead' in reported(rig)[1]) == bool(moving or rig.pipeline.repeat_fault)
+    assert rig.pipeline.repeat_fault
+    rig.feed(noisy(2.0), SLOW)
+    assert not rig.pipeline.repeat_fault
 
 
 @pytest.mark.parametrize('size', [0.3, -1.0, 30.0])
@@ -361,6 +405,38 @@ def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, sh
     assert abs(turned) < 0.7 * 0.5, 'half a second at most'
 
 
+@pytest.mark.parametrize('share, behind', [(0.0, 1), (0.005, 1), (0.1, 1), (0.02, 3)])
+def test_samples_that_come_late_from_one_publisher_are_lost_samples(tmp_path, share, behind):
+    rig, waiting = rested(tmp_path, model=CERTAIN, seconds=12.0,
+                          robot=Robot(bias=0.01, scale_factor_error=0.0)), []
+    sample, generator, begin = rig.sample, np.random.default_rng(1), len(rig.outputs) - 1
+
+    def swap(*reading):
+        if not waiting and (generator.random() < share or not share and len(rig.truth) == 1500):
+            waiting.append((behind, reading))
+            return
+        sample(*reading)
+        if waiting:
+            left, late = waiting.pop()
+            sample(*late) if left == 1 else waiting.append((left - 1, late))
+    rig.sample = swap
+    for rate in (0.7, -0.4, 0.5, 0.0):
+        rig.turn(rate, 5.0)
+    counts, (error, deviation) = rig.journal.counts, rig.error(begin)
+    assert not rig.pipeline.conflict and not counts['restarts'] and counts['lost_samples'] > 0
+    assert 'came after the next one' in rig.journal.event
+    assert abs(error) < 4.0 * deviation < 0.3 * len(rig.outputs) * max(share, 1e-3) * DEGREE
+
+
+@pytest.mark.parametrize('offset', [0.025, 0.03, 0.031, 0.037])
+def test_two_gyros_a_few_intervals_apart_on_one_topic_are_not_late_samples(tmp_path, offset):
+    rig = rested(tmp_path)
+    for _ in range(30):
+        rig.step()
+        rig.sample(max(rig.truth) + round(1e9 * offset), 0.0)
+    assert 'jump back repeatedly' in rig.pipeline.conflict
+
+
 def test_a_queue_that_is_stamped_on_arrival_is_no_stamp_that_stands_still(tmp_path, reported):
     rig = rested(tmp_path)
     rig.go(2.0)
@@ -408,7 +484,8 @@ def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, report
         for _ in range(250):
             rig.clock.now += INTERVAL
             rig.fed += 10 ** 7
-            rig.outputs.append(rig.pipeline.add_sample(rig.fed, 0.01, frame=frame))
+            rig.outputs.append(rig.pipeline.add_sample(
+                rig.fed, rig.robot.step().output, frame=frame))
             rig.guards()
         found = rig.pipeline.faults['frame']
         assert fault in found and bool(fault) == bool(found)
@@ -552,6 +629,17 @@ def test_a_bias_that_moved_raises_an_alarm_which_a_calibration_at_rest_ends(
     assert not rig.pipeline.monitor.bias_alarm
 
 
+@pytest.mark.parametrize('odometry', [True, False], ids=['odometry', 'no wheels'])
+@pytest.mark.parametrize('rate', [1.6, 5.0, 20.0])
+def test_an_even_turn_of_a_circle_is_no_change_of_the_bias(tmp_path, rate, odometry):
+    rig = Rig(tmp_path, model=CERTAIN)
+    for seconds, each in ((12.0, 0.0), (60.0, rate * DEGREE), (12.0, 0.0)):
+        for part in range(round(seconds)):
+            rig.feed(noisy(1.0, each, 0.01, part), SLOW, moving=each if odometry else None)
+            assert not rig.pipeline.monitor.bias_alarm
+    assert rig.pipeline.monitor.examined_count > 1
+
+
 # Effects with a past
 
 PLAIN = {'bias': {'bias': 0.002}, 'scale_factor_error': {'scale_factor_error': 0.02},
@@ -642,6 +730,30 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
     level, message, _ = reported(rig)
     assert (level == WARN and 'stamps on imu/data_raw advanced by' in message) == warns, message
     assert (rig.error(first)[1] > math.tau) == warns
+
+
+@pytest.mark.parametrize('fault, words', [
+    (lambda rig: rig.go(3.0), 'no samples for 3.0'), (lambda rig: None, 'jumps back by 0.99')],
+    ids=['unplugged', 'a jump back'])
+def test_while_the_heading_is_unknown_a_warning_says_why_until_a_reset(
+        tmp_path, reported, fault, words):
+    rig = rested(tmp_path)
+    rig.turn(0.5, 2.0)
+    rig.robot.unplugged = True
+    fault(rig)
+    rig.robot.unplugged = False
+    if 'back' in words:
+        rig.stamp = lambda reading, stamp=rig.stamp: stamp(reading) - 10 ** 9
+    for _ in range(3):
+        rig.go(5.0)
+        reported(rig)
+        level, message, values = reported(rig)
+        assert level == WARN and 'the heading is unknown (' in message, message
+        assert words in message and 'call reset_heading' in message
+        assert float(values['heading_standard_deviation_deg']) >= 360.0
+    rig.pipeline.reset_heading()
+    rig.go(2.0)
+    assert reported(rig)[:2] == (OK, 'the heading is published')
 
 
 def test_a_count_is_a_warning_only_while_it_grows(tmp_path, reported):

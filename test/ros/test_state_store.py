@@ -54,6 +54,21 @@ def test_what_is_kept_is_there_after_a_restart(remember):
             and len(again.table.entries) == 1)
 
 
+@pytest.mark.parametrize('model, words', [
+    ('effects: {scale_factor_error: {scale_factor_error: -1.0}}', 'is -1.0; wanted at most 0.3'),
+    ('effects: {scale_factor_error: {scale_factor_error: 3.7356}}', 'a fraction, not in %'),
+    ('effects: {bias: {bias: 1.2}}', 'effects.bias.bias is 1.2; wanted at most 0.1745'),
+    ('effects: {}\nnoise: {angle_random_walk: 2.5}', 'noise.angle_random_walk is 2.5; wanted SI'),
+    ('effects: {}\nnoise: {bias_instability: 9.0}', 'unknown within 1 s'),
+    ('effects: {}\nnoise: {rate_random_walk: 1.0}', 'unknown within 1 s'),
+    ('effects: {scale_factor_error: {scale_factor_error: -0.3}, bias: {bias: 0.17}}\n'
+     'noise: {angle_random_walk: 0.1, bias_instability: 0.1, rate_random_walk: 0.1}', '')])
+def test_a_model_by_which_no_gyro_can_be_compensated_is_a_problem(remember, model, words):
+    memory = remember(model)
+    assert words in memory.problem and bool(words) == bool(memory.problem)
+    assert bool(words) == (not memory.model.terms), 'the rates are uncalibrated'
+
+
 def test_the_table_is_written_seldom_and_only_if_it_learned_something(remember, tmp_path):
     memory = remember()
     memory.store_table(NOW, is_final=True)
