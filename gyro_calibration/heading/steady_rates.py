@@ -344,8 +344,9 @@ def _compare_rests(rate: Array, prior: Array, same: Array, lasting: Array, white
     last may be that of a calibration. The results have the shapes (k, k), with the other rate by
     column, and (k,).
     """
-    turned, count = np.unique(SCATTER_RATIOS[1:]) * white, len(rate)
-    turned = turned[turned <= MAX_SCATTER_RATIO * prior.max()]
+    # of turns as slow as bends, and as fast as the bias may be
+    levels = math.floor(math.log(MAX_SCATTER_RATIO * prior.max() / white, 4.0)) + 1
+    turned, count = white * 4.0 ** np.arange(max(levels, 1)), len(rate)
     square = (rate[:, None] - rate) ** 2
     as_rest = np.log(_REST_PROBABILITY) - 0.5 * (square / same + np.log(same))
     spread = same + turned[:, None, None]

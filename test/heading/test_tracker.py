@@ -349,26 +349,26 @@ def test_a_rest_that_may_be_a_drive_leaves_mean_and_covariance_of_the_mixture():
 # a slow, steady turn differs from a rest by its rate: unknown biases, and ways that bend
 
 RATE, WALK = 50.0, 0.03 * DEGREE
-NOISE = Noise(WALK, WALK / 20.0, WALK / 300.0)
+NOISE, FINE_NOISE = (Noise(walk, walk / 20.0, walk / 300.0) for walk in (WALK, 0.01 * WALK))
 #: Durations, s, and rates, deg/s; the bias is far within its prior of 0.5 deg/s.
 TURN_FIRST = [(20, 0.8), (20, 0), (4, 30), (10, 0), (4, -30), (10, 0)]
 
 
-def simulated(parts, seed=0, bias=-0.2):
+def simulated(parts, seed=0, bias=-0.2, walk=WALK):
     """Return time, output, and true heading, deg."""
     rate = np.concatenate([np.full(round(duration * RATE), value) for duration, value in parts])
-    noise = WALK * math.sqrt(RATE) * np.random.default_rng(seed).standard_normal(len(rate))
+    noise = walk * math.sqrt(RATE) * np.random.default_rng(seed).standard_normal(len(rate))
     time = np.arange(len(rate)) / RATE
     return time, (rate + bias) * DEGREE + noise, np.append(0.0, np.cumsum(
         0.5 * (rate[1:] + rate[:-1]))) / RATE
 
 
-def followed(parts, bias=0.5, hindsight=False, seed=0, true_bias=-0.2):
+def followed(parts, bias=0.5, hindsight=False, seed=0, true_bias=-0.2, noise=NOISE):
     """Return error and stated deviation of the heading, deg, with a prior of the bias, deg/s."""
     model = gyro_calibration.read_model({
         'effects': {'bias': {'bias': 0.0}, 'scale_factor_error': {'scale_factor_error': 0.0}},
-        'covariance': [[(bias * DEGREE) ** 2, 0.0], [0.0, 0.0]], 'noise': vars(NOISE)})
-    time, output, true = simulated(parts, seed, true_bias)
+        'covariance': [[(bias * DEGREE) ** 2, 0.0], [0.0, 0.0]], 'noise': vars(noise)})
+    time, output, true = simulated(parts, seed, true_bias, noise.angle_random_walk)
     found = gyro_calibration.track(Log(time, output), model, hindsight=hindsight)
     return (found.heading - found.heading[0]) / DEGREE - true, found.heading_std / DEGREE
 
@@ -468,6 +468,14 @@ def test_a_steady_turn_does_not_replace_the_bias_of_a_calibration():
         true_bias=0.0)
     assert deviation[round(70 * RATE)] > 1.0 > deviation[-1]
     assert np.abs(error).max() < 1.0
+
+
+@pytest.mark.parametrize('rate', [0.6, 1.9, -4.7])
+def test_a_steady_turn_of_a_fine_gyro_does_not_replace_the_bias_of_its_calibration(rate):
+    """Turns may be faster than 0.5 deg/s, thousands of times its noise."""
+    error, _ = followed([(4.0, 30.0), (20.0, rate), (4.0, 30.0), (10.0, 0.0)], 0.0005,
+                        true_bias=0.0, noise=FINE_NOISE)
+    assert np.abs(error).max() < 0.1
 
 
 def test_a_user_is_warned_of_the_ambiguity():
