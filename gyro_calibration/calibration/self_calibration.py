@@ -192,9 +192,8 @@ class OutputRounding:
         return np.asarray(sums @ sums.T)
 
 
-def find_rounding(time: Array, output: Array) -> OutputRounding | None:
-    """Return the errors by the steps of an output over five samples each; None without steps."""
-    step = quantization_step(output)
+def find_rounding(time: Array, output: Array, step: float) -> OutputRounding | None:
+    """Return the errors by the steps of an output over five samples each; None without a step."""
     if not step:
         return None
     length = 5.0 * float(np.median(np.diff(time)))
@@ -225,7 +224,7 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     By least squares on the blocks of `find_rounding`. Shape (2, 2) and (rad/s)²; both are zero
     without steps.
     """
-    if (found := find_rounding(time, output)) is None:
+    if (found := find_rounding(time, output, quantization_step(output))) is None:
         return np.zeros((2, 2)), 0.0
     rate = (found.mean - fit.bias) / (1.0 + fit.scale_factor_error)
     root = np.sqrt(np.bincount(found.block))[:, None]

@@ -72,7 +72,8 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     # N², rad²/s: by differences between neighbours, and at least the known one
     white_density = max(white_noise_deviation(rate) ** 2 * float(np.median(np.diff(time))),
                         noise.angle_random_walk ** 2)
-    begin, end = _find_turns(time, rate, white_density, quantization_step(output))
+    step = quantization_step(output)
+    begin, end = _find_turns(time, rate, white_density, step)
     rest_durations, duration = (float(begin - time[0]), float(time[-1] - end)), end - begin
     parts = np.array([time <= begin, time >= end, (time > begin) & (time < end)])
     weights = parts / parts.sum(axis=1)[:, None]
@@ -81,7 +82,9 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     of_white = white_density / rest_durations[0] + white_density / rest_durations[1]
     of_wander = noise.mean_change_variance(duration, min(rest_durations))
     # of the means of both rests and of the turns, by the steps of the output
-    found = find_rounding(time, output)
+    # the few values of a ramp may lie on a coarser grid than those of the rests
+    at_rest = output[parts[0] | parts[1]]
+    found = find_rounding(time, output, quantization_step(at_rest) or step)
     of_steps = np.zeros((3, 3)) if found is None else found.covariance(weights)
     # a bias that wanders within one code changes its error
     difference = float(means[1] - means[0])

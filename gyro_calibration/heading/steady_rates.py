@@ -21,8 +21,9 @@ Under another bias the rests until then were turns: the heading changes by the d
 time since its begin.
 
 A calibration is one more rest before the others, if the bias is still that of its power-on, which
-is as probable as another one. The scatter of power-ons is not known for a gyro: one in ten has ten
-times the usual one. Without rests, all steady rates are bends and the calibration holds.
+is as probable as another one. One power-on in ten has five times the usual scatter, as without a
+calibration; such a bias counts where no steady rate is near the usual ones. Without rests, all
+steady rates are bends and the calibration holds.
 
 With a known bias, either some of the steady rates near it are rests, or the vehicle never rests. A
 bend has a rate of normal distribution and an exponential duration, and a rest may last. The share
@@ -59,7 +60,7 @@ _REST_SHARES = (np.arange(5) + 0.5) / 5.0
 _LOG_PRIORS = np.log(np.outer([0.5, *np.full(len(_REST_SHARES), 0.5 / len(_REST_SHARES))],
                               np.full(len(_BENDS), 1.0 / len(_BENDS))))
 #: Variances of the bias of another power-on, relative to the usual one, and their shares.
-_TURN_ON_RATIOS, _TURN_ON_SHARES = np.array([1.0, 100.0]), np.array([0.9, 0.1])
+_TURN_ON_RATIOS, _TURN_ON_SHARES = np.array([1.0, 25.0]), np.array([0.9, 0.1])
 #: Probability below which it is not computed what follows if the vehicle never rests.
 _NEGLIGIBLE = 1e-6
 #: Probability from which on another steady rate is taken for the bias.
@@ -74,6 +75,7 @@ class _SteadyRate:
     end_time: float  # s
     step_count: int  # a single step does not tell whether its rate is steady
     is_possible: bool  # within the prior of the bias; else it is certainly a turn
+    is_usual: bool  # within that of the usual scatter of power-ons
     way: int  # number of the way without a turn, on which equal rates are one
     #: Mean, rad/s, and variance of the error of the rate before it, with rests and without.
     errors: tuple[float, float, float, float]
@@ -138,14 +140,14 @@ class SteadyRates:
                 np.exp(_LOG_PRIORS[0]).sum())
         # else the prior contains the scatter of power-ons
         self._is_calibrated = prior < 0.5 * self._turn_on_variance
+        usual = prior + self._is_calibrated * self._turn_on_variance
         widest = prior + self._is_calibrated * self._turn_on_variance * _TURN_ON_RATIOS[-1]
         is_possible = rate ** 2 < sigmas ** 2 * (widest + white / still.duration)
         self._agreement, self._begin_time = sigmas ** 2 * white, min(
             self._begin_time, time - turn.duration)
         # a turn is beyond what a bias may differ by, from that of the last steady rate
-        usual = self._way_rate if self._is_calibrated and self._way_rate < math.inf else 0.0
-        self._way += (rate - usual) ** 2 >= sigmas ** 2 * (
-            prior + self._turn_on_variance * self._is_calibrated + white / still.duration)
+        before_it = self._way_rate if self._is_calibrated and self._way_rate < math.inf else 0.0
+        self._way += (rate - before_it) ** 2 >= sigmas ** 2 * (usual + white / still.duration)
         last, freedom = self._last, still.block_count - 1
         is_steady = is_rest or freedom <= 0 or still.block_square_sum - still.angle * rate <= (
             white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas))))
@@ -167,7 +169,8 @@ class SteadyRates:
         if count > 1 and is_possible:
             self._way += (rate - self._way_rate) ** 2 > MAX_SCATTER_RATIO * white
             self._way_rate = rate
-        self._last = _SteadyRate(still, time, count, is_possible, self._way, errors)
+        is_usual = rate ** 2 < sigmas ** 2 * (usual + white / still.duration)
+        self._last = _SteadyRate(still, time, count, is_possible, is_usual, self._way, errors)
         is_due = count > 1 and still.duration >= 2.0 * self._evaluated_duration
         if is_due:
             self._evaluate(before.noise)
@@ -261,7 +264,8 @@ class SteadyRates:
         self.moving_probability = self._ended_probability
         self._ended = self._candidates()
         if len(self._ended) > _MAX_RATES:
-            self._ended.remove(min(self._ended, key=lambda each: each.turn.duration))
+            self._ended.remove(min(self._ended, key=lambda each: (
+                each.is_usual or self._has_changed, each.turn.duration)))
         self._last, self._evaluated_duration = None, 0.0
 
     def _candidates(self) -> list[_SteadyRate]:
@@ -284,6 +288,9 @@ class SteadyRates:
         """
         rates, noise, is_known = self._candidates(), state.noise, self._is_calibrated
         self.is_changing = False
+        # another power-on with an unusual bias has no rest at a usual one
+        if is_known and not self._has_changed:
+            rates = [each for each in rates if each.is_usual] or rates
         if len(rates) + is_known < 2 or not rates:
             return None
         white, floor = noise.angle_random_walk ** 2, noise.allan_floor ** 2

@@ -74,7 +74,7 @@ class TrackerSettings:
     threshold: Threshold = Threshold(0.0)
     maximum_gap: float = MAX_GAP  # longest gap in the stamps that is integrated, s
     #: Usual standard deviation of the bias from one power-on to the next, rad/s: of most gyros
-    #: 0.05 deg/s or less, of one in five 0.2 (`bias_table`), of one in ten ten times larger.
+    #: 0.05 deg/s or less, of one in five 0.2 (`bias_table`), of one in ten five times larger.
     turn_on: float = 0.1 * DEGREE
 
 

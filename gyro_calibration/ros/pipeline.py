@@ -513,7 +513,8 @@ class Pipeline:
         if not known or self._last_variance < math.tau ** 2:
             self.heading_loss = ''
         elif before < math.tau ** 2:
-            cause = (next(filter(None, self.faults.values()), self.journal.event)
+            cause = (next(filter(None, (*self.faults.values(), self.journal.event)),
+                          'the gyro may have missed a turn')
                      if self._last_variance - before > 0.5 * math.tau ** 2 else
                      'the errors of scale factor and bias have added up since the last reset')
             self.heading_loss = (f'the heading is unknown ({cause}): call reset_heading where it '
