@@ -81,8 +81,8 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     # variances of their difference by white noise, and by the wander of the bias
     of_white = white_density / rest_durations[0] + white_density / rest_durations[1]
     of_wander = noise.mean_change_variance(duration, min(rest_durations))
-    # of the means of both rests and of the turns, by the steps of the output
-    # the few values of a ramp may lie on a coarser grid than those of the rests
+    # of the means of both rests and of the turns, by the steps of the output at rest, since the
+    # few values of a ramp may lie on a coarser grid
     at_rest = output[parts[0] | parts[1]]
     found = find_rounding(time, output, quantization_step(at_rest) or step)
     of_steps = np.zeros((3, 3)) if found is None else found.covariance(weights)
@@ -99,8 +99,26 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     refuse_bias(bias, limits, 'let the robot rest at both ends')
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
-    # the number of turns
-    measured = gyro_angle / math.tau
+    count = _count_turns(gyro_angle / math.tau, turns, limits)
+    scale = gyro_angle / math.tau / count
+    true_angle = count * math.tau
+    if abs(scale - 1.0) > limits.max_scale_factor_error:
+        raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
+                          f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
+                          'and check the sensitivity')
+    angle_variance = (white_density * duration + variance * duration ** 2
+                      + (scale * mark_deviation) ** 2)
+    shared = -variance * duration / true_angle
+    covariance = np.array([[angle_variance / true_angle ** 2, shared], [shared, variance]])
+    # s by the mean of the turns less the bias, and b
+    of_means = np.array([[-0.5, -0.5, 1.0], [0.5, 0.5, 0.0]]) * [[duration / true_angle], [1.0]]
+    covariance += of_means @ of_steps @ of_means.T
+    return _TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
+                            rest_durations)
+
+
+def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
+    """Return the whole number of turns, as given or nearest to the gyro, or refuse it."""
     count = round(measured) if turns is None else turns
     if not count:
         raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
@@ -121,20 +139,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
         given = f', and {turns} were given' if turns else ''
         raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '
                           'whole number; close the turns on the mark, count them, or make fewer')
-    true_angle = count * math.tau
-    if abs(scale - 1.0) > limits.max_scale_factor_error:
-        raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
-                          f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
-                          'and check the sensitivity')
-    angle_variance = (white_density * duration + variance * duration ** 2
-                      + (scale * mark_deviation) ** 2)
-    shared = -variance * duration / true_angle
-    covariance = np.array([[angle_variance / true_angle ** 2, shared], [shared, variance]])
-    # s by the mean of the turns less the bias, and b
-    of_means = np.array([[-0.5, -0.5, 1.0], [0.5, 0.5, 0.0]]) * [[duration / true_angle], [1.0]]
-    covariance += of_means @ of_steps @ of_means.T
-    return _TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
-                            rest_durations)
+    return count
 
 
 def _find_turns(time: Array, rate: Array, white_density: float,

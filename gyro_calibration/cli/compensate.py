@@ -80,27 +80,10 @@ def run(given: argparse.Namespace) -> Answer:
     estimator = found.estimator
     if estimator is None:
         data['bias_is_calibrated'] = bool(model.self_calibration or model.fits_scale_and_bias[1])
-        if not data['bias_is_calibrated']:
-            lines.append('The bias is not known from a calibration: 0 was used, and its error is '
-                         'not in the standard deviation; run self-calibrate, or use --rest.')
     else:
         data.update(bias_is_calibrated=not estimator.is_bias_assumed,
                     bias_ambiguity_rad_s=estimator.tracker.bias_ambiguity)
-        if estimator.is_bias_assumed and not found.has_wheels:
-            lines.append('The bias is not known from a calibration: the first steady rate within '
-                         f'{Assumptions.bias / DEGREE:g} deg/s was taken for that of a rest. If '
-                         'the log begins in a turn or a bend, the heading may be off by more than '
-                         'its standard deviation; run self-calibrate, begin the log with a rest, '
-                         'or record the column moving.')
-        if not (estimator.is_bias_assumed or data['rows_at_rest']):
-            lines.append('No rest was found: the bias of the calibration was used, and a change '
-                         'since then is not in the standard deviation; rest for some seconds now '
-                         'and then, or calibrate before each drive.')
-        if estimator.bias_message:
-            lines.append(as_sentence(estimator.bias_message))
-        if not data['temperature_known']:
-            lines.append('The log has no temperature: a change of the bias with it is not in the '
-                         'standard deviation; record the column temperature_degc.')
+    lines += _describe_bias(found, data)
     if found.errors:
         sums, counts, last = zip(*found.errors)
         mean = sum(sums) / sum(counts)
@@ -133,6 +116,31 @@ def run(given: argparse.Namespace) -> Answer:
         if data[name]:
             lines.append(f'{data[name]} {words}')
     return Answer(lines, data)
+
+
+def _describe_bias(found: _Totals, data: dict[str, Any]) -> Iterator[str]:
+    """Give sentences on what the standard deviation does not contain of the bias."""
+    estimator = found.estimator
+    if estimator is None:
+        if not data['bias_is_calibrated']:
+            yield ('The bias is not known from a calibration: 0 was used, and its error is not in '
+                   'the standard deviation; run self-calibrate, or use --rest.')
+        return
+    if estimator.is_bias_assumed and not found.has_wheels:
+        yield ('The bias is not known from a calibration: the first steady rate within '
+               f'{Assumptions.bias / DEGREE:g} deg/s was taken for that of a rest. If the log '
+               'begins in a turn or a bend, the heading may be off by more than its standard '
+               'deviation; run self-calibrate, begin the log with a rest, or record the column '
+               'moving.')
+    if not (estimator.is_bias_assumed or data['rows_at_rest']):
+        yield ('No rest was found: the bias of the calibration was used, and a change since then '
+               'is not in the standard deviation; rest for some seconds now and then, or '
+               'calibrate before each drive.')
+    if estimator.bias_message:
+        yield as_sentence(estimator.bias_message)
+    if not data['temperature_known']:
+        yield ('The log has no temperature: a change of the bias with it is not in the standard '
+               'deviation; record the column temperature_degc.')
 
 
 #: Other inputs of effects: quantity of a log -> the sentence where the log lacks it.
@@ -168,12 +176,12 @@ class _Totals:
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
         self.counts.update(
             rows=len(log), rows_without_output=without,
+            rows_at_rest=int(np.sum(columns.get('resting', 0))),
             refused_samples=len(log) - len(columns['rate_rad_s']) - without,
             **{name: int(columns[name].sum()) for name in ('temperature_clipped', 'beyond_range')})
         self.unknown = tuple(
             quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
-            self.counts['rows_at_rest'] += int(np.sum(columns.get('resting', 0)))
             self.heading, self.deviation = (
                 float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
             if log.reference_heading is not None:

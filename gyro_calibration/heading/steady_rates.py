@@ -140,8 +140,8 @@ class SteadyRates:
                 np.exp(_LOG_PRIORS[0]).sum())
         # else the prior contains the scatter of power-ons
         self._is_calibrated = prior < 0.5 * self._turn_on_variance
-        usual = prior + self._is_calibrated * self._turn_on_variance
-        widest = prior + self._is_calibrated * self._turn_on_variance * _TURN_ON_RATIOS[-1]
+        usual, widest = (prior + self._is_calibrated * self._turn_on_variance
+                         * _TURN_ON_RATIOS).tolist()
         is_possible = rate ** 2 < sigmas ** 2 * (widest + white / still.duration)
         self._agreement, self._begin_time = sigmas ** 2 * white, min(
             self._begin_time, time - turn.duration)
@@ -346,10 +346,10 @@ def _compare_rests(rate: Array, prior: Array, same: Array, lasting: Array, white
     """
     Return the probabilities that rates are rests if another is one, and that each is the bias.
 
-    Of k rates, rad/s, given are the variances of their prior, shape (k,), and of the difference of
-    two rests, (k, k), (rad/s)², their durations, s, and the variance of white noise over 1 s. The
-    last may be that of a calibration. The results have the shapes (k, k), with the other rate by
-    column, and (k,).
+    Of k rates, rad/s, given are the variances of their prior for each scatter of power-ons, shape
+    (j, k), and of the difference of two rests, (k, k), (rad/s)², their durations, s, and the
+    variance of white noise over 1 s. The last may be that of a calibration. The results have the
+    shapes (k, k), with the other rate by column, and (k,).
     """
     # of turns as slow as bends, and as fast as the bias may be
     levels = math.floor(math.log(MAX_SCATTER_RATIO * prior.max() / white, 4.0)) + 1

@@ -417,7 +417,7 @@ class CompensationReport:
                    if count - self._previous_counts[name] > tolerated.get(name, 0)}
         silent = self._clock.steady() - journal.last_received
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
-                     or pipeline.repeat_fault or pipeline.repeat_doubt):
+                     or pipeline.repeat_fault or pipeline.repeat_suspicion):
             return ERROR, error
         if pipeline.ros_time.paused_duration > 1.0:
             return ERROR, ROS_TIME_PAUSED

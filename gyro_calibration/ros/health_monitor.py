@@ -72,7 +72,7 @@ class RepeatedOutputDetector:
     as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above. What
     counts does so until the value changes.
 
-    A gyro with noise `is_doubtful` while it repeats the value of its first sample, whose step is
+    A gyro with noise `is_suspected` while it repeats the value of its first sample, whose step is
     not known, or zero against chance for the first time: it is dead, or shows that at rest.
 
     A value that was held for less time, but longer than usual and not by chance, leaves a possible
@@ -85,7 +85,7 @@ class RepeatedOutputDetector:
         self._value, self._since, self._count = math.nan, 0.0, 0
         self._last_step = self._acceleration = 0.0  # to this value, rad/s, and rad/s² less noise
         self._reports_zero, self._holds = False, Intervals()
-        self._is_fault = self.is_doubtful = self._has_left_zero = False
+        self._is_fault = self.is_suspected = self._has_left_zero = False
         self._first = 0.0, 0  # value, rad/s, and number of samples before the first change
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # Smallest and largest value since a time, s, and the number of samples after the first.
@@ -134,7 +134,7 @@ class RepeatedOutputDetector:
                 if sample and self._excludes_chance(self._step, self._first[1], sample):
                     self.unseen_turn = math.tau
                 self._first = 0.0, 0
-            self._is_fault = self.is_doubtful = False
+            self._is_fault = self.is_suspected = False
             self._has_left_zero = self._reports_zero
             self._last_step = step
             self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
@@ -158,10 +158,10 @@ class RepeatedOutputDetector:
             2.0 * _MAX_NOISE_REDUCTION * self._step < sample
             or self._excludes_chance(self._step, self._count, sample))
         if output == 0.0 and self._reports_zero and not is_sudden:
-            self.is_doubtful = not (is_chance or self._has_left_zero)
+            self.is_suspected = not (is_chance or self._has_left_zero)
         else:
             self._is_fault = not is_chance
-        self.is_doubtful = self.is_doubtful or sample > 0.0 and self._changes == 1
+        self.is_suspected = self.is_suspected or sample > 0.0 and self._changes == 1
         return self._is_fault
 
     def _excludes_chance(self, width: float, count: float, sample: float,

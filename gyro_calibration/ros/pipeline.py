@@ -173,7 +173,7 @@ class Pipeline:
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
         # that the gyro is dead, or may be so
-        self.repeat_fault = self.repeat_doubt = ''
+        self.repeat_fault = self.repeat_suspicion = ''
         self.heading_loss, self._last_variance = '', 0.0  # why the heading is unknown; rad²
         self._repeat_detector = RepeatedOutputDetector(noise)
         self._pulse_detector, self._outlier_count = PulseDetector(), 0
@@ -287,8 +287,8 @@ class Pipeline:
 
     @property
     def heading_variance(self) -> float:
-        """Return the variance of the heading, rad², with a turn while the gyro is in doubt."""
-        return self.estimator.tracker.variance + bool(self.repeat_doubt) * math.tau ** 2
+        """Return the variance of the heading, rad², with a turn while the gyro may be dead."""
+        return self.estimator.tracker.variance + bool(self.repeat_suspicion) * math.tau ** 2
 
     @property
     def _is_odometry_contradictory(self) -> bool:
@@ -533,10 +533,10 @@ class Pipeline:
         pulse, size = self._pulse_detector.add(time, output)
         is_repeated = self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
                                                 self.monitor.has_noise_at_rest)
-        self.repeat_doubt = (
+        self.repeat_suspicion = (
             f'the gyro repeats the rate {output:g} rad/s without the noise of its model: it is '
             'dead, or shows this at rest; turn the robot to find out'
-            if self._repeat_detector.is_doubtful and not is_repeated else '')
+            if self._repeat_detector.is_suspected and not is_repeated else '')
         if not is_repeated:
             if self._outlier_count > outliers:  # the tracker has not used the sample
                 pulse = 0.0

@@ -207,7 +207,7 @@ def test_a_gyro_that_is_dead_in_the_first_seconds_is_an_error_and_the_heading_cl
 
 
 @pytest.mark.parametrize('first', [np.zeros(500), np.full(500, 0.3)], ids=['zeros', 'one code'])
-def test_a_gyro_that_repeats_its_value_at_rest_is_in_doubt_until_it_has_turned(
+def test_a_gyro_that_repeats_its_value_at_rest_is_suspected_until_it_has_turned(
         tmp_path, reported, first):
     """It reports zero at rest, or its steps are larger than its noise."""
     rig = Rig(tmp_path, model=CERTAIN)
