@@ -378,6 +378,19 @@ def test_the_steps_of_a_coarse_output_are_in_the_deviations_of_whole_turns():
         assert (errors < 4.0 * np.sqrt(np.diag(fit.covariance))).all()
 
 
+def test_ramps_of_a_finely_stepped_output_do_not_widen_whole_turns():
+    """Few values of a ramp lie on a grid 17 times too coarse; noise is larger than the steps."""
+    step, time = 0.06 * DEGREE, np.arange(0.0, 47.0, 0.02)
+    rate = np.clip(np.minimum(time - 5.0, 42.0 - time) / 0.5, 0.0, 1.0)
+    rate *= 5.0 * math.tau / (0.02 * rate.sum())
+    for seed in range(6):
+        noise = 0.7 * np.random.default_rng(seed).standard_normal(len(time))
+        output = step * np.round((1.01 * rate - 0.15 * DEGREE) / step + noise)
+        fit = calibrate_turns(time, output, 5).fit
+        deviation = math.sqrt(fit.covariance[1, 1])
+        assert abs(fit.bias + 0.15 * DEGREE) < 4.0 * deviation < 0.03 * DEGREE
+
+
 CLOCK, TURNED = turned(2)
 NO_TURNS = {
     'half a turn too much': (turned(2.5), 2, 'counts 2.5'),
