@@ -60,7 +60,7 @@ _REST_SHARES = (np.arange(5) + 0.5) / 5.0
 _LOG_PRIORS = np.log(np.outer([0.5, *np.full(len(_REST_SHARES), 0.5 / len(_REST_SHARES))],
                               np.full(len(_BENDS), 1.0 / len(_BENDS))))
 #: Variances of the bias of another power-on, relative to the usual one, and their shares.
-_TURN_ON_RATIOS, _TURN_ON_SHARES = np.array([1.0, 25.0]), np.array([0.9, 0.1])
+TURN_ON_RATIOS, _TURN_ON_SHARES = np.array([1.0, 25.0]), np.array([0.9, 0.1])
 #: Probability below which it is not computed what follows if the vehicle never rests.
 _NEGLIGIBLE = 1e-6
 #: Probability from which on another steady rate is taken for the bias.
@@ -141,7 +141,7 @@ class SteadyRates:
         # else the prior contains the scatter of power-ons
         self._is_calibrated = prior < 0.5 * self._turn_on_variance
         usual, widest = (prior + self._is_calibrated * self._turn_on_variance
-                         * _TURN_ON_RATIOS).tolist()
+                         * TURN_ON_RATIOS).tolist()
         is_possible = rate ** 2 < sigmas ** 2 * (widest + white / still.duration)
         self._agreement, self._begin_time = sigmas ** 2 * white, min(
             self._begin_time, time - turn.duration)
@@ -314,7 +314,7 @@ class SteadyRates:
         same = (white * (1.0 / durations[:, None] + 1.0 / durations) + 2.0 * floor
                 + noise.rate_random_walk ** 2 * np.abs(ends[:, None] - ends)
                 + ((apart @ self._covariance) * apart).sum(axis=2))
-        turn_on = self._turn_on_variance * (_TURN_ON_RATIOS if is_known else np.zeros(1))
+        turn_on = self._turn_on_variance * (TURN_ON_RATIOS if is_known else np.zeros(1))
         agrees, chances = _compare_rests(rate, prior + turn_on[:, None], same, lasting, white,
                                          is_known)
         # the rate whose bias is in use: first that of the calibration

@@ -33,7 +33,7 @@ from gyro_calibration.heading.stationary import (
     Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES, EnergyDetector, Epoch,
     EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SlowTurn,
     Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
-from gyro_calibration.heading.steady_rates import SteadyRates
+from gyro_calibration.heading.steady_rates import SteadyRates, TURN_ON_RATIOS
 from gyro_calibration.logs.log import (
     Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, Number)
 from gyro_calibration.model.noise import Noise
@@ -105,8 +105,7 @@ class HeadingTracker:
         self.recalibrations = list[tuple[int, HeadingState]]()
         self._interval, self.intervals = math.inf, Intervals()
         self._last_time = 0.0
-        # Begin of the motion since the last rest, and last time when the wheels did not stand, s.
-        self._motion_start_time = self._wheel_motion_time = 0.0
+        self._motion_start_time = self._wheel_motion_time = 0.0  # since the last rest, s
         self._last_sample: tuple[float, float, float, Array] | None = None
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
         # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump, and turn
@@ -142,6 +141,7 @@ class HeadingTracker:
                                     age if len(covariance) else None)
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
+        self._expects_turn_on = True  # another bias, at the first rest that wheels show
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         # None with wheels, which tell of rests
         self._steady_rates: SteadyRates | None = SteadyRates(
@@ -294,7 +294,7 @@ class HeadingTracker:
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
             self._remember([time], [rate])
-            self._last_time = self._motion_start_time = self._wheel_motion_time = time
+            self._last_time = self._motion_start_time = time
             self._heading_begin_time = time
             self.rate = rate - self._rate_error(sensitivity)
             return ''
@@ -524,8 +524,10 @@ class HeadingTracker:
         part = self._close_block()
         if wheels is not False:
             self._wheel_motion_time = self._last_time
-        if wheels is not None:
+        if wheels is not None and self._steady_rates is not None:
             self._steady_rates = None
+            if self.is_resting:  # with what the wheels show
+                self._begin_rest_again()
         if self.is_resting:
             self._rest_blocks.append(part)
             self._wheels_stand = wheels is False
@@ -534,9 +536,7 @@ class HeadingTracker:
             elif self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
                 self._advance_state()
                 if self._steady_rates is not None and self._steady_rates.is_changing:
-                    # of this rest too, which begins again with the next step
-                    self._revert_to_motion(self._rest_integral.duration)
-                    self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
+                    self._begin_rest_again()  # the bias changes in this rest too
                 else:
                     self._compare_means(wheels)
             return
@@ -555,29 +555,38 @@ class HeadingTracker:
             duration -= self._recent_blocks.popleft().duration
         if self._open_integral.duration - duration >= _STEP_DURATION - TIME_TOLERANCE:
             self._advance_state(self._held_integral)
-        if not quiet or duration < least or len(self._recent_blocks) < 2:
-            return
+        if quiet and duration >= least and len(self._recent_blocks) > 1:
+            self._decide_on_rest(wheels)
 
-        # whether the mean over them is that of a rest; in the first the robot may still move
-        held = self._held_integral - self._recent_blocks[0]
-        still, least_sigmas = self._with_still_sensitivity(held), self._sigmas[WINDOW_DURATION]
-        innovation = self._normalized_innovation(
-            self._state, still, _WHEEL_BIAS_CHANGE if wheels is False else 0.0)
-        after_slow_turn = self._quiet_duration > WINDOW_DURATION
-        if not abs(innovation) < (0.5 if after_slow_turn else 1.0) * self._sigmas[
-                self._quiet_duration]:
-            if after_slow_turn and not self._accept_slow_turn_as_bias():
+    def _decide_on_rest(self, wheels: bool | None) -> None:
+        """Begin a rest with the last blocks if their mean is that of a rest."""
+        held = self._held_integral - self._recent_blocks[0]  # in which the robot may still move
+        still, turn_on = self._with_still_sensitivity(held), self._settings.turn_on
+        expected, variance = self._state.expected_rest_angle(still)
+        difference = (held.angle - expected) / held.duration  # rad/s
+        variance /= held.duration ** 2
+        is_first, change = wheels is False and self._expects_turn_on, 0.0
+        if is_first:
+            change = math.sqrt(TURN_ON_RATIOS[-1]) * turn_on
+        elif wheels is False:
+            change = _WHEEL_BIAS_CHANGE
+        is_after_slow_turn = self._quiet_duration > WINDOW_DURATION
+        sigmas = (0.5 if is_after_slow_turn else 1.0) * self._sigmas[self._quiet_duration]
+        if not difference ** 2 < sigmas ** 2 * (variance + change ** 2):
+            if is_after_slow_turn and not self._accept_slow_turn_as_bias():
                 self._enter_motion(self._quiet_duration)
             return
-        # a change of the bias that only the wheels explain may have come at any time since the
-        # last rest
-        change = 0.0
-        if (self._last_time - self._wheel_motion_time >= _WHEEL_DELAY
-                and not abs(self._normalized_innovation(self._state, still)) < least_sigmas):
-            change = (held.angle - self._state.expected_rest_angle(still)[0]) / held.duration
         self._advance_state(held)
-        self._state = self._state.with_added_variance(
-            HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
+        change = 0.0
+        if is_first:  # it measures the bias of this power-on
+            self._change_bias(0.0, max(difference ** 2, turn_on ** 2), still)
+            self._expects_turn_on = False
+        elif (self._last_time - self._wheel_motion_time >= _WHEEL_DELAY
+              and not difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance):
+            # what only the wheels explain may have come at any time since the last rest
+            change = difference
+            self._state = self._state.with_added_variance(
+                HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
         self._enter_rest(change)
         self._rest_blocks.extend([*self._recent_blocks][1:])
 
@@ -671,6 +680,11 @@ class HeadingTracker:
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
         self._adopt_state()
+
+    def _begin_rest_again(self) -> None:
+        """Take this rest for a motion, after which a rest may begin at once."""
+        self._revert_to_motion(self._rest_integral.duration)
+        self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
@@ -796,23 +810,26 @@ class HeadingTracker:
             rates, sigmas = self._steady_rates, self._sigmas.get(MEAN_LAGS[0], 0.0)
             if (rates is not None
                     and rates.add(turn, still, end, before, sigmas, self.is_resting)
-                    and (not self.is_resting or rates.variance)
                     and (change := rates.compare(self._state, sigmas)) and not self.is_resting):
-                self._state = self._state.with_bias_change(
-                    *change[:2], end - self._heading_begin_time)
+                self._change_bias(*change[:2], still)
                 rates.adopt(self._state, change[2])
-                # there was no rest: the steps are computed again with the change
-                first = self.recalibrations[-1][0] if self.recalibrations else 0
-                if self._keeps_steps:
-                    state, row = self.steps[first].state_before, still.sensitivity / still.duration
-                    state = state.with_bias_change(
-                        self._state.rate_error(row)[0] - state.rate_error(row)[0], change[1], 0.0)
-                for place, step in enumerate(self.steps[first:], first):
-                    self.steps[place] = replace(
-                        step, state_before=state, is_resting=False,
-                        moving_heading=state.heading(self._zero_integral))
-                    state = state.propagate(step.rate_integral)
         self._adopt_state()
+
+    def _change_bias(self, change: float, variance: float, still: RateIntegral) -> None:
+        """Add a change of the bias, rad/s, and its variance, since the begin of the heading."""
+        end = self._last_time - self._block_integral.duration - self._open_integral.duration
+        self._state = self._state.with_bias_change(
+            change, variance, end - self._heading_begin_time)
+        # there was no rest: the steps are computed again with the change
+        first = self.recalibrations[-1][0] if self.recalibrations else 0
+        if first < len(self.steps):
+            state, row = self.steps[first].state_before, still.sensitivity / still.duration
+            state = state.with_bias_change(
+                self._state.rate_error(row)[0] - state.rate_error(row)[0], variance, 0.0)
+        for place, step in enumerate(self.steps[first:], first):
+            self.steps[place] = replace(step, state_before=state, is_resting=False,
+                                        moving_heading=state.heading(self._zero_integral))
+            state = state.propagate(step.rate_integral)
 
     def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""

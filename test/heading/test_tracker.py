@@ -150,7 +150,7 @@ def test_a_slow_turn_that_lasts_is_followed(slow, wheels):
     errors = []
     for seed in range(2):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
-        found = follow(time, rate, wheels=None if wheels is None else list(true > 0.0))
+        found = follow(time, rate, wheels=None if wheels is None else (true > 0.0).tolist())
         errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
         assert np.abs(
             np.diff(found.heading)).max() < 10.0 * DEGREE * INTERVAL, ('the heading jumped')
@@ -218,6 +218,44 @@ def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(chan
         assert not tracker.add(INTERVAL * index, bias + drawn, np.array([-1.0]), False)
     assert tracker.is_resting and tracker.bias[0] == pytest.approx(0.0, abs=1e-4)
     assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
+
+
+@pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
+@pytest.mark.parametrize('bias', [0.02, 0.7, 2.0])
+def test_short_rests_that_wheels_show_measure_the_bias_of_another_power_on(bias, hindsight):
+    """Rests of 2 s, after a calibration that is off by up to 2 deg/s (84 deg until the end)."""
+    motion = constant_rate_motion([(2, 0), (3, 45), (2, 0), (3, -60)] * 4 + [(2, 0)])
+    errors = []
+    for seed in range(4):
+        time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
+        found = follow(time, rate + bias * DEGREE, wheels=(true != 0.0).tolist(),
+                       hindsight=hindsight)
+        errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
+        assert found.variance[-1] < (2.0 * DEGREE) ** 2
+    assert np.abs(errors).max() < 4.0, errors
+
+
+def test_wheels_that_are_known_during_a_rest_widen_the_bias_of_the_calibration():
+    """A bias off by less than a short rest shows; the rest begins again with wheels."""
+    tracker, off = HeadingTracker(XV3500, KNOWN, TrackerSettings()), 0.02 * DEGREE
+    for index in range(round(120.0 / INTERVAL)):
+        tracker.add(INTERVAL * index, off, np.array([0.0, -1.0]),
+                    None if index < round(10.0 / INTERVAL) else False)
+    assert tracker.is_resting and tracker.bias[0] == pytest.approx(off, abs=0.1 * off)
+
+
+def test_rests_at_one_rate_near_that_of_the_calibration_are_its_bias():
+    """Off by 0.03 deg/s, without wheels: 6 deg over the drive."""
+    noise, known = Noise(1e-4, 1e-6), np.diag([1e-8, (0.005 * DEGREE) ** 2])
+    motion = constant_rate_motion([(15, 0), (3, 45), (15, 0), (3, -60)] * 6 + [(15, 0)])
+    for seed in range(4):
+        time, _, heading, rate = gyro(motion, np.random.default_rng(seed), noise, bias=0.0)
+        found = track(time, rate + 0.03 * DEGREE, -np.vstack([rate, np.ones(len(rate))]), noise,
+                      known, TrackerSettings(), None, False)
+        late = time > 100.0
+        error = np.abs(found.heading - heading)[late]
+        assert error[-1] < 1.0 * DEGREE
+        assert (error < 4.0 * np.sqrt(found.variance[late])).all()
 
 
 def test_hindsight_does_not_reach_over_a_gap():
