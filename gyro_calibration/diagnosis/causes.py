@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from gyro_calibration.diagnosis.findings import Estimate, Finding
-from gyro_calibration.diagnosis.significance import (
-    detectable_sigmas, probabilities, RULED_OUT_DEFICIT)
+from gyro_calibration.diagnosis.findings import (
+    detectable_sigmas, Estimate, Finding, probabilities, RULED_OUT_DEFICIT)
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE, Effect
 from gyro_calibration.model.gyro_model import GyroModel

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.causes import add_remedies, NOISE_NAMES
@@ -298,8 +297,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
                    for each, block in zip(replays, blocks))):
         return None
     reduced_search = restrict_search(
-        search, [drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
-        FALSE_ALARM_RATE)
+        search, [drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes)
     named = search_causes(reduced_search)
     straight, plain, extended = (
         replace(fit_causes(reduced_search.problem, some), lasting_only=True)

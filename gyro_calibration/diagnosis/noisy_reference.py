@@ -18,18 +18,19 @@ by the scatter of stretches.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.heading_regression import (
     fit_spans, MIN_STRETCHES, SpanFit, whiten_regression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG, OwnInstants
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.spans import (
     BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM)
 from gyro_calibration.diagnosis.candidates import (
-    indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
+    Candidate, indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
     Cause, cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, sized_finding,
     untestable_causes, value_finding)
@@ -38,13 +39,10 @@ from gyro_calibration.diagnosis.extended_model import (
     add_terms, gain_from_errors, heading_curve, heading_error_shares, HEADING_WINDOW,
     MAX_WINDOW_SHARE, previous_origins, window_changes)
 from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress, Reference,
-    TIME_LIMIT_REMARK)
-from gyro_calibration.diagnosis.regression import fit_causes, Value
+    Curve, detectable_sigmas, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress,
+    Reference, SEARCH_ALARM_RATE, TIME_LIMIT_REMARK, VALUE_ALARM_RATE)
 from gyro_calibration.diagnosis.search import (
-    confirm_causes, explain_selection, p_value, Search, search_causes)
-from gyro_calibration.diagnosis.significance import (
-    detectable_sigmas, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
+    confirm_causes, explain_selection, Search, search_causes, SelectedCause)
 from gyro_calibration.diagnosis.span_problem import (
     find_span_steps, span_candidate, SpanProblem)
 from gyro_calibration.heading.log_compensation import compensate_log
@@ -75,7 +73,7 @@ _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropp
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
-                                false_alarm_rate: float, on_progress: OnProgress,
+                                on_progress: OnProgress,
                                 instants: OwnInstants | None = None) -> Diagnosis:
     """
     Diagnose a log with a reference whose errors are larger than those of the gyro.
@@ -91,8 +89,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     if model is not None:
         cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
     plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior, instants))
-    extended, found = select_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
-                                    on_progress)
+    extended, found = select_causes(plain, SEARCH_ALARM_RATE, on_progress)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
     lasting_terms = [each for each in extended.causes if not each.is_single_event]
@@ -105,7 +102,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
         model_fit = plain
         if not plain.spans.treatment.is_fine:
             found = [replace(each, is_established=each.is_established
-                             and each.cause_term.is_single_event) for each in found]
+                             and _term_of(each.cause).is_single_event) for each in found]
             extended = fit_spans(plain.spans, events) if events else plain
         gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
@@ -115,11 +112,10 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
     of_heading = heading_error_shares([(parts, time)],
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
-    findings = [*_value_findings(extended, model, false_alarm_rate, reference),
-                *_reference_findings(extended, false_alarm_rate), *record.findings,
-                *(each for cause in found for each in [_cause_finding(
-                    cause, extended, VALUE_ALARM_SHARE * false_alarm_rate)]
-                  if not each.parameters[each.effect].contains_zero)]
+    findings = [*_value_findings(extended, model, reference), *_reference_findings(extended),
+                *record.findings, *(
+                    each for each in (_cause_finding(cause, extended) for cause in found)
+                    if not each.parameters[each.effect].contains_zero)]
     of_record = {each.effect for each in record.findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
@@ -145,14 +141,13 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                      _untestable_causes(plain), [curve], heading_curve(parts, time), None,
                      (*record.remarks, *_remarks(reference, extended, prior is not None),
                       *[TIME_LIMIT_REMARK] * bool(time_is_up)),
-                     false_alarm_rate, trace=trace,
-                     method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
+                     trace=trace, method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
                      reference=replace(reference, noise=noise), heading_shares=of_heading)
 
 
 # values
 
-def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: float,
+def _value_findings(fit: SpanFit, model: GyroModel | None,
                     reference: Reference) -> Iterator[Finding]:
     """Give delay, and with a model bias and scale factor error, if they are established."""
     own_clock = reference.kind not in _SAME_CLOCK
@@ -171,7 +166,7 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                             for each in (*shown, model.noise))
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         # a delay between two clocks is usual
-        level, is_usual = VALUE_ALARM_SHARE * false_alarm_rate, name == 'time_offset' and own_clock
+        is_usual = name == 'time_offset' and own_clock
         if name == 'time_offset':
             of_gyro = 0.0 < value < MAX_GYRO_LAG
             confounders = [other for other, might in (('bandwidth', of_gyro), ('clock_rate', True))
@@ -179,20 +174,20 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
             if own_clock and not of_gyro:
                 known['cause'] = 'The gyro has a time offset from its reference.'
         if found := value_finding(name, value, math.sqrt(variance),
-                                  false_alarm_rate if is_usual else level, confounders,
+                                  FALSE_ALARM_RATE if is_usual else VALUE_ALARM_RATE, confounders,
                                   float(fit.freedom[place]),
                                   NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place],
                                   evidence=f'evidence from {effective:.0f} stretches', **known):
             yield found
 
 
-def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
+def _reference_findings(fit: SpanFit) -> Iterator[Finding]:
     """Give the misalignment, and the drift of a reference against the rests in which it stands."""
     if MISALIGNMENT_TERM in fit.causes:
         name, places = MISALIGNMENT_TERM.cause, fit.value_slice(MISALIGNMENT_TERM)
         angle, half, chance = oblique_angle(fit.values[places], fit.normal_covariance[
             places, places])
-        if chance < false_alarm_rate:
+        if chance < FALSE_ALARM_RATE:
             yield sized_finding(name, angle, half, max(chance, MIN_PROBABILITY),
                                 remedy=MISALIGNMENT_REMEDY)
     name = 'reference_drift'
@@ -204,7 +199,7 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
     place = fit.value_slice(CauseTerm(name)).start
     if found := value_finding(
             name, float(fit.values[place]), math.sqrt(fit.covariance[place, place]),
-            false_alarm_rate, ['vibration_rectification'], float(fit.freedom[place]),
+            FALSE_ALARM_RATE, ['vibration_rectification'], float(fit.freedom[place]),
             evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias'):
         yield found
 
@@ -224,28 +219,23 @@ def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
     return bool(abs(values[place] - left) < 3.0 * np.linalg.norm(inverse[place]))
 
 
-def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Finding:
+def _cause_finding(found: SelectedCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
-    term, spans = found.cause_term, extended.spans
+    term, spans = _term_of(found.cause), extended.spans
     fit = (extended if found.is_established
            else fit_spans(spans, [*extended.causes, term]))
-    places, effect, shapes = fit.value_slice(term), CATALOGUE.get(term.cause), {}
+    places, shapes, log = fit.value_slice(term), found.fit.shape_parameters(found.place), spans.log
     values, covariance = fit.values[places], fit.normal_covariance[places, places]
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
         values, covariance = values[1:], covariance[1:, 1:]
-    elif found.shape is not None and effect is not None:
-        shape, = effect.nonlinear_parameters
-        shapes[shape.name] = Estimate.from_half_width(
-            term.shapes[0], NORMAL_QUANTILE_975 * found.shape.deviation, shape.unit)
-    log = spans.log
     return cause_finding(
         term.cause, cause_parameters(term.cause, values, covariance, shapes), found.p_value,
         found.deficits, found.is_established, observed_range(
             [np.asarray(spans.channels.rate)], [each for each in [log.temperature]
                                                 if each is not None], float(spans.time[-1])),
-        detectable_sigmas(level),
+        detectable_sigmas(VALUE_ALARM_RATE),
         where=(term.shapes[0], float(spans.time[-1])) if term.is_single_event else None,
         remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
 
@@ -416,18 +406,6 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
 
 # the search
 
-@dataclass(frozen=True)
-class FoundCause:
-    """A cause that the search found."""
-
-    cause_term: CauseTerm  # the cause
-    p_value: float  # that noise alone shows as much
-    is_established: bool  # whether it is confirmed
-    # what it and its alternatives lack in log-likelihood, the best first
-    deficits: Mapping[str, float]
-    shape: Value | None = None  # None if no shape was fitted
-
-
 def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
     """
     Return the causes that headings over spans can show, for the channels that the log has.
@@ -454,8 +432,12 @@ def _follows_the_rate(cause: str) -> bool:
             and 'rate' in effect.inputs)
 
 
+def _term_of(cause: Candidate) -> CauseTerm:
+    return CauseTerm(cause.cause, cause.shapes)
+
+
 def select_causes(fit: SpanFit, false_alarm_rate: float,
-                  on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
+                  on_progress: OnProgress) -> tuple[SpanFit, list[SelectedCause]]:
     """Search for causes, and fit again with those that are established."""
     terms = _propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
@@ -470,27 +452,20 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
                         {'bias_step': find_span_steps}, on_progress=on_progress)
         causes = search_causes(search)
         # once more, at the rate without these causes: similar ones differ in higher order
-        of_rate = [CauseTerm(each.cause, each.shapes) for each in causes
+        of_rate = [_term_of(each) for each in causes
                    if _follows_the_rate(each.cause) and each.cause != 'clock_rate']
         if not of_rate:
             break
         at = fit_spans(fit.spans, of_rate)
-    found: list[FoundCause] = []
-    selection = confirm_causes(search, causes)
-    for causes, place, evidence, deficits in explain_selection(search, selection):
-        known = causes[place]
-        found.append(FoundCause(
-            CauseTerm(known.cause, known.shapes), p_value(known.cause, evidence),
-            len(found) < len(selection.named), deficits,
-            next(iter(fit_causes(search.problem, causes).shapes(place).values()), None)))
-    while established := [each.cause_term for each in found if each.is_established]:
+    found = [*explain_selection(search, confirm_causes(search, causes))]
+    while established := [_term_of(each.cause) for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)
         worst = max(established,
                     key=lambda each: _implausibility(extended, each, false_alarm_rate))
         if _implausibility(extended, worst, false_alarm_rate) < 1.0:
             return extended, found
-        found = [replace(each, is_established=each.is_established and each.cause_term != worst)
-                 for each in found]
+        found = [replace(each, is_established=each.is_established
+                         and _term_of(each.cause) != worst) for each in found]
     return fit, found
 
 

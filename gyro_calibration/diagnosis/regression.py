@@ -32,6 +32,7 @@ from typing import Any
 from gyro_calibration.diagnosis.candidates import (
     Candidate, candidate_transforms, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK,
     MAX_STEP_TIMES, smooth_shapes, with_shape)
+from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.replay import (
     band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
     stated_shapes)
@@ -67,14 +68,6 @@ class RegressionProblem:
     weights: Array  # one over the variance of each band relative to the first noise, shape (g, b)
     log_determinants: Array  # of the relative variances, and of the prior probability, shape (g,)
     stated_count: int = 0  # number of the last of the noises, which a model states
-
-    def with_random_walks(self) -> RegressionProblem:
-        """Return the problem with the noises that have a random walk, and are not stated."""
-        kept = [place for place, shape in enumerate(
-            self.noise_shapes[:len(self.noise_shapes) - self.stated_count]) if shape.walk_ratio]
-        return replace(self, noise_shapes=tuple(self.noise_shapes[place] for place in kept),
-                       weights=self.weights[kept], log_determinants=self.log_determinants[kept],
-                       stated_count=0)
 
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
@@ -123,10 +116,11 @@ class RegressionProblem:
         """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
         return np.tensordot(self.weights, self.band_products(one, other), 1)
 
-    def with_white_noise(self) -> RegressionProblem:
-        """Return the problem without a wander of the bias."""
-        return replace(self, noise_shapes=self.noise_shapes[:1], weights=self.weights[:1],
-                       log_determinants=self.log_determinants[:1])
+    def with_noises(self, kept: list[int]) -> RegressionProblem:
+        """Return the problem with some of the noises, none of which a model states."""
+        return replace(self, noise_shapes=tuple(self.noise_shapes[place] for place in kept),
+                       weights=self.weights[kept], log_determinants=self.log_determinants[kept],
+                       stated_count=0)
 
     def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
                        known: Candidate) -> Array | None:
@@ -389,6 +383,15 @@ class RegressionFit:
         return {place: replace(self._column_value(cause_index, -1 - place),
                                value=candidate.shapes[place])
                 for place in fitted_shape_indices(candidate)}
+
+    def shape_parameters(self, cause_index: int) -> dict[str, Estimate]:
+        """Return the fitted shapes of a cause, by their names."""
+        effect = CATALOGUE.get(self.causes[cause_index].cause)
+        names = ([('width', 's')] if effect is None else
+                 [(shape.name, shape.unit) for shape in effect.nonlinear_parameters])
+        return {names[place][0]: Estimate.from_half_width(
+            size.value, NORMAL_QUANTILE_975 * size.deviation, names[place][1])
+            for place, size in self.shapes(cause_index).items()}
 
     # contributions to the output
 

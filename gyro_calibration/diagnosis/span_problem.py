@@ -32,10 +32,10 @@ from gyro_calibration.calibration.noise_grid import GridFit
 from gyro_calibration.calibration.spans import CauseTerm, Spans
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.findings import prediction_sigmas
 from gyro_calibration.diagnosis.regression import (
     column_evidence, fit_causes, group_columns, RegressionFit)
 from gyro_calibration.diagnosis.scans import best_steps, Scored
-from gyro_calibration.diagnosis.significance import prediction_sigmas
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import SINE_RESPONSE
 import numpy as np
@@ -113,8 +113,8 @@ class SpanProblem:
         return one @ np.swapaxes(other, -1, -2) - np.einsum(
             '...rw,gwv,...sv->g...rs', of_one, self._reduction, of_other, optimize=True)
 
-    def with_white_noise(self) -> SpanProblem:
-        return replace(self, deviations=self.deviations[:1])
+    def with_noises(self, kept: list[int]) -> SpanProblem:
+        return replace(self, deviations=self.deviations[kept])
 
     def _with_wander(self, rows: Array, noise: int) -> tuple[Array, Array]:
         """Return rows, shape (k, m), and the wander with its prior under a noise, (w, m + w)."""

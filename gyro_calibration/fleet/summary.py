@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
-from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
+from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.report import (
     Chart, draw_chart, element, join_markup, Line, Markup, render_page)
 from gyro_calibration.diagnosis.words import (
@@ -258,7 +258,7 @@ def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
               if one['status'] == 'established'} for each in logs]
 
     def p_value(shows: NDArray[np.bool_]) -> float:
-        return float(binom.sf(shows.sum() - 1, len(shows), Diagnosis.false_alarm_rate))
+        return float(binom.sf(shows.sum() - 1, len(shows), FALSE_ALARM_RATE))
 
     result = []
     for effect in sorted(set().union(*shown) - set(summary.values)):
