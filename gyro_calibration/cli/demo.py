@@ -14,8 +14,6 @@ Run an emulated gyro, its driver, compensation, self-calibration and a drive her
 example: gyro_calibration demo --out demo
 """
 
-from __future__ import annotations
-
 import argparse
 from collections import deque
 from collections.abc import Iterator

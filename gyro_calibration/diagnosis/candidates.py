@@ -16,8 +16,6 @@ two variables, and of time. They compete with the causes. If a generic term is c
 every cause, the structure is reported as unexplained.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -15,8 +15,6 @@ The formulas and units of effects are in `effects`, with the variable along whic
 the experiment that distinguishes it from similar causes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math

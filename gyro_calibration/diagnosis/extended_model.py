@@ -15,8 +15,6 @@ The model gets effects, limits, values, covariance, noise and origin. The held-o
 part in the selection and fit of the causes that predict them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 

@@ -16,8 +16,6 @@ found with a column of each cause, and under any wander of the bias. The evidenc
 by the scatter of stretches.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 import math

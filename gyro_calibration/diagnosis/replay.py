@@ -304,10 +304,6 @@ class Replay:
         grid = np.rint((time - time[0]) / self.interval).astype(int)
         return grid, self.command[np.searchsorted(grid, np.arange(grid[-1] + 1), 'right') - 1]
 
-    def with_command(self, command: Array) -> Replay:
-        """Return the log with another command, rad/s, shape (n,), as its reference."""
-        return replace(self.with_motion(command - self.channels.rate), command=command)
-
     def response_variance(self) -> Array:
         """Return the variance of coefficients that weights the response, shape (points - 1,)."""
         return self.response_noise.variance(coefficient_angles(self.point_count),

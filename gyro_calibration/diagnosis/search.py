@@ -17,8 +17,6 @@ causes would explain. A cause that is selected is confirmed if it predicts stret
 that are held out, and if the interval of its size excludes 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

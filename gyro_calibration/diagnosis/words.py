@@ -10,8 +10,6 @@
 
 """Numbers as people read them, and a diagnosis in plain words, for terminal and report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import math
 import re
