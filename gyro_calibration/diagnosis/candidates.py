@@ -77,14 +77,6 @@ class Candidate:
                 and CATALOGUE[self.cause].stage == 'rate')
 
 
-def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
-    """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
-    return np.concatenate([
-        np.array([each.transform_samples(value) if candidate.log_index in (None, run)
-                  else np.zeros(each.point_count - 1) for value in candidate.columns(each)])
-        for run, each in enumerate(replays)], axis=1)
-
-
 def effect_candidate(name: str, *shapes: float, log_index: int | None = None,
                      half_width: float | None = None) -> Candidate:
     """Return the candidate of an effect of the gyro, or of the reference."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
@@ -28,8 +27,8 @@ from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
-    Cause, cause_finding, cause_parameters, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES,
-    REFERENCES, SINGLE_EVENT_REMEDY, slip_times, untestable_causes, value_finding)
+    Cause, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES, REFERENCES, slip_times,
+    untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, complete_diagnosis, drop_samples, extend_model, heading_contributions,
@@ -52,7 +51,7 @@ from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, model_residuals, residual_curves)
 from gyro_calibration.diagnosis.search import (
     confirm_causes, evidence_for, evidence_threshold, explain_selection, forget_searches, p_value,
-    refine_shape, Search, search_causes, SelectedCause, Selection, start_search)
+    refine_shape, Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.diagnosis.words import is_model_extended
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
@@ -379,16 +378,34 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
 
     A cause that is not significant where the noise has a random walk of any size may be that.
     """
-    shapes = search.problem.noise_shapes
+    shapes, replays = search.problem.noise_shapes, fit.problem.replays
     walking = replace(search, problem=search.problem.with_noises([
         place for place, shape in enumerate(shapes[:len(shapes) - search.problem.stated_count])
         if shape.walk_ratio]))
+    observed = observed_range(
+        [each.channels.rate for each in replays],
+        [each.channels.temperature for each in replays
+         if 'temperature' in common_channels(replays)], max(each.duration for each in replays))
     for each in explain_selection(search, selection):
-        by_walk = each.is_established and p_value(
-            each.cause.cause, evidence_for(walking, each.fit.causes, each.place)) >= search.rate
-        # of established causes without structure that has no name
-        yield _cause_finding(search, replace(each, fit=fit) if each.is_established else each,
-                             ['rate_random_walk'] * by_walk)
+        name, place, log_index = each.cause.cause, each.place, each.cause.log_index
+        confounders = []
+        if each.is_established:
+            if p_value(name, evidence_for(walking, each.fit.causes, place)) >= search.rate:
+                confounders.append('rate_random_walk')
+            each = replace(each, fit=fit)  # without structure that has no name
+        known = each.fit.shape_parameters(place)
+        if name == 'time_offset':
+            (offset,) = known.values()
+            if is_sample_offset(offset.estimate, offset.deviation, replays[0].interval):
+                confounders.append('unit_error')
+        # the evidence of a size of n standard deviations is n² / 2
+        threshold = evidence_threshold(name, search.rate) + complexity_penalty(each.cause)
+        found = each.finding(
+            *each.fit.coefficients(place), known, observed,
+            math.sqrt(2.0 * max(threshold, 0.0)) + float(norm.ppf(DETECTION_POWER)),
+            float(replays[log_index or 0].channels.time[-1]), confounders)
+        yield (found if log_index is None or len(replays) == 1 or not found.evidence else
+               replace(found, evidence=f'in log {log_index + 1}, {found.evidence}'))
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
@@ -475,36 +492,6 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 
 
 # findings
-
-def _cause_finding(search: Search, selected: SelectedCause,
-                   confounders: Sequence[str]) -> Finding:
-    """Return the finding of a cause, with confounders in addition to its alternatives."""
-    known, fit, place = selected.cause, selected.fit, selected.place
-    name, replays, shapes = known.cause, fit.problem.replays, fit.shape_parameters(place)
-    fields: dict[str, Any] = {'remedy': SINGLE_EVENT_REMEDY if is_single_event(known) else ''}
-    if name == 'bias_step':
-        fields['where'] = (known.shapes[0],
-                           float(replays[known.log_index or 0].channels.time[-1]))
-    elif name == 'reference_slip':
-        fields['where'] = min(known.shapes[1:]), max(known.shapes[1:])
-        shapes |= slip_times(known.shapes[1:])
-    parameters = cause_parameters(name, *fit.coefficients(place), shapes)
-    size = next(iter(parameters.values()))
-    is_sample = name == 'time_offset' and is_sample_offset(size.estimate, size.deviation,
-                                                           replays[0].interval)
-    # the evidence of a size of n standard deviations is n² / 2
-    threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
-    found = cause_finding(
-        name, parameters, selected.p_value, selected.deficits, selected.is_established,
-        observed_range([each.channels.rate for each in replays],
-                       [each.channels.temperature for each in replays
-                        if 'temperature' in common_channels(replays)],
-                       max(each.duration for each in replays)),
-        math.sqrt(2.0 * max(threshold, 0.0)) + float(norm.ppf(DETECTION_POWER)),
-        [*confounders, *['unit_error'] * is_sample], **fields)
-    return (found if known.log_index is None or len(replays) == 1 or not found.evidence else
-            replace(found, evidence=f'in log {known.log_index + 1}, {found.evidence}'))
-
 
 def _unexplained_structures(search: Search, fit: RegressionFit,
                             unnamed: Sequence[Candidate]) -> list[Unexplained]:

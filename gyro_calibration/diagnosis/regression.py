@@ -30,8 +30,8 @@ import math
 from typing import Any
 
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK,
-    MAX_STEP_TIMES, smooth_shapes, with_shape)
+    Candidate, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK, MAX_STEP_TIMES, smooth_shapes,
+    with_shape)
 from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.replay import (
     band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
@@ -85,12 +85,6 @@ class RegressionProblem:
         return np.split(coefficients,
                         np.cumsum([each.point_count - 1 for each in self.replays])[:-1])
 
-    def band_products(self, one: Array, other: Array) -> Array:
-        """Return the products of rows (..., r, m) and (..., s, m) in each band, (b, ..., r, s)."""
-        edges = [*self.band_starts, one.shape[-1]]
-        return np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
-                         for begin, end in zip(edges, edges[1:])])
-
     # what a search needs
 
     @property
@@ -114,7 +108,10 @@ class RegressionProblem:
 
     def products(self, one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
-        return np.tensordot(self.weights, self.band_products(one, other), 1)
+        edges = [*self.band_starts, one.shape[-1]]
+        of_bands = np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
+                             for begin, end in zip(edges, edges[1:])])
+        return np.tensordot(self.weights, of_bands, 1)
 
     def with_noises(self, kept: list[int]) -> RegressionProblem:
         """Return the problem with some of the noises, none of which a model states."""
@@ -477,8 +474,13 @@ def _with_distorted_rate(replay: Replay,
     return before.with_rate(distortion(before.channels.rate, before.channels.time, *shapes))
 
 
-#: Transforms of the same columns are needed in many fits, as in a search for a shape.
-_transforms = lru_cache(maxsize=32)(candidate_transforms)
+@lru_cache(maxsize=32)  # they are needed in many fits, as in a search for a shape
+def _transforms(candidate: Candidate, replays: tuple[Replay, ...]) -> Array:
+    """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
+    return np.concatenate([
+        np.array([each.transform_samples(value) if candidate.log_index in (None, run)
+                  else np.zeros(each.point_count - 1) for value in candidate.columns(each)])
+        for run, each in enumerate(replays)], axis=1)
 
 
 @lru_cache(maxsize=16)

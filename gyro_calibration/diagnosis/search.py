@@ -29,13 +29,14 @@ from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
     Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
-from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.causes import (
+    cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, slip_times)
 from gyro_calibration.diagnosis.findings import (
-    MIN_PREDICTION_SIGMAS, OnProgress, prediction_sigmas, RULED_OUT_DEFICIT, SEARCH_ALARM_RATE,
-    SUSPECTED_RATE_FACTOR)
+    Estimate, Finding, MIN_PREDICTION_SIGMAS, OnProgress, prediction_sigmas, RULED_OUT_DEFICIT,
+    SEARCH_ALARM_RATE, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.diagnosis.regression import (
     build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, forget_fits,
-    group_columns, likelihood_with, RegressionFit, VALUE_PENALTY)
+    group_columns, is_single_event, likelihood_with, RegressionFit, VALUE_PENALTY)
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.scans import (
     find_slips, find_steps, find_tones, MAX_PER_LOG, Scored)
@@ -474,6 +475,25 @@ class SelectedCause:
     def cause(self) -> Candidate:
         """Return the cause with its shapes."""
         return self.fit.causes[self.place]
+
+    def finding(self, values: Array, covariance: Array, shapes: Mapping[str, Estimate],
+                observed: Mapping[str, float], sigmas: float, end: float,
+                confounders: Sequence[str] = ()) -> Finding:
+        """
+        Return the finding: `cause_finding` with the coefficients, their covariance, and shapes.
+
+        Single events are in a part of a log, up to its end, s, or between the first and the last.
+        """
+        known, where = self.cause, None
+        if known.cause == 'bias_step':
+            where = known.shapes[0], end
+        elif known.cause == 'reference_slip':
+            where = min(known.shapes[1:]), max(known.shapes[1:])
+            shapes = {**shapes, **slip_times(known.shapes[1:])}
+        return cause_finding(
+            known.cause, cause_parameters(known.cause, values, covariance, shapes), self.p_value,
+            self.deficits, self.is_established, observed, sigmas, confounders, where=where,
+            remedy=SINGLE_EVENT_REMEDY if is_single_event(known) else '')
 
 
 def explain_selection(search: Search, selection: Selection) -> Iterator[SelectedCause]:

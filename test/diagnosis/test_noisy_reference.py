@@ -22,10 +22,9 @@ from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import select_causes
+from gyro_calibration.diagnosis.noisy_reference import select_causes, span_candidate
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.search import Selection
-from gyro_calibration.diagnosis.span_problem import span_candidate
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
