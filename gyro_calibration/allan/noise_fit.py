@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 import itertools
 import math
 
@@ -51,10 +51,6 @@ _COMBINATIONS = [combination for count in range(len(NOISE_TERMS))
                  if combination]
 
 
-#: Each octave is in many fits.
-_cached_form = lru_cache(maxsize=4096)(covariance_form)
-
-
 @dataclass(frozen=True)
 class _OctaveVariances:
     """Allan variances at octaves and the terms of their covariance, all in samples."""
@@ -82,10 +78,8 @@ class _OctaveVariances:
         With a process it is (n, n, 6, 6).
         """
         sizes = self.size.tolist()
-        forms = np.array([[_cached_form(self.samples, *sorted((one, other)), self.process)
-                           for other in sizes] for one in sizes])
-        # products of coefficients are in either order
-        return 0.5 * (forms + np.swapaxes(forms, 2, 3)) * np.outer(
+        return np.array([[covariance_form(self.samples, *sorted((one, other)), self.process)
+                          for other in sizes] for one in sizes]) * np.outer(
             self.loss_factor, self.loss_factor)[:, :, None, None]
 
     def process_columns(self, process: GaussMarkov) -> Array:

@@ -59,7 +59,6 @@ def run(given: argparse.Namespace) -> Answer:
     with show_progress('diagnosis') as on_progress:
         found = diagnose_logs(logs, model, given.seed, given.reference_kind, given.log,
                               on_progress, given.time_limit)
-    found = replace(found, logs=tuple(given.log))
     if found.model is not model:
         origin = {**found.model.origin, **verb.make_origin(found.logs)}
         found = replace(found, model=replace(found.model, origin=origin))

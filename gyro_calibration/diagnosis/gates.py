@@ -19,7 +19,7 @@ axis that tilts. A gate that fails is the only finding. The kind of the referenc
 errors exceed those of the gyro, decide how a log is diagnosed.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 from typing import NamedTuple
@@ -121,12 +121,8 @@ def reference_rate(log: Log) -> Array | None:
 def spline_rate(time: Array, heading: Array) -> Array:
     """Return the rate of a heading by a quintic spline, gaps interpolated, rad/s, shape (n,)."""
     known = np.isfinite(heading)
-    return heading_spline(time, np.interp(time, time[known], heading[known]))(time, 1)
-
-
-def heading_spline(time: Array, heading: Array) -> Callable[[Array, int], Array]:
-    """Return the quintic spline through a heading, by time and the order of its derivative."""
-    return make_interp_spline(time, heading, 5)
+    whole = np.interp(time, time[known], heading[known])
+    return np.asarray(make_interp_spline(time, whole, 5)(time, 1))
 
 
 def fit_line(time: Array | None, rate: Array, output: Array) -> _LineFit | None:

@@ -309,7 +309,7 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], on_progress: On
     if follows:
         return replace(found, findings=lag, followed=followed[0],
                        remarks=[] if within is None else [_SETTLED_REMARK])
-    before, after = map(_residual_variance, (fit_causes(plain.problem, []), moved))
+    before, after = map(_residual_variance, (plain, moved))
     return replace(found, unexplained=[Unexplained(
         'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
 
@@ -393,7 +393,7 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
             if p_value(name, evidence_for(walking, each.fit.causes, place)) >= search.rate:
                 confounders.append('rate_random_walk')
             each = replace(each, fit=fit)  # without structure that has no name
-        known = each.fit.shape_parameters(place)
+        known = each.fit.shapes(place)
         if name == 'time_offset':
             (offset,) = known.values()
             if is_sample_offset(offset.estimate, offset.deviation, replays[0].interval):

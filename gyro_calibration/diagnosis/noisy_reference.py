@@ -235,16 +235,17 @@ def _cause_finding(found: SelectedCause, extended: SpanFit) -> Finding:
     term, spans = _term_of(found.cause), extended.spans
     fit = (extended if found.is_established
            else fit_spans(spans, [*extended.causes, term]))
-    places, shapes, log = fit.value_slice(term), found.fit.shape_parameters(found.place), spans.log
+    places, shapes = fit.value_slice(term), found.fit.shapes(found.place)
     values, covariance = fit.values[places], fit.normal_covariance[places, places]
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
         values, covariance = values[1:], covariance[1:, 1:]
-    end, temperatures = float(spans.time[-1]), [log.temperature]
-    return found.finding(values, covariance, shapes, observed_range(
-        [np.asarray(spans.channels.rate)], [each for each in temperatures if each is not None],
-        end), detectable_sigmas(VALUE_ALARM_RATE), end)
+    end, temperature = float(spans.time[-1]), spans.log.temperature
+    observed = observed_range([np.asarray(spans.channels.rate)],
+                              [] if temperature is None else [temperature], end)
+    return found.finding(values, covariance, shapes, observed,
+                         detectable_sigmas(VALUE_ALARM_RATE), end)
 
 
 def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:

@@ -302,7 +302,7 @@ class RegressionFit:
         probable = self.noise_probability
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
-        covariance = np.linalg.inv(self.information[kept])
+        covariance = self.inverse_information[kept]
         values = np.einsum('gpq,gq->gp', covariance, self.scores[kept])
         mean = weights @ values
         variances = weights * self.residual_squares[kept] / self.degrees_of_freedom
@@ -374,21 +374,18 @@ class RegressionFit:
         values, covariance = self.estimates
         return np.append(values, 0.0)[ranks], np.pad(covariance, (0, 1))[np.ix_(ranks, ranks)]
 
-    def shapes(self, cause_index: int) -> dict[int, Value]:
-        """Return the fitted shapes of a cause, by their places."""
-        candidate = self.causes[cause_index]
-        return {place: replace(self._column_value(cause_index, -1 - place),
-                               value=candidate.shapes[place])
-                for place in fitted_shape_indices(candidate)}
-
-    def shape_parameters(self, cause_index: int) -> dict[str, Estimate]:
-        """Return the fitted shapes of a cause, by their names."""
-        effect = CATALOGUE.get(self.causes[cause_index].cause)
+    def shapes(self, cause_index: int) -> dict[str, Estimate]:
+        """Return the fitted shapes of a named cause, by their names."""
+        known, found = self.causes[cause_index], {}
+        effect = CATALOGUE.get(known.cause)
         names = ([('width', 's')] if effect is None else
                  [(shape.name, shape.unit) for shape in effect.nonlinear_parameters])
-        return {names[place][0]: Estimate.from_half_width(
-            size.value, NORMAL_QUANTILE_975 * size.deviation, names[place][1])
-            for place, size in self.shapes(cause_index).items()}
+        for place in fitted_shape_indices(known):
+            name, unit = names[place]
+            found[name] = Estimate.from_half_width(
+                known.shapes[place], NORMAL_QUANTILE_975 * self._column_value(
+                    cause_index, -1 - place).deviation, unit)
+        return found
 
     # contributions to the output
 
@@ -535,8 +532,7 @@ def _fit_causes(problem: Any, causes: tuple[Candidate, ...]) -> RegressionFit:
     # of what the values for one noise leave, as the difference of the whole sums is rounded
     left = np.append(-np.linalg.solve(information[0], scores[0]), 1.0) @ rows
     pull, squares = (problem.products(each, left[None]) for each in (rows[:-1], left[None]))
-    squares = squares[:, 0, 0] - np.einsum(
-        'gq,gq->g', np.linalg.solve(information, pull)[:, :, 0], pull[:, :, 0])
+    squares = squares[:, 0, 0] - (pull * np.linalg.solve(information, pull)).sum(axis=(1, 2))
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
     likelihood = -0.5 * ((len(left) - len(rows) + 1) * np.log(squares) + determinants)
     return RegressionFit(problem, distorted, causes, rows,
@@ -605,20 +601,16 @@ def group_columns(problem: Any, columns: Array,
 
 def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
     """Return the evidence of groups of columns given a fit, -inf if unidentifiable."""
-    # products, under each noise, of what the fit leaves of the columns: with the residual, and own
+    # products, under each noise, of what the fit leaves of the columns, with the residual
     crossing = fit.problem.products(groups.columns, fit.rows)
     crossing, pull = crossing[:, :, :-1], crossing[:, :, -1]
     towards = crossing @ fit.inverse_information
     pull = pull - np.einsum('gpq,gq->gp', towards, fit.scores)
-    own = np.einsum('gpq,gpq->gp', crossing, towards)
     squares, likelihood = fit.residual_squares[:, None], fit.noise_log_likelihood[:, None]
     found = np.full(len(groups.groups), -np.inf)
     for places, members, whole in groups.of_width:
-        width, left = members.shape[1], whole.copy()
-        for row, column in np.ndindex(width, width):
-            one, other = members[:, row], members[:, column]
-            left[:, :, row, column] -= (own[:, one] if row == column else np.einsum(
-                'gnq,gnq->gn', crossing[:, one], towards[:, other]))
+        width = members.shape[1]
+        left = whole - crossing[:, members] @ np.swapaxes(towards[:, members], -1, -2)
         of_left, of_whole = (np.einsum('gnpp->gnp', each) for each in (left, whole))
         shown = (of_left > MIN_INDEPENDENT_SHARE * of_whole).all(axis=(0, 2))
         # columns that depend on each other count as one

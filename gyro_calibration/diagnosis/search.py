@@ -523,7 +523,7 @@ def _remove_unconfirmed(search: Search, causes: Causes,
         fit, sigmas = fit_causes(search.problem, causes), []
         for place, (known, held_out) in enumerate(zip(causes, held_out_sigmas(search, causes))):
             values, covariance = fit.coefficients(place)
-            sizes = [(one.value, one.deviation) for one in fit.shapes(place).values()]
+            sizes = [(one.estimate, one.deviation) for one in fit.shapes(place).values()]
             if len(values):
                 sizes = [*zip(values.tolist(), np.sqrt(np.diag(covariance)).tolist())]
             # sine or cosine alone may be 0 for a wave that is not

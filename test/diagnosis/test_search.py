@@ -181,7 +181,7 @@ def test_the_interval_of_the_time_of_a_step_holds_it():
         fit = fit_causes(search.problem, named)
         for place in range(2):
             time, = fit.shapes(place).values()
-            held += min(abs(time.value - true) for true in times) < 1.96 * time.deviation < 10.0
+            held += min(abs(time.estimate - true) for true in times) < 1.96 * time.deviation < 10
     assert held >= 11
 
 
