@@ -48,7 +48,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                         'for causes ends after half of it, s, and what was found is confirmed and '
                         'reported; default: none')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
-                        help='seed of the random draws of significance tests; default: 0')
+                        help='seed of the noise that fills gaps of a log; default: 0')
 
 
 def run(given: argparse.Namespace) -> Answer:
