@@ -179,9 +179,8 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
     measure.
     """
     scale, limits = fit.scale_factor_error, RunLimits()
-    return fit.estimate_index(-1, 0) is not None and (
-        scale.value < -limits.max_scale_factor_error
-        or scale.deviation > limits.max_scale_deviation)
+    return (scale.value < -limits.max_scale_factor_error
+            or scale.deviation > limits.max_scale_deviation)
 
 
 # values

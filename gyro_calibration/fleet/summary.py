@@ -71,8 +71,8 @@ class _ValueSummary:
 
     def format_interval(self, interval: Interval, per: str = '') -> str:
         """Return an estimate of the value with its interval, or of its slope per unit of time."""
-        return str(format_quantity(Estimate(interval.value, (interval.low, interval.high),
-                                            self.unit + per), self.name))
+        return format_quantity(Estimate(interval.value, (interval.low, interval.high),
+                                        self.unit + per), self.name)
 
     def format_component(self, name: str) -> str:
         """Return a standard deviation with its interval, or its bound where it may be zero."""
@@ -374,9 +374,9 @@ def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[s
         cells = []
         for name in names:
             value = each.get('values', {}).get(name)
-            cells.append(_cell('') if value is None else _cell(str(format_quantity(
+            cells.append(_cell('') if value is None else _cell(format_quantity(
                 Estimate.from_half_width(value['value'], NORMAL_QUANTILE_975 * value['deviation'],
-                                         value['unit']), name)), value['value']))
+                                         value['unit']), name), value['value']))
         rows.append([element('td', link, data_key=file),
                      *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *cells,
                      _cell((each.get('diagnosis') or {}).get('verdict', '')),
