@@ -323,7 +323,7 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0, kind: st
     logs : logs of one gyro, each with a reference, or at rest; or a single rate table
     model : model of the simulation; None is an ideal gyro with the bias and scale factor error
         that fit the logs best
-    seed : seed of the random draws of significance tests
+    seed : seed of the noise that fills gaps
     kind : kind of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or
         rest; None detects it
     time_limit : the search for causes ends after half of it, s, and what was found is confirmed

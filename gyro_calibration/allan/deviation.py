@@ -20,6 +20,7 @@ of the angle, and mean squares of Gaussian values have the covariance 2 c² summ
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 from typing import Any
 
@@ -314,6 +315,7 @@ def _lag_covariance(angle_covariance: Callable[[Integers], Array], first: int, s
                    for j, b in enumerate((1.0, -2.0, 1.0))], axis=0)
 
 
+@lru_cache(maxsize=4096)  # each pair of times is in many fits
 def covariance_form(samples: int, first: int, second: int,
                     process: GaussMarkov | None = None) -> Array:
     """

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 import itertools
 import math
 
@@ -78,7 +78,7 @@ class _OctaveVariances:
         With a process it is (n, n, 6, 6).
         """
         sizes = self.size.tolist()
-        return np.array([[_symmetric_form(self.samples, *sorted((one, other)), self.process)
+        return np.array([[covariance_form(self.samples, *sorted((one, other)), self.process)
                           for other in sizes] for one in sizes]) * np.outer(
             self.loss_factor, self.loss_factor)[:, :, None, None]
 
@@ -88,10 +88,6 @@ class _OctaveVariances:
         columns[:, _PROCESS] = process.allan_variance(self.size.astype(float))
         return columns
 
-    def with_process(self, process: GaussMarkov) -> _OctaveVariances:
-        """Add a process of 1 rad/s, and its part of the covariance."""
-        return replace(self, columns=self.process_columns(process), process=process)
-
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
         known = squares[:self.forms.shape[-1]]
@@ -100,13 +96,6 @@ class _OctaveVariances:
     def model_variance(self, squares: Array) -> Array:
         """Return the sum of the terms for these squared coefficients, kept above zero."""
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
-
-
-@lru_cache(maxsize=4096)
-def _symmetric_form(samples: int, first: int, second: int, process: GaussMarkov | None) -> Array:
-    """Return `covariance_form` for products of coefficients in either order."""
-    form = covariance_form(samples, first, second, process)
-    return 0.5 * (form + form.T)
 
 
 @dataclass(frozen=True)
@@ -284,7 +273,8 @@ def _fit_with_process(best: _CombinationFit, kept_terms: tuple[int, ...],
 
     process = min((GaussMarkov(math.sqrt(2.0 / constant), constant) for constant in np.geomspace(
         octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=approximate_deviance)
-    found = _fit_combination(octaves.with_process(process), places, misfit)
+    found = _fit_combination(replace(octaves, columns=octaves.process_columns(process),
+                                     process=process), places, misfit)
     first = found.squares * found.octaves.columns[0]
     return found if 0.0 < first[_PROCESS] < 0.5 * first.sum() else None
 

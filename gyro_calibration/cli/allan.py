@@ -15,8 +15,6 @@ example: gyro_calibration allan rest.csv --rate 100 --picture allan.png --model 
 --out model.yaml
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass, field, replace
 import math

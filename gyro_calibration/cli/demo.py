@@ -14,8 +14,6 @@ Run an emulated gyro, its driver, compensation, self-calibration and a drive her
 example: gyro_calibration demo --out demo
 """
 
-from __future__ import annotations
-
 import argparse
 from collections import deque
 from collections.abc import Iterator
@@ -150,7 +148,7 @@ class _DemoClient:
         """Subscribe; the robot receives ``cmd_vel`` from now on."""
         self.raw_rates: list[tuple[float, float]] = []  # s and rad/s
         self.headings: list[tuple[float, float]] = []  # s and rad
-        self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
+        self.node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
 
         def add_raw(message: Imu) -> None:
             self.raw_rates.append((_seconds(message), message.angular_velocity.z))
@@ -166,19 +164,19 @@ class _DemoClient:
             while not self._stop.is_set():
                 self._executor.spin_once(timeout_sec=0.1)
 
-        self._node.create_subscription(Imu, 'imu/data_raw', add_raw, SENSOR_QOS)
-        self._node.create_subscription(Imu, 'imu/data', add_heading, SENSOR_QOS)
-        self._node.create_subscription(Twist, 'cmd_vel', add_command, 10)
-        self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
+        self.node.create_subscription(Imu, 'imu/data_raw', add_raw, SENSOR_QOS)
+        self.node.create_subscription(Imu, 'imu/data', add_heading, SENSOR_QOS)
+        self.node.create_subscription(Twist, 'cmd_vel', add_command, 10)
+        self._velocity = self.node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
+        self._executor.add_node(self.node)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=spin)
         self._thread.start()
 
     def call_service(self, name: str, timeout: float) -> None:
         """Call a service, and wait until it has succeeded."""
-        client = self._node.create_client(Trigger, name)
+        client = self.node.create_client(Trigger, name)
         if not client.wait_for_service(20.0):
             raise OSError(f'the service {name} did not appear within 20 s')
         answer, deadline = client.call_async(Trigger.Request()), time.monotonic() + timeout
@@ -189,10 +187,6 @@ class _DemoClient:
         if not answer.result().success:
             raise _CallRefused(f'{name}: {answer.result().message}')
 
-    def is_ready(self) -> bool:
-        return (bool(self.raw_rates and self.headings)
-                and self._node.count_publishers('cmd_vel') > 1)
-
     def command_rate(self, rate: float) -> None:
         command = Twist()
         command.angular.z = rate
@@ -202,7 +196,7 @@ class _DemoClient:
         self._stop.set()
         self._thread.join()
         self._executor.shutdown()
-        self._node.destroy_node()
+        self.node.destroy_node()
 
 
 def _seconds(message: Imu) -> float:
@@ -230,7 +224,8 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
     with verb.show_progress('starting driver and compensation') as on_progress:
         deadline = time.monotonic() + 60.0
-        while not client.is_ready():
+        while not (client.raw_rates and client.headings
+                   and client.node.count_publishers('cmd_vel') > 1):
             if time.monotonic() > deadline:
                 raise OSError('driver and compensation were not ready within 60 s; stop other '
                               'programs, and run the demo again')

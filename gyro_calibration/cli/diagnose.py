@@ -48,7 +48,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                         'for causes ends after half of it, s, and what was found is confirmed and '
                         'reported; default: none')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
-                        help='seed of the random draws of significance tests; default: 0')
+                        help='seed of the noise that fills gaps of a log; default: 0')
 
 
 def run(given: argparse.Namespace) -> Answer:
@@ -59,7 +59,6 @@ def run(given: argparse.Namespace) -> Answer:
     with show_progress('diagnosis') as on_progress:
         found = diagnose_logs(logs, model, given.seed, given.reference_kind, given.log,
                               on_progress, given.time_limit)
-    found = replace(found, logs=tuple(given.log))
     if found.model is not model:
         origin = {**found.model.origin, **verb.make_origin(found.logs)}
         found = replace(found, model=replace(found.model, origin=origin))

@@ -14,8 +14,6 @@ Calibrate from a rate table, a turntable, an encoder, or any log with a referenc
 example: gyro_calibration fit table.csv --out model.yaml
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

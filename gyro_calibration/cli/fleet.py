@@ -57,7 +57,7 @@ def add(parser: argparse.ArgumentParser) -> None:
                         help='technology of the gyros; default: mems')
     parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only; faster')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
-                        help='seed of the random draws of a diagnosis; default: 0')
+                        help='seed of the noise that fills gaps of a log; default: 0')
     parser.add_argument('--workers', type=verb.positive_integer, metavar='N',
                         help='number of processes; default: one per core')
     parser.add_argument('--memory', type=verb.positive_number, metavar='GB',

@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
 #: Lines that are distinguished without colour; further ones are thinner.
 _LINE_STYLES = ('-', '--', '-.', ':')
-#: Colour maps of values with a sign, symmetric about zero, and of others; both are suitable for
-#: the colour-blind.
-_DIVERGING_COLORMAP, _SEQUENTIAL_COLORMAP = 'RdBu_r', 'cividis'
 
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
@@ -116,7 +113,7 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
         for row, (error, name, when, more) in enumerate(rows):
             axes, inside, outlying = panels[row, column], error[kept] / DEGREE, error[~kept]
             dots = _draw_dots(axes, across[kept], inside, None if shade is None else shade[kept],
-                              _DIVERGING_COLORMAP if shade is rate else _SEQUENTIAL_COLORMAP)
+                              shade is rate)
             # the scale is that of those kept; others beyond it are at the edge
             low, high = float(inside.min()), float(inside.max())
             margin = 0.12 * (high - low) or 1e-3
@@ -153,9 +150,9 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
                  f'largest {np.abs(error).max() / DEGREE:.3g} deg')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
-    return _save_figure(figure, path, 'Shades of grey: temperature. A step between the senses: '
-                        'scale factor error; a curve: nonlinearity; growth towards '
-                        'slow turns: bias or noise. Turns slower than '
+    return _save_figure(figure, path, 'Colours: temperature. A step between the senses: scale '
+                        'factor error; a curve: nonlinearity; growth towards slow turns: bias or '
+                        'noise. Turns slower than '
                         f'{min_rate / DEGREE:g} deg/s are left out. Scales differ.')
 
 
@@ -187,16 +184,14 @@ def _panels(rows: int, columns: int, inches: tuple[float, float],
 
 
 def _draw_dots(axes: Any, across: Array, up: Array, colour_values: Array | None,
-               colours: str = 'Greys') -> Any:
-    """Draw dots, each in the colour that a quantity gives it; no dot is white."""
+               is_signed: bool = False) -> Any:
+    """Draw dots, each in the colour that a quantity gives it; with a sign, white is zero."""
     if colour_values is None:
         return axes.scatter(across, up, s=9, linewidths=0, color='black')
-    largest, span = float(np.abs(colour_values).max()), float(np.ptp(colour_values))
-    low, high = ((-largest, largest) if colours == _DIVERGING_COLORMAP
-                 else (float(colour_values.min()) - (0.35 * span if colours == 'Greys' else 0.0),
-                       float(colour_values.max())))
-    return axes.scatter(across, up, s=14, linewidths=0.3, edgecolors='0.3', c=colour_values,
-                        cmap=colours, vmin=low, vmax=high)
+    most = float(np.abs(colour_values).max()) if is_signed else None
+    return axes.scatter(  # in colours that the colour-blind distinguish
+        across, up, s=14, linewidths=0.3, edgecolors='0.3', c=colour_values,
+        cmap='RdBu_r' if is_signed else 'cividis', vmin=most and -most, vmax=most)
 
 
 def _save_figure(figure: Any, path: str | Path | None, caption: str) -> Any:

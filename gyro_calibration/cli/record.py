@@ -14,8 +14,6 @@ Record a gyro, from its port or from topics, until Ctrl-C.
 example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress

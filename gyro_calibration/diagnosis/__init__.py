@@ -11,15 +11,15 @@
 """
 Diagnosis: what a simulation of a gyro gets wrong, why, and what extending its model improves.
 
-Reading order, each imports only from those before it: `findings` (what is found, as records),
-`significance` (the rules by which causes are named), `causes` (that can be named, and experiments
-that distinguish them), `gates` (which logs are refused, whether gyro and reference belong
-together, and the kind of the reference), `data_quality` (of a record: lost, repeated and outlying
-samples, codes and limits), `replay` (of a log, and the spectrum of its noise), `candidates`
-(columns of causes, and of what has no name), `regression` (of logs on causes, under every noise),
-`scans` (for tones, steps and slips), `span_problem` (a log as spans), `search` (for causes, and
-their confirmation), `words` (numbers and findings for people), `residuals` (their noise and
-curves), `extended_model` (and its gain on what was held out), `noisy_reference` (where the
-reference limits what is known), `reference_lag` (of a motion that follows its reference),
-`table_diagnosis` (of a rate table), `log_diagnosis` (of logs, in order), `report` (the page).
+Reading order, each imports only from those before it: `findings` (what is found, as records, and
+the rules by which causes are named), `causes` (that can be named, and experiments that distinguish
+them), `gates` (which logs are refused, whether gyro and reference belong together, and the kind of
+the reference), `data_quality` (of a record: lost, repeated and outlying samples, codes and
+limits), `replay` (of a log, and the spectrum of its noise), `candidates` (columns of causes, and
+of what has no name), `regression` (of logs on causes, under every noise), `scans` (for tones,
+steps and slips), `search` (for causes, and their confirmation), `words` (numbers and findings for
+people), `residuals` (their noise and curves), `extended_model` (and its gain on what was held
+out), `noisy_reference` (a log as spans, where the reference limits what is known),
+`reference_lag` (of a motion that follows its reference), `table_diagnosis` (of a rate table),
+`log_diagnosis` (of logs, in order), `report` (the page).
 """

@@ -16,8 +16,6 @@ two variables, and of time. They compete with the causes. If a generic term is c
 every cause, the structure is reported as unexplained.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -77,14 +75,6 @@ class Candidate:
         """Tell whether it distorts the rate before errors are added to it."""
         return (self.amplitude is not None and self.cause in CATALOGUE
                 and CATALOGUE[self.cause].stage == 'rate')
-
-
-def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
-    """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
-    return np.concatenate([
-        np.array([each.transform_samples(value) if candidate.log_index in (None, run)
-                  else np.zeros(each.point_count - 1) for value in candidate.columns(each)])
-        for run, each in enumerate(replays)], axis=1)
 
 
 def effect_candidate(name: str, *shapes: float, log_index: int | None = None,

@@ -15,16 +15,13 @@ The formulas and units of effects are in `effects`, with the variable along whic
 the experiment that distinguishes it from similar causes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from gyro_calibration.diagnosis.findings import Estimate, Finding
-from gyro_calibration.diagnosis.significance import (
-    detectable_sigmas, probabilities, RULED_OUT_DEFICIT)
+from gyro_calibration.diagnosis.findings import (
+    detectable_sigmas, Estimate, Finding, probabilities, RULED_OUT_DEFICIT)
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE, Effect
 from gyro_calibration.model.gyro_model import GyroModel
@@ -332,8 +329,6 @@ _EXPERIMENTS: Mapping[str, str] = {
     'step the supply by 5 % each minute at one temperature and at rest':
         'bias_temperature supply_sensitivity',
 }
-#: Largest number of logs that is proposed.
-_MAX_PROPOSED_LOGS = 10
 _EXPERIMENT_BY_PAIR = {frozenset(pair.split()): words
                        for words, pairs in _EXPERIMENTS.items() for pair in pairs.split(', ')}
 
@@ -355,7 +350,7 @@ def next_experiment(name: str, alternatives: Sequence[tuple[str, float]],
             words = CAUSES[name].separate_by or CAUSES[other].separate_by
         sigmas = math.sqrt(2.0 * max(lack, 0.0))
         text = f'{other.replace("_", " ")} by {sigmas:.1f} sigma'
-        if RULED_OUT_DEFICIT / _MAX_PROPOSED_LOGS < lack < RULED_OUT_DEFICIT:
+        if 0.1 * RULED_OUT_DEFICIT < lack < RULED_OUT_DEFICIT:  # up to ten logs are proposed
             logs = math.ceil(RULED_OUT_DEFICIT / lack)
             text += f', {logs} such logs together by {math.sqrt(logs) * sigmas:.1f}'
         found.setdefault(words.format(**observed_range), []).append(text)

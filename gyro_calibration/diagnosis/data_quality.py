@@ -21,8 +21,6 @@ samples, repeated samples, outliers, a limit on either side) has a level of 2e-4
 units are reported if they are large enough to matter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 
@@ -30,9 +28,8 @@ from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_outpu
 from gyro_calibration.diagnosis.causes import sized_finding
 from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.gates import (
-    compare_headings, fit_line, identify_unit_factor, is_at_rest, is_implausible_factor,
-    model_scale_factor, reference_angle, reference_rate, resample_reference, select_reference,
-    spline_rate, UNIT_FACTORS)
+    fit_line, identify_unit_factor, is_at_rest, is_implausible_factor, model_scale_factor,
+    reference_rate, resample_reference, select_reference, UNIT_FACTORS)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps, encoder_step, find_codes, find_runs, QuantizationCodes, robust_deviation,
@@ -348,32 +345,21 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     log, notes = select_reference(log)
     resampled = resample_reference(log)
     output, rate = require_output(log), reference_rate(resampled)
-    has_output, heading = np.isfinite(output), resampled.reference_heading
-    if log.time is not None and log.reference_rate is None and heading is not None:
-        rate = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
+    has_output = np.isfinite(output)
     line = None if rate is None else fit_line(log.time, rate, output)
     units = []
     if rate is not None and line is not None:
-        # a factor in addition to the scale factor of the model
+        # a factor in addition to the scale factor of the model; one far from 1 fails a gate
         own = 1.0 if model is None else model_scale_factor(model, rate)
         ratio, deviation = line.factor / own, line.deviation / abs(own)
-        name = identify_unit_factor(ratio, deviation)
-        spans = ([] if name is None or log.time is None
-                 else compare_headings(log, reference_angle(log)))
-        best = max(spans, key=lambda each: each.coherence, default=None)
-        # Of a motion that is late, a rate shows less than its turns do: over spans, the headings
-        # may agree with 1 rather than with the factor.
-        if name is not None and (best is None or abs(best.factor - 1.0) >= abs(
-                best.factor - 1.0 / UNIT_FACTORS[name]) or abs(
-                best.factor - 1.0 / UNIT_FACTORS[name]) <= 5.0 * best.deviation):
-            is_plausible = not is_implausible_factor(ratio)
+        name = None if is_implausible_factor(ratio) else identify_unit_factor(ratio, deviation)
+        if name is not None:
             units = [sized_finding(
                 'unit_error', ratio, NORMAL_QUANTILE_975 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
-                ('scale_factor_error',) * is_plausible,
+                ['scale_factor_error'],
                 evidence=f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
-                f'{name} is {UNIT_FACTORS[name]:.5g}'
-                + '; a new model has it as a scale factor error' * is_plausible)]
+                f'{name} is {UNIT_FACTORS[name]:.5g}; a new model has it as a scale factor error')]
     if log.time is None:
         return DataQuality(tuple(units), notes, has_output)
     lost, remarks = _check_stamps(log.time, has_output)

@@ -15,12 +15,9 @@ The model gets effects, limits, values, covariance, noise and origin. The held-o
 part in the selection and fit of the causes that predict them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.causes import add_remedies, NOISE_NAMES
@@ -182,9 +179,8 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
     measure.
     """
     scale, limits = fit.scale_factor_error, RunLimits()
-    return fit.estimate_index(-1, 0) is not None and (
-        scale.value < -limits.max_scale_factor_error
-        or scale.deviation > limits.max_scale_deviation)
+    return (scale.value < -limits.max_scale_factor_error
+            or scale.deviation > limits.max_scale_deviation)
 
 
 # values
@@ -298,8 +294,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
                    for each, block in zip(replays, blocks))):
         return None
     reduced_search = restrict_search(
-        search, [drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
-        FALSE_ALARM_RATE)
+        search, [drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes)
     named = search_causes(reduced_search)
     straight, plain, extended = (
         replace(fit_causes(reduced_search.problem, some), lasting_only=True)

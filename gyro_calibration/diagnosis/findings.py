@@ -8,18 +8,27 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The results of a diagnosis as records, and as data for files."""
+"""
+The results of a diagnosis as records and as data for files, and the rules that they follow.
+
+A cause is selected if noise alone rarely shows as much. It is established if it also predicts
+stretches of the data that took no part in its fit; otherwise it is suspected. Alternatives that
+explain the data nearly as well form a set with it, each with its probability.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+import math
 from typing import Any, ClassVar, TypeAlias
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
+import numpy as np
+from scipy.stats import norm
 
 #: Is called with the share of the work done, None if unknown, and the step that begins; returns
 #: whether the time limit is near, so that the search ends and no gain is measured.
@@ -33,6 +42,41 @@ NOT_OFFERED = ('On the held-out parts, the errors of the extended model are larg
                'the model before; it is not offered.')
 #: Least probability that is stated; the assumptions on the noise do not justify smaller ones.
 MIN_PROBABILITY = 1e-4
+#: False-alarm rates of the search for causes, and of each value or noise figure.
+SEARCH_ALARM_RATE, VALUE_ALARM_RATE = 0.6 * FALSE_ALARM_RATE, 0.05 * FALSE_ALARM_RATE
+#: Ratio of the level at which a lasting cause is suspected to that at which it is established.
+SUSPECTED_RATE_FACTOR = 5.0
+#: Probability that an effect of the minimum detectable size is found.
+DETECTION_POWER = 0.95
+#: Least deficit in log-likelihood, relative to the best cause, of a cause that is ruled out (2.5
+#: sigma).
+RULED_OUT_DEFICIT = 3.2
+#: A cause is confirmed if its gain in log-likelihood on held-out stretches exceeds so many
+#: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
+#: same level, so that no single stretch confirms a cause.
+_LEVEL = 0.05
+MIN_PREDICTION_SIGMAS, _MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
+
+
+def detectable_sigmas(level: float) -> float:
+    """Return the size, in standard deviations, that is found at a two-sided level."""
+    return float(norm.isf(0.5 * level) + norm.ppf(DETECTION_POWER))
+
+
+def prediction_sigmas(gains: Array) -> float:
+    """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
+    if not np.sum(gains) > 0.0:
+        return 0.0
+    clipped = np.clip(gains, -_MAX_STRETCH_GAIN, _MAX_STRETCH_GAIN)
+    scatter = float(np.std(clipped, ddof=1)) * len(gains) ** 0.5
+    return float(np.sum(clipped)) / max(scatter, 1e-9)
+
+
+def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
+    """Return the probabilities of causes by their deficits in log-likelihood, largest first."""
+    weights = {name: math.exp(-min(max(lack, 0.0), 700.0)) for name, lack in deficits.items()}
+    return {name: max(weight / sum(weights.values()), MIN_PROBABILITY)
+            for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
 
 
 class _Record:
@@ -232,7 +276,6 @@ class Diagnosis(_Record):
     # noise that was found, and simulated; None for a model without noise
     noise_curve: Curve | None = None
     remarks: tuple[str, ...] = ()  # for people, one sentence each
-    false_alarm_rate: float = FALSE_ALARM_RATE  # per diagnosis
     logs: tuple[str, ...] = ()  # names of the files
     trace: Curve | None = None  # of the output over time, rad/s
     method: str = ''  # how it was computed, for people; empty for the method of logs in time
@@ -254,4 +297,4 @@ class Diagnosis(_Record):
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
         return {'schema': _SCHEMA, 'verdict': self.verdict,
-                'false_alarm_rate': self.false_alarm_rate, **super().to_dict()}
+                'false_alarm_rate': FALSE_ALARM_RATE, **super().to_dict()}

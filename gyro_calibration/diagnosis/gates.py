@@ -19,9 +19,7 @@ axis that tilts. A gate that fails is the only finding. The kind of the referenc
 errors exceed those of the gyro, decide how a log is diagnosed.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 from typing import NamedTuple
@@ -46,7 +44,6 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy import stats
 from scipy.interpolate import make_interp_spline
-from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
 _FACTORS = {'pi/180': DEGREE, '180/pi': 1.0 / DEGREE, '2': 2.0, '1/2': 0.5}
@@ -115,27 +112,17 @@ def reference_rate(log: Log) -> Array | None:
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         return log.reference_rate
     if (log.reference_heading is None or log.time is None
-            or np.isfinite(log.reference_heading).sum() < 2):
+            or len(log) < 6 or np.isfinite(log.reference_heading).sum() < 2):
         return None
-    known = np.isfinite(log.reference_heading)
-    # parabolas over 0.15 s; shorter ones would show the quantization of the heading
-    length = min(max(5, 2 * round(0.075 / float(np.median(np.diff(log.time)))) + 1),
-                 (len(known) - 1) // 2 * 2 + 1)
-    if length < 3:
-        return None
-    smooth = savgol_filter(bridge_gaps(log.reference_heading), length, 2)
-    return np.where(known, np.gradient(smooth, log.time), np.nan)
+    return np.where(np.isfinite(log.reference_heading),
+                    spline_rate(log.time, log.reference_heading), np.nan)
 
 
 def spline_rate(time: Array, heading: Array) -> Array:
     """Return the rate of a heading by a quintic spline, gaps interpolated, rad/s, shape (n,)."""
     known = np.isfinite(heading)
-    return heading_spline(time, np.interp(time, time[known], heading[known]))(time, 1)
-
-
-def heading_spline(time: Array, heading: Array) -> Callable[[Array, int], Array]:
-    """Return the quintic spline through a heading, by time and the order of its derivative."""
-    return make_interp_spline(time, heading, 5)
+    whole = np.interp(time, time[known], heading[known])
+    return np.asarray(make_interp_spline(time, whole, 5)(time, 1))
 
 
 def fit_line(time: Array | None, rate: Array, output: Array) -> _LineFit | None:
@@ -478,8 +465,9 @@ def examine_log(log: Log, model: GyroModel | None = None, is_command: bool = Fal
 
 
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
+    assert log.output is not None
     if log.time is None:
-        line = (None if log.reference_rate is None or log.output is None
+        line = (None if log.reference_rate is None
                 else fit_line(None, log.reference_rate, log.output))
         if line is not None:
             yield from _unit_gates(line.factor, line.deviation, log)
@@ -494,7 +482,7 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
             yield Gate('wrapped_heading', False, str(refusal).rpartition(':')[0],
                        'unwrap the reference heading (--unwrap)')
     reference = reference_angle(log)
-    if log.output is not None and not np.isfinite(log.output).any():
+    if not np.isfinite(log.output).any():
         yield Gate('motion', False, 'the output of the gyro has no numbers',
                    'check its column, and the line that it came by')
         return

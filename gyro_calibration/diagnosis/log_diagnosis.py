@@ -13,10 +13,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
@@ -28,16 +27,16 @@ from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
-    Cause, cause_finding, cause_parameters, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES,
-    REFERENCES, SINGLE_EVENT_REMEDY, slip_times, untestable_causes, value_finding)
+    Cause, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES, REFERENCES, slip_times,
+    untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, complete_diagnosis, drop_samples, extend_model, heading_contributions,
     heading_curve, heading_error_shares, is_scale_implausible, measure_gain,
     merge_self_calibration, unmergeable_causes)
 from gyro_calibration.diagnosis.findings import (
-    Diagnosis, Estimate, Finding, Gate, MIN_PROBABILITY, OnProgress, Reference, TIME_LIMIT_REMARK,
-    Unexplained)
+    DETECTION_POWER, Diagnosis, Estimate, Finding, Gate, MIN_PROBABILITY, OnProgress, Reference,
+    TIME_LIMIT_REMARK, Unexplained, VALUE_ALARM_RATE)
 from gyro_calibration.diagnosis.gates import (
     classify_reference, examine_log, is_at_rest, is_reference_limiting, is_sample_offset,
     mismatch_diagnosis)
@@ -53,13 +52,11 @@ from gyro_calibration.diagnosis.residuals import (
 from gyro_calibration.diagnosis.search import (
     confirm_causes, evidence_for, evidence_threshold, explain_selection, forget_searches, p_value,
     refine_shape, Search, search_causes, Selection, start_search)
-from gyro_calibration.diagnosis.significance import (
-    DETECTION_POWER, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.diagnosis.words import is_model_extended
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import mark_rows
-from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
+from gyro_calibration.model.effects import QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -138,10 +135,10 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
             f'the errors of the reference of {where} are larger than those of the gyro, and such '
             'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
     try:
-        found = (diagnose_by_noisy_reference(logs[0], references[0], model, FALSE_ALARM_RATE,
-                                             on_progress, instants[0])
+        found = (diagnose_by_noisy_reference(logs[0], references[0], model, on_progress,
+                                             instants[0])
                  if limiting_logs else _diagnose_by_exact_reference(
-                     logs, generator, model, FALSE_ALARM_RATE, names, on_progress, references,
+                     logs, generator, model, names, on_progress, references,
                      reference_kind == 'rate_command'))
     finally:
         forget_searches()
@@ -188,7 +185,7 @@ def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | No
 
 
 def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
-                                 model: GyroModel | None, rate: float, names: Sequence[str],
+                                 model: GyroModel | None, names: Sequence[str],
                                  on_progress: OnProgress, references: Sequence[Reference],
                                  is_command: bool) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
@@ -197,7 +194,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     on_progress(None, 'replay of the model')
     replays = [replay(log, clean.usable, generator, clean.heading_step, clean.output_step, model)
                for log, clean in zip(logs, quality)]
-    searched = _search_logs(logs, replays, rate, on_progress, is_command)
+    searched = _search_logs(logs, replays, on_progress, is_command)
     search = searched.search
     selection = confirm_causes(search, searched.causes)
     delays = [each.shapes[0] for each in selection.named if each.cause == 'time_offset']
@@ -205,7 +202,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         search = replace(search, problem=build_problem(
             [each.with_possible_lag(delays[0]) for each in search.problem.replays]))
     if searched.followed is not None and selection.unnamed and len(logs) == 1:
-        return _diagnose_by_spans(logs[0], searched, replays[0], references[0], model, rate,
+        return _diagnose_by_spans(logs[0], searched, replays[0], references[0], model,
                                   on_progress)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
@@ -216,7 +213,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     simulated = Noise() if model is None else model.noise
     noise = fit_noise_parameters(found, rounds)
     time_is_up = on_progress(None, 'cross-validation')
-    changed = [] if model is None else list(_model_value_findings(found, model, noise, rate))
+    changed = [] if model is None else list(_model_value_findings(found, model, noise))
     within = [(known, members) for known, members in zip(found.causes, selection.alternatives)
               if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
@@ -230,7 +227,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                 *searched.findings]
     # a motion that follows has noise of its own
     if model is not None and not searched.hidden:
-        findings += find_changed_figures(found, model, VALUE_ALARM_SHARE * rate, rounds).values()
+        findings += find_changed_figures(found, model, rounds).values()
     # without causes that the model has already and that cannot be merged with those
     inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
                      if out else found, lasting_only=True)
@@ -255,21 +252,20 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                          *heading_contributions(shown, 0, None if changed else plain)),
                      allan_curves(found, noise, simulated),
                      (*_remarks(quality, names, found, selection, out, model),
-                      *searched.remarks, *[TIME_LIMIT_REMARK] * bool(time_is_up)), rate,
+                      *searched.remarks, *[TIME_LIMIT_REMARK] * bool(time_is_up)),
                      heading_shares=of_heading,
                      reference=references[0] if len(logs) == 1 else None)
 
 
 def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: Reference,
-                       model: GyroModel | None, rate: float,
-                       on_progress: OnProgress) -> Diagnosis:
+                       model: GyroModel | None, on_progress: OnProgress) -> Diagnosis:
     """Diagnose a log by spans, if its motion has more of its own than a response to a command."""
     motion = searched.followed
     assert motion is not None and log.reference_rate is not None
     of_motion = np.where(motion.valid, log.reference_rate + motion.reference - given.reference,
                          np.nan)
     found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
-                                        rate, on_progress)
+                                        on_progress)
     # nor can a single event be told from what the motion has of its own
     hidden = {name: _HIDDEN_REASON
               for name in (*searched.hidden, 'bias_step', 'reference_slip') if name in CAUSES}
@@ -294,32 +290,31 @@ class _Searched:
     followed: Replay | None = None  # the first log, with the motion that follows
 
 
-def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], rate: float,
-                 on_progress: OnProgress, is_command: bool) -> _Searched:
+def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], on_progress: OnProgress,
+                 is_command: bool) -> _Searched:
     """Search for causes, given the motion that follows where a log follows its reference."""
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
     follows = follows_rate(replays) and (is_command or is_late(plain))
     if not follows:
-        replays = _drop_unknown_ends(plain, rate)
-        found = _search_replays(replays, rate, on_progress)
+        found = _search_replays(_drop_unknown_ends(plain), on_progress)
         replays = found.search.problem.replays
         if RESPONSE not in {each.cause for each in found.causes}:
             return found
     followed, lag = follow_reference(replays, follows)
     moved = fit_causes(build_problem(followed), [])
-    within = _find_settled(moved, rate) if follows and len(logs) == 1 else None
+    within = _find_settled(moved) if follows and len(logs) == 1 else None
     replays = followed if within is None else [drop_samples(followed[0], ~within)]
-    found = _search_replays(replays, rate, on_progress, {RESPONSE, *HIDDEN_CAUSES})
+    found = _search_replays(replays, on_progress, {RESPONSE, *HIDDEN_CAUSES})
     if follows:
         return replace(found, findings=lag, followed=followed[0],
                        remarks=[] if within is None else [_SETTLED_REMARK])
-    before, after = map(_residual_variance, (fit_causes(plain.problem, []), moved))
+    before, after = map(_residual_variance, (plain, moved))
     return replace(found, unexplained=[Unexplained(
         'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
 
 
-def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
+def _drop_unknown_ends(plain: RegressionFit) -> Sequence[Replay]:
     """Return the logs of a fit without samples of which a delay or lag hides the motion."""
     replays = plain.problem.replays
     delays = {0.1, -0.1, *filter(None, (each.delay for each in replays))}
@@ -327,7 +322,7 @@ def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
         *(('time_offset', each) for each in delays), ('bandwidth', 0.1))),
         key=lambda each: each[1])
     size = late.shapes[0]
-    if p_value(late.cause, likelihood - plain.log_likelihood) > rate:
+    if p_value(late.cause, likelihood - plain.log_likelihood) > FALSE_ALARM_RATE:
         return replays
     # a lag that begins with the log has decayed to less than 1 % after five time constants
     first, last = max(size, 0.0) * (5.0 if late.cause == 'bandwidth' else 1.0), max(-size, 0.0)
@@ -336,19 +331,19 @@ def _drop_unknown_ends(plain: RegressionFit, rate: float) -> Sequence[Replay]:
             for each, time in zip(replays, times)]
 
 
-def _search_replays(replays: Sequence[Replay], rate: float, on_progress: OnProgress,
+def _search_replays(replays: Sequence[Replay], on_progress: OnProgress,
                     without: Collection[str] = ()) -> _Searched:
     """Search for causes, some left out; again where noise is filtered."""
-    search = start_search(replays, SEARCH_ALARM_SHARE * rate, on_progress, without)
+    search = start_search(replays, on_progress, without)
     causes = search_causes(search)
     averaged = average_filtered_noise(fit_causes(search.problem, causes)).problem.replays
     if averaged is not search.problem.replays:
-        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress, without)
+        search = start_search(averaged, on_progress, without)
         causes = search_causes(search)
     return _Searched(search, causes, without)
 
 
-def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
+def _find_settled(fit: RegressionFit) -> Mask | None:
     """
     Return the samples in dwells of a motion if the residual is larger between them, or None.
 
@@ -372,7 +367,7 @@ def _find_settled(fit: RegressionFit, false_alarm_rate: float) -> Mask | None:
     if len(replay.shared_errors):
         steady = np.maximum(steady, replay.output_step ** 2 / 12.0)
     if (min(len(steady), len(between)) < MIN_STRETCHES or mannwhitneyu(
-            between, steady, alternative='greater').pvalue > false_alarm_rate):
+            between, steady, alternative='greater').pvalue > FALSE_ALARM_RATE):
         return None
     return within
 
@@ -383,15 +378,34 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
 
     A cause that is not significant where the noise has a random walk of any size may be that.
     """
-    walking = replace(search, problem=search.problem.with_random_walks())
-    for place, (causes, number, evidence, deficits) in enumerate(
-            explain_selection(search, selection)):
-        is_established = place < len(selection.named)
-        by_walk = is_established and p_value(
-            causes[number].cause, evidence_for(walking, causes, number)) >= search.rate
-        yield _cause_finding(search, fit if is_established else fit_causes(search.problem, causes),
-                             number, evidence, deficits, ['rate_random_walk'] * by_walk,
-                             is_established)
+    shapes, replays = search.problem.noise_shapes, fit.problem.replays
+    walking = replace(search, problem=search.problem.with_noises([
+        place for place, shape in enumerate(shapes[:len(shapes) - search.problem.stated_count])
+        if shape.walk_ratio]))
+    observed = observed_range(
+        [each.channels.rate for each in replays],
+        [each.channels.temperature for each in replays
+         if 'temperature' in common_channels(replays)], max(each.duration for each in replays))
+    for each in explain_selection(search, selection):
+        name, place, log_index = each.cause.cause, each.place, each.cause.log_index
+        confounders = []
+        if each.is_established:
+            if p_value(name, evidence_for(walking, each.fit.causes, place)) >= search.rate:
+                confounders.append('rate_random_walk')
+            each = replace(each, fit=fit)  # without structure that has no name
+        known = each.fit.shapes(place)
+        if name == 'time_offset':
+            (offset,) = known.values()
+            if is_sample_offset(offset.estimate, offset.deviation, replays[0].interval):
+                confounders.append('unit_error')
+        # the evidence of a size of n standard deviations is n² / 2
+        threshold = evidence_threshold(name, search.rate) + complexity_penalty(each.cause)
+        found = each.finding(
+            *each.fit.coefficients(place), known, observed,
+            math.sqrt(2.0 * max(threshold, 0.0)) + float(norm.ppf(DETECTION_POWER)),
+            float(replays[log_index or 0].channels.time[-1]), confounders)
+        yield (found if log_index is None or len(replays) == 1 or not found.evidence else
+               replace(found, evidence=f'in log {log_index + 1}, {found.evidence}'))
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
@@ -409,8 +423,8 @@ def _mean_bias_deviation(fit: RegressionFit, noise: Noise) -> float:
     return float(np.sqrt(np.mean(each) / len(each) + fit.bias_variance))
 
 
-def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
-                          false_alarm_rate: float) -> Iterator[Finding]:
+def _model_value_findings(fit: RegressionFit, model: GyroModel,
+                          noise: Noise) -> Iterator[Finding]:
     """Give bias and scale factor error as findings if they differ from those of the model."""
     own = {name: deviation for name, _, _, deviation in model.estimates()
            if math.isfinite(deviation)}
@@ -423,8 +437,7 @@ def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
             ('bias', bias, ()),
             ('scale_factor_error', fit.scale_factor_error, ('reference_scale',))):
         deviation = math.hypot(value.deviation, own.get(name, 0.0))
-        if found := value_finding(name, value.value, deviation, VALUE_ALARM_SHARE
-                                  * false_alarm_rate, confounders):
+        if found := value_finding(name, value.value, deviation, VALUE_ALARM_RATE, confounders):
             yield replace(found, evidence='it adds to the value of the model, '
                           f'{abs(value.value) / deviation:.3g} sigma from zero')
 
@@ -479,44 +492,6 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 
 
 # findings
-
-def _cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
-                   deficits: Mapping[str, float], confounders: Sequence[str] = (),
-                   is_established: bool = True) -> Finding:
-    """Return the finding of a cause with its evidence and the deficits of its alternatives."""
-    known, replays = fit.causes[cause_index], fit.problem.replays
-    name, effect = known.cause, CATALOGUE.get(known.cause)
-    names = ([(shape.name, shape.unit) for shape in effect.nonlinear_parameters]
-             if effect is not None else [('width', 's')])
-    shapes = {}
-    for number, value in fit.shapes(cause_index).items():
-        shape, unit = names[number]
-        shapes[shape] = Estimate.from_half_width(
-            value.value, NORMAL_QUANTILE_975 * value.deviation, unit)
-    fields: dict[str, Any] = {'remedy': SINGLE_EVENT_REMEDY if is_single_event(known) else ''}
-    if name == 'bias_step':
-        fields['where'] = (known.shapes[0],
-                           float(replays[known.log_index or 0].channels.time[-1]))
-    elif name == 'reference_slip':
-        fields['where'] = min(known.shapes[1:]), max(known.shapes[1:])
-        shapes |= slip_times(known.shapes[1:])
-    parameters = cause_parameters(name, *fit.coefficients(cause_index), shapes)
-    size = next(iter(parameters.values()))
-    is_sample = name == 'time_offset' and is_sample_offset(size.estimate, size.deviation,
-                                                           replays[0].interval)
-    # the evidence of a size of n standard deviations is n² / 2
-    threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
-    found = cause_finding(
-        name, parameters, p_value(name, evidence), deficits, is_established,
-        observed_range([each.channels.rate for each in replays],
-                       [each.channels.temperature for each in replays
-                        if 'temperature' in common_channels(replays)],
-                       max(each.duration for each in replays)),
-        math.sqrt(2.0 * max(threshold, 0.0)) + float(norm.ppf(DETECTION_POWER)),
-        [*confounders, *['unit_error'] * is_sample], **fields)
-    return (found if known.log_index is None or len(replays) == 1 or not found.evidence else
-            replace(found, evidence=f'in log {known.log_index + 1}, {found.evidence}'))
-
 
 def _unexplained_structures(search: Search, fit: RegressionFit,
                             unnamed: Sequence[Candidate]) -> list[Unexplained]:

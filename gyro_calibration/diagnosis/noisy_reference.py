@@ -11,48 +11,57 @@
 """
 The diagnosis of a log whose reference has errors of its own, such as a course over ground.
 
-Causes are searched for as beside an exact reference, under the noise of gyro and reference that is
-found with a column of each cause, and under any wander of the bias. The evidence is at most that
-by the scatter of stretches.
+Causes are searched for as beside an exact reference, but over spans, under the noise of gyro and
+reference that is found with a column of each cause, and under any wander of the bias.
+
+The score of a cause is also summed over stretches. Its variance is that by the noise or that by
+the scatter of the stretches, whichever is larger, and its distribution is Fisher's, with the
+effective number of stretches less that of the columns as the degrees of freedom. The evidence is
+at most that of this test.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 import math
 
 from gyro_calibration.calibration.heading_regression import (
-    fit_spans, MIN_STRETCHES, SpanFit, whiten_regression)
+    fit_spans, MIN_STRETCHES, SpanFit, whiten_regression, WhitenedRegression)
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
+from gyro_calibration.calibration.noise_grid import GridFit
 from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG, OwnInstants
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.spans import (
-    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM)
+    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
+    Spans)
 from gyro_calibration.diagnosis.candidates import (
-    indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
+    Candidate, indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
-    Cause, cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, sized_finding,
-    untestable_causes, value_finding)
+    Cause, CAUSES, sized_finding, untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_terms, gain_from_errors, heading_curve, heading_error_shares, HEADING_WINDOW,
     MAX_WINDOW_SHARE, previous_origins, window_changes)
 from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress, Reference,
-    TIME_LIMIT_REMARK)
-from gyro_calibration.diagnosis.regression import fit_causes, Value
+    Curve, detectable_sigmas, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress,
+    prediction_sigmas, Reference, SEARCH_ALARM_RATE, TIME_LIMIT_REMARK, VALUE_ALARM_RATE)
+from gyro_calibration.diagnosis.regression import (
+    column_evidence, fit_causes, group_columns, RegressionFit)
+from gyro_calibration.diagnosis.scans import best_steps, Scored
 from gyro_calibration.diagnosis.search import (
-    confirm_causes, explain_selection, p_value, Search, search_causes)
-from gyro_calibration.diagnosis.significance import (
-    detectable_sigmas, SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE)
-from gyro_calibration.diagnosis.span_problem import (
-    find_span_steps, span_candidate, SpanProblem)
+    confirm_causes, explain_selection, Search, search_causes, SelectedCause)
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as fisher
 
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
@@ -75,7 +84,7 @@ _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropp
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
-                                false_alarm_rate: float, on_progress: OnProgress,
+                                on_progress: OnProgress,
                                 instants: OwnInstants | None = None) -> Diagnosis:
     """
     Diagnose a log with a reference whose errors are larger than those of the gyro.
@@ -91,8 +100,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     if model is not None:
         cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
     plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior, instants))
-    extended, found = select_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
-                                    on_progress)
+    extended, found = select_causes(plain, SEARCH_ALARM_RATE, on_progress)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
     lasting_terms = [each for each in extended.causes if not each.is_single_event]
@@ -105,7 +113,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
         model_fit = plain
         if not plain.spans.treatment.is_fine:
             found = [replace(each, is_established=each.is_established
-                             and each.cause_term.is_single_event) for each in found]
+                             and _term_of(each.cause).is_single_event) for each in found]
             extended = fit_spans(plain.spans, events) if events else plain
         gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
@@ -115,11 +123,10 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
     of_heading = heading_error_shares([(parts, time)],
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
-    findings = [*_value_findings(extended, model, false_alarm_rate, reference),
-                *_reference_findings(extended, false_alarm_rate), *record.findings,
-                *(each for cause in found for each in [_cause_finding(
-                    cause, extended, VALUE_ALARM_SHARE * false_alarm_rate)]
-                  if not each.parameters[each.effect].contains_zero)]
+    findings = [*_value_findings(extended, model, reference), *_reference_findings(extended),
+                *record.findings, *(
+                    each for each in (_cause_finding(cause, extended) for cause in found)
+                    if not each.parameters[each.effect].contains_zero)]
     of_record = {each.effect for each in record.findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
@@ -145,14 +152,13 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                      _untestable_causes(plain), [curve], heading_curve(parts, time), None,
                      (*record.remarks, *_remarks(reference, extended, prior is not None),
                       *[TIME_LIMIT_REMARK] * bool(time_is_up)),
-                     false_alarm_rate, trace=trace,
-                     method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
+                     trace=trace, method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
                      reference=replace(reference, noise=noise), heading_shares=of_heading)
 
 
 # values
 
-def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: float,
+def _value_findings(fit: SpanFit, model: GyroModel | None,
                     reference: Reference) -> Iterator[Finding]:
     """Give delay, and with a model bias and scale factor error, if they are established."""
     own_clock = reference.kind not in _SAME_CLOCK
@@ -171,7 +177,7 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                             for each in (*shown, model.noise))
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         # a delay between two clocks is usual
-        level, is_usual = VALUE_ALARM_SHARE * false_alarm_rate, name == 'time_offset' and own_clock
+        is_usual = name == 'time_offset' and own_clock
         if name == 'time_offset':
             of_gyro = 0.0 < value < MAX_GYRO_LAG
             confounders = [other for other, might in (('bandwidth', of_gyro), ('clock_rate', True))
@@ -179,20 +185,20 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
             if own_clock and not of_gyro:
                 known['cause'] = 'The gyro has a time offset from its reference.'
         if found := value_finding(name, value, math.sqrt(variance),
-                                  false_alarm_rate if is_usual else level, confounders,
+                                  FALSE_ALARM_RATE if is_usual else VALUE_ALARM_RATE, confounders,
                                   float(fit.freedom[place]),
                                   NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place],
                                   evidence=f'evidence from {effective:.0f} stretches', **known):
             yield found
 
 
-def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
+def _reference_findings(fit: SpanFit) -> Iterator[Finding]:
     """Give the misalignment, and the drift of a reference against the rests in which it stands."""
     if MISALIGNMENT_TERM in fit.causes:
         name, places = MISALIGNMENT_TERM.cause, fit.value_slice(MISALIGNMENT_TERM)
         angle, half, chance = oblique_angle(fit.values[places], fit.normal_covariance[
             places, places])
-        if chance < false_alarm_rate:
+        if chance < FALSE_ALARM_RATE:
             yield sized_finding(name, angle, half, max(chance, MIN_PROBABILITY),
                                 remedy=MISALIGNMENT_REMEDY)
     name = 'reference_drift'
@@ -204,7 +210,7 @@ def _reference_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Findi
     place = fit.value_slice(CauseTerm(name)).start
     if found := value_finding(
             name, float(fit.values[place]), math.sqrt(fit.covariance[place, place]),
-            false_alarm_rate, ['vibration_rectification'], float(fit.freedom[place]),
+            FALSE_ALARM_RATE, ['vibration_rectification'], float(fit.freedom[place]),
             evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias'):
         yield found
 
@@ -224,30 +230,22 @@ def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
     return bool(abs(values[place] - left) < 3.0 * np.linalg.norm(inverse[place]))
 
 
-def _cause_finding(found: FoundCause, extended: SpanFit, level: float) -> Finding:
+def _cause_finding(found: SelectedCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
-    term, spans = found.cause_term, extended.spans
+    term, spans = _term_of(found.cause), extended.spans
     fit = (extended if found.is_established
            else fit_spans(spans, [*extended.causes, term]))
-    places, effect, shapes = fit.value_slice(term), CATALOGUE.get(term.cause), {}
+    places, shapes = fit.value_slice(term), found.fit.shapes(found.place)
     values, covariance = fit.values[places], fit.normal_covariance[places, places]
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
         values, covariance = values[1:], covariance[1:, 1:]
-    elif found.shape is not None and effect is not None:
-        shape, = effect.nonlinear_parameters
-        shapes[shape.name] = Estimate.from_half_width(
-            term.shapes[0], NORMAL_QUANTILE_975 * found.shape.deviation, shape.unit)
-    log = spans.log
-    return cause_finding(
-        term.cause, cause_parameters(term.cause, values, covariance, shapes), found.p_value,
-        found.deficits, found.is_established, observed_range(
-            [np.asarray(spans.channels.rate)], [each for each in [log.temperature]
-                                                if each is not None], float(spans.time[-1])),
-        detectable_sigmas(level),
-        where=(term.shapes[0], float(spans.time[-1])) if term.is_single_event else None,
-        remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
+    end, temperature = float(spans.time[-1]), spans.log.temperature
+    observed = observed_range([np.asarray(spans.channels.rate)],
+                              [] if temperature is None else [temperature], end)
+    return found.finding(values, covariance, shapes, observed,
+                         detectable_sigmas(VALUE_ALARM_RATE), end)
 
 
 def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
@@ -414,19 +412,175 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
                   simulated=measured - before))
 
 
+# the log as spans
+
+#: Sizes of each part of the wander of the bias, and times of a step, that are tried.
+_SIZES, _STEP_TIMES = 8, 400
+
+
+@dataclass(frozen=True, eq=False)
+class SpanProblem:
+    """A log as spans, as a `RegressionProblem`, under each size of a wander of the bias."""
+
+    spans: Spans  # with the rate as corrected so far
+    noise: GridFit  # of gyro and reference, which whitens
+    data: WhitenedRegression  # with the prior of the values; its last w rows are of the wander
+    base: Array  # rows of what is always fitted, and last of the observations
+    wander: Array  # columns of the wandering bias, whitened, shape (w, m)
+    deviations: Array  # of the wander, under each noise, shape (g, w)
+    cosine_count: int  # number of the columns that are cosines
+
+    @classmethod
+    def of(cls, fit: SpanFit, noise_fit: SpanFit) -> SpanProblem:
+        """Return the problem of a log under the noise of a fit, with wanders of all sizes."""
+        waves, parts = fit.spans.bias_wander()
+        axes = [np.geomspace(*part.size_range, 1 if len({*part.size_range}) == 1 else _SIZES)
+                for part in parts]
+        variances = np.array([*product(*axes)]) ** 2 @ np.array([each.variance for each in parts])
+        data, count = whiten_regression(fit, (), noise_fit), waves.shape[1]
+        rows = np.column_stack([data.design, data.observed])[:-count].T
+        return cls(fit.spans, noise_fit.fit, data, np.delete(rows, slice(-count - 1, -1), axis=0),
+                   rows[-count - 1:-1], np.sqrt(variances),
+                   int(np.count_nonzero(parts[0].variance)))
+
+    def whiten(self, columns: Array) -> Array:
+        """Return columns, shape (n + r, k), in units of the noise, shape (k, m)."""
+        white = self.noise.whiten(columns).T
+        return np.pad(white, ((0, 0), (0, self.wander.shape[1] - white.shape[1])))
+
+    @cached_property
+    def _scaled(self) -> Array:
+        """Return identity and products of the wander in its deviations, shape (g, w, w)."""
+        gram = self.wander @ self.wander.T
+        return np.eye(len(gram)) + self.deviations[:, :, None] * gram * self.deviations[:, None]
+
+    @cached_property
+    def _reduction(self) -> Array:
+        """Return the matrices by which the wander reduces products, shape (g, w, w)."""
+        return np.asarray(self.deviations[:, :, None] * np.linalg.inv(self._scaled)
+                          * self.deviations[:, None])
+
+    # as of `RegressionProblem`
+
+    @cached_property
+    def log_determinants(self) -> Array:
+        return np.linalg.slogdet(self._scaled)[1]
+
+    @property
+    def durations(self) -> list[float]:
+        return [float(np.ptp(self.spans.time))]
+
+    def distorted(self, causes: Sequence[Candidate]) -> tuple[Spans, ...]:
+        return (self.spans,)
+
+    def base_rows(self, logs: tuple[Spans, ...]) -> Array:
+        return self.base
+
+    def rows(self, candidate: Candidate, logs: tuple[Spans, ...]) -> Array:
+        return self.whiten(np.transpose(candidate.columns(self.spans)))
+
+    def products(self, one: Array, other: Array) -> Array:
+        of_one, of_other = (each @ self.wander.T for each in (one, other))
+        return one @ np.swapaxes(other, -1, -2) - np.einsum(
+            '...rw,gwv,...sv->g...rs', of_one, self._reduction, of_other, optimize=True)
+
+    def with_noises(self, kept: list[int]) -> SpanProblem:
+        return replace(self, deviations=self.deviations[kept])
+
+    def _with_wander(self, rows: Array, noise: int) -> tuple[Array, Array]:
+        """Return rows, shape (k, m), and the wander with its prior under a noise, (w, m + w)."""
+        prior = np.diag(1.0 / self.deviations[noise])
+        return np.pad(rows, ((0, 0), (0, len(prior)))), np.hstack([self.wander, prior])
+
+    def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
+                       known: Candidate) -> Array | None:
+        # all values are fitted without each fifth of the log, or every fifth stretch, where slow
+        # causes are also predicted by the wander of neighbouring ones; errors of a course are
+        # correlated, so that distant stretches must be predicted
+        if known.log_index is not None:
+            return None
+        stretch, count = self.data.clusters[0], self.data.stretch_count
+        gains = []
+        for fold in [stretch * 5 // count, stretch % 5][:1 + self.spans.treatment.is_fine]:
+            losses = []
+            for fit in (rest, full):
+                rows, wander = self._with_wander(fit.rows, full.best_noise)
+                design, observed = np.vstack([rows[:-1], wander]).T, rows[-1]
+                left: Array = np.zeros(len(observed))
+                for held in (np.equal(fold, part) & (stretch < count) for part in range(5)):
+                    values = np.linalg.lstsq(design[~held], observed[~held], rcond=None)[0]
+                    left[held] = observed[held] - design[held] @ values
+                losses.append(0.5 * np.bincount(stretch, left ** 2)[:count])
+            gains.append(losses[0] - losses[1])
+        return max(gains, key=prediction_sigmas)
+
+    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
+        # the noise without a slow cause has its wander
+        best, count = fit_causes(self, [*rest.causes, candidate]).best_noise, len(self.wander)
+        rows, wander = self._with_wander(np.vstack([
+            rest.columns, self.rows(candidate, rest.distorted), rest.rows[-1]]), best)
+        given, sought = np.split(rows, [len(rest.columns)])
+        base, _ = np.linalg.qr(np.vstack([given, wander]).T)
+        left = sought.T - base @ (base.T @ sought.T)
+        # along the motion they are similar to errors of an encoder that repeat with its position
+        along = CAUSES[candidate.cause].along in ('rate', 'heading')
+        chance, ratio = _cluster_robust_chance(
+            left[:, :-1], left[:, -1], self.data.clusters[:None if along else 1],
+            slice(-count, self.cosine_count - count or None))
+        return 0.5 * float(chi2.isf(max(chance, 1e-300), 1)) - candidate.penalty, ratio
+
+
+def span_candidate(name: str, *shapes: float) -> Candidate:
+    """Return a cause for the search, whose columns are those of spans."""
+    def columns(spans: Spans, *sizes: float) -> Sequence[Array]:
+        found: Array = (spans.step_columns(np.array(sizes)) if name == 'bias_step'
+                        else spans.cause_columns(CauseTerm(name, sizes)))
+        return [*found.T]
+
+    return Candidate(name, shapes, columns,
+                     amplitude=1.0 if name == SINE_RESPONSE.name else None)
+
+
+def find_span_steps(fit: RegressionFit) -> list[Scored]:
+    """Return the clearest step of the bias of a log as spans."""
+    problem = fit.problem
+    times = problem.spans.time[2:-2]
+    times = times[::math.ceil(len(times) / _STEP_TIMES)]
+    evidence = column_evidence(fit, group_columns(
+        problem, problem.whiten(problem.spans.step_columns(times)),
+        np.arange(len(times))[:, None].tolist()))
+    return best_steps([(times, evidence)], span_candidate)
+
+
+def _cluster_robust_chance(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
+                           cosines: slice) -> tuple[float, float]:
+    """
+    Return the largest p-value of columns by any of the clusterings, and the ratio of variances.
+
+    It is the variance by the scatter of the clusters over that by the noise, at least 1. Evidence
+    against a wander of the bias counts as that of all its cosines, since all of them show its
+    size, although a slow cause is in few of them. Fewer clusters than `MIN_STRETCHES` show none.
+    """
+    information = x.T @ x
+    size = np.sqrt(np.diag(information)) + 1e-300
+    # by the residual with the candidate: scores that contain the effect would overestimate scatter
+    off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
+    count, found = x.shape[1], []
+    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size ** 2)))
+    square = float(np.sum((root @ x.T @ residual) ** 2))
+    for cluster in clusters:
+        scores = np.array([np.bincount(cluster, part * off) for part in x.T])
+        shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
+        shares[cosines] = shares[cosines].mean()
+        effective = float(shares.sum() ** 2 / (shares ** 2).sum())
+        scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
+        ratio = max(float(np.linalg.eigvalsh(root @ scatter @ root.T).max()), 1.0)
+        found.append((1.0 if effective < MIN_STRETCHES else float(fisher.sf(
+            square / ratio / count, count, max(effective - count, 1.0))), ratio))
+    return max(found)
+
+
 # the search
-
-@dataclass(frozen=True)
-class FoundCause:
-    """A cause that the search found."""
-
-    cause_term: CauseTerm  # the cause
-    p_value: float  # that noise alone shows as much
-    is_established: bool  # whether it is confirmed
-    # what it and its alternatives lack in log-likelihood, the best first
-    deficits: Mapping[str, float]
-    shape: Value | None = None  # None if no shape was fitted
-
 
 def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
     """
@@ -454,8 +608,12 @@ def _follows_the_rate(cause: str) -> bool:
             and 'rate' in effect.inputs)
 
 
+def _term_of(cause: Candidate) -> CauseTerm:
+    return CauseTerm(cause.cause, cause.shapes)
+
+
 def select_causes(fit: SpanFit, false_alarm_rate: float,
-                  on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
+                  on_progress: OnProgress) -> tuple[SpanFit, list[SelectedCause]]:
     """Search for causes, and fit again with those that are established."""
     terms = _propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
@@ -470,27 +628,20 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
                         {'bias_step': find_span_steps}, on_progress=on_progress)
         causes = search_causes(search)
         # once more, at the rate without these causes: similar ones differ in higher order
-        of_rate = [CauseTerm(each.cause, each.shapes) for each in causes
+        of_rate = [_term_of(each) for each in causes
                    if _follows_the_rate(each.cause) and each.cause != 'clock_rate']
         if not of_rate:
             break
         at = fit_spans(fit.spans, of_rate)
-    found: list[FoundCause] = []
-    selection = confirm_causes(search, causes)
-    for causes, place, evidence, deficits in explain_selection(search, selection):
-        known = causes[place]
-        found.append(FoundCause(
-            CauseTerm(known.cause, known.shapes), p_value(known.cause, evidence),
-            len(found) < len(selection.named), deficits,
-            next(iter(fit_causes(search.problem, causes).shapes(place).values()), None)))
-    while established := [each.cause_term for each in found if each.is_established]:
+    found = [*explain_selection(search, confirm_causes(search, causes))]
+    while established := [_term_of(each.cause) for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)
         worst = max(established,
                     key=lambda each: _implausibility(extended, each, false_alarm_rate))
         if _implausibility(extended, worst, false_alarm_rate) < 1.0:
             return extended, found
-        found = [replace(each, is_established=each.is_established and each.cause_term != worst)
-                 for each in found]
+        found = [replace(each, is_established=each.is_established
+                         and _term_of(each.cause) != worst) for each in found]
     return fit, found
 
 

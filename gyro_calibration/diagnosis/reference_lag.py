@@ -17,8 +17,6 @@ any other such response would explain. A delay, a lag or a clock rate of the gyr
 then, and neither can a slip.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 import math
@@ -111,7 +109,8 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Arr
     plain = replace(replay, command=replay.channels.rate)
     grid, command = plain.held_command
     limits = _likely_limits(plain)
-    limited = plain.with_command(_limit_acceleration(command, plain.interval, limits)[grid])
+    slower = _limit_acceleration(command, plain.interval, limits)[grid]
+    limited = replace(plain.with_motion(slower - plain.channels.rate), command=slower)
     # at first, and after a hole, the motion follows commands that are not in the log
     time = plain.channels.time
     known = time[np.isfinite(plain.reference)]

@@ -30,8 +30,9 @@ import math
 from typing import Any
 
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, candidate_transforms, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK,
-    MAX_STEP_TIMES, smooth_shapes, with_shape)
+    Candidate, fitted_shape_indices, is_named, MAX_STEP_TIME_LACK, MAX_STEP_TIMES, smooth_shapes,
+    with_shape)
+from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.replay import (
     band_starts, coefficient_angles, inverse_cosine_transform, noise_grid, NoiseShape, Replay,
     stated_shapes)
@@ -68,14 +69,6 @@ class RegressionProblem:
     log_determinants: Array  # of the relative variances, and of the prior probability, shape (g,)
     stated_count: int = 0  # number of the last of the noises, which a model states
 
-    def with_random_walks(self) -> RegressionProblem:
-        """Return the problem with the noises that have a random walk, and are not stated."""
-        kept = [place for place, shape in enumerate(
-            self.noise_shapes[:len(self.noise_shapes) - self.stated_count]) if shape.walk_ratio]
-        return replace(self, noise_shapes=tuple(self.noise_shapes[place] for place in kept),
-                       weights=self.weights[kept], log_determinants=self.log_determinants[kept],
-                       stated_count=0)
-
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
         parts = [coefficient_angles(each.point_count) for each in self.replays]
@@ -91,12 +84,6 @@ class RegressionProblem:
         """Return the coefficients of each log."""
         return np.split(coefficients,
                         np.cumsum([each.point_count - 1 for each in self.replays])[:-1])
-
-    def band_products(self, one: Array, other: Array) -> Array:
-        """Return the products of rows (..., r, m) and (..., s, m) in each band, (b, ..., r, s)."""
-        edges = [*self.band_starts, one.shape[-1]]
-        return np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
-                         for begin, end in zip(edges, edges[1:])])
 
     # what a search needs
 
@@ -121,12 +108,16 @@ class RegressionProblem:
 
     def products(self, one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
-        return np.tensordot(self.weights, self.band_products(one, other), 1)
+        edges = [*self.band_starts, one.shape[-1]]
+        of_bands = np.array([one[..., begin:end] @ np.swapaxes(other[..., begin:end], -1, -2)
+                             for begin, end in zip(edges, edges[1:])])
+        return np.tensordot(self.weights, of_bands, 1)
 
-    def with_white_noise(self) -> RegressionProblem:
-        """Return the problem without a wander of the bias."""
-        return replace(self, noise_shapes=self.noise_shapes[:1], weights=self.weights[:1],
-                       log_determinants=self.log_determinants[:1])
+    def with_noises(self, kept: list[int]) -> RegressionProblem:
+        """Return the problem with some of the noises, none of which a model states."""
+        return replace(self, noise_shapes=tuple(self.noise_shapes[place] for place in kept),
+                       weights=self.weights[kept], log_determinants=self.log_determinants[kept],
+                       stated_count=0)
 
     def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
                        known: Candidate) -> Array | None:
@@ -311,7 +302,7 @@ class RegressionFit:
         probable = self.noise_probability
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
-        covariance = np.linalg.inv(self.information[kept])
+        covariance = self.inverse_information[kept]
         values = np.einsum('gpq,gq->gp', covariance, self.scores[kept])
         mean = weights @ values
         variances = weights * self.residual_squares[kept] / self.degrees_of_freedom
@@ -383,12 +374,18 @@ class RegressionFit:
         values, covariance = self.estimates
         return np.append(values, 0.0)[ranks], np.pad(covariance, (0, 1))[np.ix_(ranks, ranks)]
 
-    def shapes(self, cause_index: int) -> dict[int, Value]:
-        """Return the fitted shapes of a cause, by their places."""
-        candidate = self.causes[cause_index]
-        return {place: replace(self._column_value(cause_index, -1 - place),
-                               value=candidate.shapes[place])
-                for place in fitted_shape_indices(candidate)}
+    def shapes(self, cause_index: int) -> dict[str, Estimate]:
+        """Return the fitted shapes of a named cause, by their names."""
+        known, found = self.causes[cause_index], {}
+        effect = CATALOGUE.get(known.cause)
+        names = ([('width', 's')] if effect is None else
+                 [(shape.name, shape.unit) for shape in effect.nonlinear_parameters])
+        for place in fitted_shape_indices(known):
+            name, unit = names[place]
+            found[name] = Estimate.from_half_width(
+                known.shapes[place], NORMAL_QUANTILE_975 * self._column_value(
+                    cause_index, -1 - place).deviation, unit)
+        return found
 
     # contributions to the output
 
@@ -474,8 +471,13 @@ def _with_distorted_rate(replay: Replay,
     return before.with_rate(distortion(before.channels.rate, before.channels.time, *shapes))
 
 
-#: Transforms of the same columns are needed in many fits, as in a search for a shape.
-_transforms = lru_cache(maxsize=32)(candidate_transforms)
+@lru_cache(maxsize=32)  # they are needed in many fits, as in a search for a shape
+def _transforms(candidate: Candidate, replays: tuple[Replay, ...]) -> Array:
+    """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
+    return np.concatenate([
+        np.array([each.transform_samples(value) if candidate.log_index in (None, run)
+                  else np.zeros(each.point_count - 1) for value in candidate.columns(each)])
+        for run, each in enumerate(replays)], axis=1)
 
 
 @lru_cache(maxsize=16)
@@ -530,8 +532,7 @@ def _fit_causes(problem: Any, causes: tuple[Candidate, ...]) -> RegressionFit:
     # of what the values for one noise leave, as the difference of the whole sums is rounded
     left = np.append(-np.linalg.solve(information[0], scores[0]), 1.0) @ rows
     pull, squares = (problem.products(each, left[None]) for each in (rows[:-1], left[None]))
-    squares = squares[:, 0, 0] - np.einsum(
-        'gq,gq->g', np.linalg.solve(information, pull)[:, :, 0], pull[:, :, 0])
+    squares = squares[:, 0, 0] - (pull * np.linalg.solve(information, pull)).sum(axis=(1, 2))
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
     likelihood = -0.5 * ((len(left) - len(rows) + 1) * np.log(squares) + determinants)
     return RegressionFit(problem, distorted, causes, rows,
@@ -600,20 +601,16 @@ def group_columns(problem: Any, columns: Array,
 
 def column_evidence(fit: RegressionFit, groups: ColumnGroups) -> Array:
     """Return the evidence of groups of columns given a fit, -inf if unidentifiable."""
-    # products, under each noise, of what the fit leaves of the columns: with the residual, and own
+    # products, under each noise, of what the fit leaves of the columns, with the residual
     crossing = fit.problem.products(groups.columns, fit.rows)
     crossing, pull = crossing[:, :, :-1], crossing[:, :, -1]
     towards = crossing @ fit.inverse_information
     pull = pull - np.einsum('gpq,gq->gp', towards, fit.scores)
-    own = np.einsum('gpq,gpq->gp', crossing, towards)
     squares, likelihood = fit.residual_squares[:, None], fit.noise_log_likelihood[:, None]
     found = np.full(len(groups.groups), -np.inf)
     for places, members, whole in groups.of_width:
-        width, left = members.shape[1], whole.copy()
-        for row, column in np.ndindex(width, width):
-            one, other = members[:, row], members[:, column]
-            left[:, :, row, column] -= (own[:, one] if row == column else np.einsum(
-                'gnq,gnq->gn', crossing[:, one], towards[:, other]))
+        width = members.shape[1]
+        left = whole - crossing[:, members] @ np.swapaxes(towards[:, members], -1, -2)
         of_left, of_whole = (np.einsum('gnpp->gnp', each) for each in (left, whole))
         shown = (of_left > MIN_INDEPENDENT_SHARE * of_whole).all(axis=(0, 2))
         # columns that depend on each other count as one

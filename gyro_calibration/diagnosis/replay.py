@@ -28,8 +28,7 @@ import math
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.calibration.spans import COURSE_TREATMENT, HEADING_TREATMENT, lag_deviation
 from gyro_calibration.diagnosis.gates import (
-    heading_spline, MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference,
-    spline_rate)
+    MIN_SAMPLES, MIN_VALID_SHARE, resample_reference, select_reference, spline_rate)
 from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
 from gyro_calibration.logs.quality import find_runs, white_noise_deviation
@@ -42,6 +41,7 @@ from gyro_calibration.model.noise import MARKOV_FLOOR_RATIO, Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
+from scipy.interpolate import make_interp_spline
 from scipy.linalg import toeplitz
 from scipy.ndimage import binary_opening, maximum_filter1d
 from scipy.optimize import minimize
@@ -303,10 +303,6 @@ class Replay:
         time = self.channels.time
         grid = np.rint((time - time[0]) / self.interval).astype(int)
         return grid, self.command[np.searchsorted(grid, np.arange(grid[-1] + 1), 'right') - 1]
-
-    def with_command(self, command: Array) -> Replay:
-        """Return the log with another command, rad/s, shape (n,), as its reference."""
-        return replace(self.with_motion(command - self.channels.rate), command=command)
 
     def response_variance(self) -> Array:
         """Return the variance of coefficients that weights the response, shape (points - 1,)."""
@@ -609,7 +605,8 @@ def _heading_rates(time: Array, heading: Array) -> tuple[Array, Array]:
     for part in find_runs(~long):  # a line over a gap bends the spline beside it
         at = time[part][~lost[part]]
         if len(at) > 2 * _GAP_MARGIN_SAMPLES:
-            rate[part] = heading_spline(at, heading[part][~lost[part]])(time[part], 1)
+            spline = make_interp_spline(at, heading[part][~lost[part]], 5)
+            rate[part] = spline(time[part], 1)
     # a spline errs at the ends of a log as it does at a gap
     near = maximum_filter1d(lost, 3) | maximum_filter1d(
         np.pad(long, 1, constant_values=True), 2 * _GAP_MARGIN_SAMPLES + 1)[1:-1]

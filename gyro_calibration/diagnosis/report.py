@@ -30,6 +30,7 @@ from typing import Any
 import warnings
 
 import gyro_calibration
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Curve, Diagnosis, Estimate
 from gyro_calibration.diagnosis.words import (
     as_sentence, cause_paragraphs, cause_title, display_unit, format_amount, format_number,
@@ -153,7 +154,7 @@ def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
         element('pre', element('code', format_model(diagnosis.model)), tabindex='0',
                 class_='scroll')]
     logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
-    method = _METHOD_TEXT.format(logs=logs, share=f'{100.0 * diagnosis.false_alarm_rate:.2g} %')
+    method = _METHOD_TEXT.format(logs=logs, share=f'{100.0 * FALSE_ALARM_RATE:.2g} %')
     yield 'How this was computed', [
         element('p', as_sentence(diagnosis.method) or method),
         element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')]

@@ -26,11 +26,11 @@ from gyro_calibration.allan.deviation import allan_deviation
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding, NOISE_NAMES
-from gyro_calibration.diagnosis.findings import Curve, Estimate, Finding
+from gyro_calibration.diagnosis.findings import (
+    Curve, Estimate, Finding, RULED_OUT_DEFICIT, VALUE_ALARM_RATE)
 from gyro_calibration.diagnosis.regression import RegressionFit, VALUE_PENALTY
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles, cosine_transform, NoiseShape, Replay, spline_derivative_gain)
-from gyro_calibration.diagnosis.significance import RULED_OUT_DEFICIT
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
@@ -141,7 +141,7 @@ def fit_noise_parameters(fit: RegressionFit, is_rounding_modelled: bool = False)
                     for place, name in enumerate(NOISE_NAMES)})
 
 
-def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
+def find_changed_figures(fit: RegressionFit, model: GyroModel,
                          is_rounding_modelled: bool) -> dict[str, Finding]:
     """
     Find the noise figures that differ from those of a model, one by one, the clearest first.
@@ -162,15 +162,15 @@ def find_changed_figures(fit: RegressionFit, model: GyroModel, level: float,
         limits[place] = 2.0 * math.log(max(low, 1e-12)), 2.0 * math.log(max(high, 1e-12))
     if any(each.heading_step for each in fit.problem.replays):
         del limits[0]
-    found = _changed_figures(bands, limits, level, expected)
+    found = _changed_figures(bands, limits, expected)
     if not is_rounding_modelled and bands.known_variance.any():
         other = _changed_figures(replace(bands, known_variance=0.0 * bands.known_variance), limits,
-                                 level, expected)
+                                 expected)
         found = {name: each for name, each in other.items() if name in found}
     return found
 
 
-def _changed_figures(bands: BandEnergies, limits: Limits, level: float,
+def _changed_figures(bands: BandEnergies, limits: Limits,
                      expected: Noise) -> dict[str, Finding]:
     kinds = [bands]
     for own in bands.markov_variances.T:
@@ -195,12 +195,12 @@ def _changed_figures(bands: BandEnergies, limits: Limits, level: float,
     changed: frozenset[int] = frozenset()
     while more := limits.keys() - changed:
         best = min(more, key=lambda place: chance(changed | {place}, place))
-        if chance(changed | {best}, best) >= level:
+        if chance(changed | {best}, best) >= VALUE_ALARM_RATE:
             break
         changed |= {best}
     found = {}
     for place in changed:
-        if (p_value := chance(changed, place)) < level:
+        if (p_value := chance(changed, place)) < VALUE_ALARM_RATE:
             cost, kind, figures = likeliest(changed)
             others = (NOISE_NAMES[other] for other in sorted(limits.keys() - changed)
                       if likeliest(changed - {place} | {other})[0] - cost

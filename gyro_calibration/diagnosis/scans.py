@@ -14,8 +14,6 @@ Scans of logs for single events: tones at all frequencies, and steps and slips a
 Each gives candidates with their evidence, and with a penalty for the places where they may be.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 import math

@@ -17,8 +17,6 @@ causes would explain. A cause that is selected is confirmed if it predicts stret
 that are held out, and if the interval of its size excludes 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -27,20 +25,21 @@ import math
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
+from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
     Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
-from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.findings import OnProgress
+from gyro_calibration.diagnosis.causes import (
+    cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, slip_times)
+from gyro_calibration.diagnosis.findings import (
+    Estimate, Finding, MIN_PREDICTION_SIGMAS, OnProgress, prediction_sigmas, RULED_OUT_DEFICIT,
+    SEARCH_ALARM_RATE, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.diagnosis.regression import (
     build_problem, column_evidence, ColumnGroups, complexity_penalty, fit_causes, forget_fits,
-    group_columns,
-    likelihood_with, RegressionFit, VALUE_PENALTY)
+    group_columns, is_single_event, likelihood_with, RegressionFit, VALUE_PENALTY)
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.scans import (
     find_slips, find_steps, find_tones, MAX_PER_LOG, Scored)
-from gyro_calibration.diagnosis.significance import (
-    MIN_PREDICTION_SIGMAS, prediction_sigmas, RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -110,7 +109,7 @@ def _candidate_columns(problem: Any, candidates: tuple[Candidate, ...],
         range(end - len(part), end) for end, part in zip(ends, parts)])
 
 
-def start_search(replays: Sequence[Replay], rate: float = 0.006,
+def start_search(replays: Sequence[Replay],
                  on_progress: OnProgress = lambda share, words: None,
                  without: Collection[str] = ()) -> Search:
     """Set up a search: candidates, some causes left out, and noises."""
@@ -124,17 +123,17 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
                           'check columns and units')
     scans = {'bias_step': find_steps, 'interference_tone': find_tones,
              'reference_slip': find_slips}
-    search = Search(problem, found, rate / len(places), on_progress=on_progress, scans={
-        cause: scan for cause, scan in scans.items() if cause not in without})
+    search = Search(problem, found, SEARCH_ALARM_RATE / len(places), {
+        cause: scan for cause, scan in scans.items() if cause not in without},
+        on_progress=on_progress)
     shown = search.candidate_evidence(fit)
     return replace(search, unidentifiable=frozenset(
         cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
 
 
-def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
-                    rate: float) -> Search:
-    """Return a silent search for some causes in other parts of the logs, at another rate."""
-    return replace(search, problem=build_problem(replays), rate=rate,
+def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str]) -> Search:
+    """Return a silent search for some causes, found already, in other parts of the logs."""
+    return replace(search, problem=build_problem(replays), rate=FALSE_ALARM_RATE,
                    on_progress=lambda share, words: None,
                    scans={each: scan for each, scan in search.scans.items() if each in causes},
                    candidates=tuple(each for each in search.candidates if each.cause in causes))
@@ -296,7 +295,7 @@ def _with_several(search: Search, causes: Causes) -> Causes:
     problem, grown, tried = search.problem, causes, []
     white = replace(
         search, scans={}, candidates=tuple(filter(_is_lasting, search.candidates)),
-        problem=problem.with_white_noise())
+        problem=problem.with_noises([0]))  # white
     while len(grown) < MAX_CAUSES:
         step, evidence = max(search.scans['bias_step'](fit_causes(white.problem, grown)),
                              key=lambda each: each[1] - each[0].penalty)
@@ -461,20 +460,54 @@ def confirm_causes(search: Search, causes: Causes) -> Selection:
     return Selection(named, alternatives, unnamed, suspected)
 
 
-def explain_selection(search: Search, selection: Selection
-                      ) -> Iterator[tuple[Causes, int, float, Mapping[str, float]]]:
-    """
-    Give the causes of a selection, the named ones first, then those that are suspected.
+@dataclass(frozen=True)
+class SelectedCause:
+    """A cause of a selection."""
 
-    Each is given as its place among all causes, with its evidence given the others and its
-    alternatives.
-    """
+    fit: RegressionFit  # with all causes of the selection
+    place: int  # of the cause among them
+    p_value: float  # that noise alone shows as much, given the others
+    is_established: bool  # whether it is confirmed
+    # what it and its alternatives lack in log-likelihood, the best first
+    deficits: Mapping[str, float]
+
+    @property
+    def cause(self) -> Candidate:
+        """Return the cause with its shapes."""
+        return self.fit.causes[self.place]
+
+    def finding(self, values: Array, covariance: Array, shapes: Mapping[str, Estimate],
+                observed: Mapping[str, float], sigmas: float, end: float,
+                confounders: Sequence[str] = ()) -> Finding:
+        """
+        Return the finding: `cause_finding` with the coefficients, their covariance, and shapes.
+
+        Single events are in a part of a log, up to its end, s, or between the first and the last.
+        """
+        known, where = self.cause, None
+        if known.cause == 'bias_step':
+            where = known.shapes[0], end
+        elif known.cause == 'reference_slip':
+            where = min(known.shapes[1:]), max(known.shapes[1:])
+            shapes = {**shapes, **slip_times(known.shapes[1:])}
+        return cause_finding(
+            known.cause, cause_parameters(known.cause, values, covariance, shapes), self.p_value,
+            self.deficits, self.is_established, observed, sigmas, confounders, where=where,
+            remedy=SINGLE_EVENT_REMEDY if is_single_event(known) else '')
+
+
+def explain_selection(search: Search, selection: Selection) -> Iterator[SelectedCause]:
+    """Give the causes of a selection, the named ones first, then those that are suspected."""
+    def explained(causes: Causes, place: int, is_established: bool,
+                  deficits: Mapping[str, float]) -> SelectedCause:
+        return SelectedCause(fit_causes(search.problem, causes), place, p_value(
+            causes[place].cause, evidence_for(search, causes, place)), is_established, deficits)
+
     causes = (*selection.named, *selection.unnamed)
     for place, deficits in enumerate(selection.alternatives):
-        yield causes, place, evidence_for(search, causes, place), deficits
+        yield explained(causes, place, True, deficits)
     for known in selection.suspected:
-        every = refine_jointly(search, (*causes, known))
-        yield every, len(causes), evidence_for(search, every, len(causes)), {}
+        yield explained(refine_jointly(search, (*causes, known)), len(causes), False, {})
 
 
 def _remove_unconfirmed(search: Search, causes: Causes,
@@ -490,7 +523,7 @@ def _remove_unconfirmed(search: Search, causes: Causes,
         fit, sigmas = fit_causes(search.problem, causes), []
         for place, (known, held_out) in enumerate(zip(causes, held_out_sigmas(search, causes))):
             values, covariance = fit.coefficients(place)
-            sizes = [(one.value, one.deviation) for one in fit.shapes(place).values()]
+            sizes = [(one.estimate, one.deviation) for one in fit.shapes(place).values()]
             if len(values):
                 sizes = [*zip(values.tolist(), np.sqrt(np.diag(covariance)).tolist())]
             # sine or cosine alone may be 0 for a wave that is not

@@ -38,11 +38,9 @@ from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     complete_diagnosis, gain_from_errors, HEADING_WINDOW, previous_origins, widen_range)
 from gyro_calibration.diagnosis.findings import (
-    Curve, Diagnosis, Estimate, Finding, Gain, OnProgress, Unexplained)
+    Curve, DETECTION_POWER, Diagnosis, Estimate, Finding, Gain, MIN_PREDICTION_SIGMAS, OnProgress,
+    prediction_sigmas, SEARCH_ALARM_RATE, Unexplained, VALUE_ALARM_RATE)
 from gyro_calibration.diagnosis.gates import examine_log, mismatch_diagnosis
-from gyro_calibration.diagnosis.significance import (
-    DETECTION_POWER, MIN_PREDICTION_SIGMAS, prediction_sigmas, SEARCH_ALARM_SHARE,
-    VALUE_ALARM_SHARE)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, CUBIC_NONLINEARITY, Effect,
@@ -187,9 +185,8 @@ class _NamedCauses:
            withdrawn: Collection[Effect] = ()) -> _NamedCauses:
         """Return the causes among the effects of a fit, without those that are withdrawn."""
         fit = fit.refit([each for each in fit.effects if each not in withdrawn])
-        level = VALUE_ALARM_SHARE * FALSE_ALARM_RATE
         causes = [each for each in fit.effects if each not in BASIC_EFFECTS
-                  or model is not None and fit.p_value(each) < level]
+                  or model is not None and fit.p_value(each) < VALUE_ALARM_RATE]
         values = {term.effect: term.values for term in fit.terms}
         if {BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC} <= values.keys():
             # If a parabola over temperature has its vertex near the measured ones, the slope is
@@ -232,7 +229,7 @@ def _name_causes(dwells: Dwells, model: GyroModel | None,
     """Find the causes that dwells support on top of a model, or of an ideal gyro."""
     technology = model.gyro.get('technology') if model else None
     fit, _ = resolve_confounders(
-        find_supported_effects(dwells, SEARCH_ALARM_SHARE * FALSE_ALARM_RATE, model),
+        find_supported_effects(dwells, SEARCH_ALARM_RATE, model),
         technology if technology in TECHNOLOGY_EFFECTS else None)
     return _NamedCauses.of(fit, model, withdrawn)
 
@@ -356,14 +353,14 @@ def _cause_finding(named: _NamedCauses, effect: Effect) -> Finding:
         f'with it to {fit.left_out_rms / DEGREE:.3g} deg/s; '
         f'{math.sqrt(max(named.misfit_reduction(effect), 0.0)):.1f} sigma from zero')
     basic = len(BASIC_EFFECTS)
-    count, share = ((basic, basic * VALUE_ALARM_SHARE) if effect in BASIC_EFFECTS
-                    else (len(STATIC_EFFECTS) - basic, SEARCH_ALARM_SHARE))
+    count, rate = ((basic, basic * VALUE_ALARM_RATE) if effect in BASIC_EFFECTS
+                   else (len(STATIC_EFFECTS) - basic, SEARCH_ALARM_RATE))
     # That of a sine response is by the cubic: a small one equals -k² w³ / 6.
     detectable, fitted = None, CUBIC_NONLINEARITY if effect is SINE_RESPONSE else effect
     if (by_cubic := fit if fitted is effect else try_replace(fit, effect, fitted)) is not None:
         place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
         detectable = float(
-            uncertainty.half_width(1.0 - share * FALSE_ALARM_RATE / count)[place]
+            uncertainty.half_width(1.0 - rate / count)[place]
             + norm.ppf(DETECTION_POWER) * math.sqrt(uncertainty.covariance()[place, place]))
         if effect is SINE_RESPONSE:
             detectable = math.sqrt(own[0] ** 2 + 6.0 * detectable) - own[0]

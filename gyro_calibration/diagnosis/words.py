@@ -10,16 +10,14 @@
 
 """Numbers as people read them, and a diagnosis in plain words, for terminal and report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import math
 import re
 import textwrap
 
 from gyro_calibration.diagnosis.causes import CAUSES, NOISE_NAMES
-from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, MIN_PROBABILITY
-from gyro_calibration.diagnosis.significance import DETECTION_POWER
+from gyro_calibration.diagnosis.findings import (
+    DETECTION_POWER, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import have_same_effects

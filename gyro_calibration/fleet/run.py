@@ -16,8 +16,6 @@ of tasks. A worker that is killed breaks its pool: the submitted tasks are then 
 one, the one that kills its worker again is reported, and the others continue.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor, Executor, FIRST_COMPLETED, Future, ProcessPoolExecutor, wait)

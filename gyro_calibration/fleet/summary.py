@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
-from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
+from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.report import (
     Chart, draw_chart, element, join_markup, Line, Markup, render_page)
 from gyro_calibration.diagnosis.words import (
@@ -71,8 +71,8 @@ class _ValueSummary:
 
     def format_interval(self, interval: Interval, per: str = '') -> str:
         """Return an estimate of the value with its interval, or of its slope per unit of time."""
-        return str(format_quantity(Estimate(interval.value, (interval.low, interval.high),
-                                            self.unit + per), self.name))
+        return format_quantity(Estimate(interval.value, (interval.low, interval.high),
+                                        self.unit + per), self.name)
 
     def format_component(self, name: str) -> str:
         """Return a standard deviation with its interval, or its bound where it may be zero."""
@@ -258,7 +258,7 @@ def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
               if one['status'] == 'established'} for each in logs]
 
     def p_value(shows: NDArray[np.bool_]) -> float:
-        return float(binom.sf(shows.sum() - 1, len(shows), Diagnosis.false_alarm_rate))
+        return float(binom.sf(shows.sum() - 1, len(shows), FALSE_ALARM_RATE))
 
     result = []
     for effect in sorted(set().union(*shown) - set(summary.values)):
@@ -374,9 +374,9 @@ def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[s
         cells = []
         for name in names:
             value = each.get('values', {}).get(name)
-            cells.append(_cell('') if value is None else _cell(str(format_quantity(
+            cells.append(_cell('') if value is None else _cell(format_quantity(
                 Estimate.from_half_width(value['value'], NORMAL_QUANTILE_975 * value['deviation'],
-                                         value['unit']), name)), value['value']))
+                                         value['unit']), name), value['value']))
         rows.append([element('td', link, data_key=file),
                      *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *cells,
                      _cell((each.get('diagnosis') or {}).get('verdict', '')),

@@ -86,7 +86,7 @@ def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, run
 
 @pytest.mark.parametrize('noise, quantization, ramp', [
     pytest.param(*case, id=name,  # the others as evidence: 30 records take some seconds
-                 marks=[] if name in ('quantization', 'walk') else pytest.mark.evidence)
+                 marks=[] if name in ('white', 'walk', 'quantization') else pytest.mark.evidence)
     for name, *case in (('white', WHITE, 0.0, 0.0), ('flicker', FLICKER, 0.0, 0.0),
                         ('walk', WALK, 0.0, 0.0), ('quantization', WHITE, 3e-5, 0.0),
                         ('ramp', WHITE, 0.0, 1e-4))])
@@ -122,13 +122,6 @@ def test_a_gauss_markov_process_is_found_and_a_flicker_or_random_walk_is_not_tak
     assert np.median(found, axis=0) == pytest.approx((1e-3, 20.0), rel=0.5)
     for noise in (Noise(1e-3, 3e-4), Noise(1e-3, 0.0, 1e-4)):
         assert fit_noise(simulate_noise(noise, 200_000, 0.01, generator), 0.01).process is None
-
-
-def test_white_noise_alone_shows_nothing_else():
-    found = figures(WHITE, 25, 5, samples=3000)
-    false = np.any([[figure.value > 0.0 for figure in found[symbol]] for symbol in 'BKQR'], axis=0)
-    assert false.sum() <= most(25, 0.05)
-    assert all(figure.value > 0.0 for figure in found['N'])
 
 
 @pytest.mark.parametrize('numerator, denominator',
@@ -252,12 +245,9 @@ def test_the_part_at_rest_that_is_proposed_is_accepted(tmp_path, run):
     assert run('allan', log, '--from', begin, '--to', end)[0] == 0
 
 
-def test_a_fit_without_noise_or_without_windows_is_refused():
+def test_a_fit_without_noise_is_refused():
     with pytest.raises(DataRefused, match='lowest Allan deviation 0 rad/s'):
         fit_noise(np.ones(1000), INTERVAL)
-    with pytest.raises(DataRefused, match='wanted 4 octaves'):
-        fit_noise(np.where(np.arange(1000) % 6 == 0, np.nan,
-                           np.random.default_rng(19).standard_normal(1000)), INTERVAL)
 
 
 def test_an_outlier_is_left_out_and_a_random_walk_of_the_bias_is_no_motion():

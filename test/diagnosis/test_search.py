@@ -15,13 +15,13 @@ import math
 from diagnosed import diagnosis_of, established, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate, effect_candidate, generic_terms, is_named, propose_candidates)
+from gyro_calibration.diagnosis.findings import MIN_PREDICTION_SIGMAS
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
     confirm_causes, evidence_for, held_out_sigmas, p_value, refine_jointly, search_causes,
     start_search)
-from gyro_calibration.diagnosis.significance import MIN_PREDICTION_SIGMAS
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -181,7 +181,7 @@ def test_the_interval_of_the_time_of_a_step_holds_it():
         fit = fit_causes(search.problem, named)
         for place in range(2):
             time, = fit.shapes(place).values()
-            held += min(abs(time.value - true) for true in times) < 1.96 * time.deviation < 10.0
+            held += min(abs(time.estimate - true) for true in times) < 1.96 * time.deviation < 10
     assert held >= 11
 
 
