@@ -38,7 +38,7 @@ from gyro_calibration.files import to_printable
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions, HeadingEstimator, MAX_SPECIFIC_FORCE, TEMPERATURE_TIMEOUT)
-from gyro_calibration.heading.integration import MAX_GAP, Threshold
+from gyro_calibration.heading.integration import Intervals, MAX_GAP, Threshold
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
@@ -164,6 +164,7 @@ class Pipeline:
         self._last_time, self._usual_interval = -math.inf, math.inf
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
         self._stamps = deque[int](maxlen=_MAX_LATE_SAMPLES)  # the last ones, in order of arrival
+        self._intervals = Intervals()  # between all of them, so that they can end a conflict
         self._first_frame: str | None = None
         self._frame: str | None = None
         # that the graph lists several publishers, and samples too soon after the one before
@@ -356,6 +357,8 @@ class Pipeline:
                              'the driver changes their order')
             return None
         self._detect_several_gyros(stamp, frame, now, silence)
+        if 0.0 < (interval := 1e-9 * (stamp - self._last_stamp)) <= self.values.maximum_gap:
+            self._intervals.add(interval)
         self._last_stamp, self._last_arrival = stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
@@ -411,12 +414,14 @@ class Pipeline:
 
     def _is_late(self, stamp: int, frame: str) -> bool:
         """Tell whether a sample was overtaken by the last ones, whose stamps left a gap for it."""
-        # two gyros of the same rate leave no gap of one and a half intervals
-        stamps, behind = self._stamps, 1e-9 * (self._last_stamp - stamp)
-        usual = self.estimator.tracker.intervals.usual_interval
-        is_late = (0.0 < behind < _MAX_LATE_SAMPLES * usual < math.inf and frame == self._frame
-                   and not self.publisher_conflict and min(stamps) < stamp
-                   and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
+        stamps, usual = self._stamps, self._intervals.usual_interval
+        behind = 1e-9 * (max(stamps, default=stamp) - stamp)
+        # Before the usual interval is known, what is behind waits; a jump back of the clock shows
+        # when all of the last stamps are beyond it. Two gyros of the same rate leave no gap of one
+        # and a half intervals.
+        is_late = behind > 0.0 and frame == self._frame and not self.publisher_conflict and (
+            usual == math.inf or behind < _MAX_LATE_SAMPLES * usual and min(stamps) < stamp
+            and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
         stamps.append(stamp)
         return is_late
 
