@@ -43,7 +43,7 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
+    CalibrationSession, describe_odometry_clock, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
@@ -121,6 +121,7 @@ class _Journal:
     last_received: float  # time of the last sample, s of the steady clock
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNT_NAMES, 0))
     event: str = ''  # the last one
+    refusal: str = ''  # why the last sample was refused; '' where it was used
     clock_steps: str = ''  # of the host clock
     refused_calibrations: int = 0
     refusal_reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
@@ -181,6 +182,7 @@ class Pipeline:
         self.clock_fault = self._suspected_clock_fault = ''
         self._stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
+        self._odometry_lateness = -math.inf, 0.0  # when it came, and its lateness, s
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
         self._turns, self._alternate_turns = TurnComparison(), AlternateTurns()
@@ -254,14 +256,18 @@ class Pipeline:
             self.estimator.tracker.add_unknown_turn(MIN_TURN_ANGLE)
         elif math.isnan(self._heading_at_rest):
             self._heading_at_rest = heading
+        # how late it is for the last sample, or ahead of one that would come now
+        late = self._last_time - time if self._last_time > -math.inf else 0.0
+        late = max(late, 0.0) or min(late + now - self._last_arrival, 0.0)
+        self._odometry_lateness = now, late
         # A late message is not used, and a contradictory one does not show standstill.
-        if (not self._last_time - time > MAX_VELOCITY_AGE
+        if (not late > MAX_VELOCITY_AGE
                 and (velocity.is_moving or not self._is_odometry_contradictory)):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
             self._compare_turns(ODOMETRY, time, rate,
                                 not velocity.is_moving and not self._is_odometry_contradictory)
-            self.session.add_odometry(time, heading, rate)
+            self.session.add_odometry(time, heading, rate, late)
 
     def _compare_turns(self, source: str, time: float, rate: float, stands: bool = False) -> None:
         """Compare the heading with a rate by odometry or commands, and add an unknown turn."""
@@ -299,6 +305,7 @@ class Pipeline:
     def faults(self) -> dict[str, str]:
         """Return the faults of clocks, frames and turns, each a sentence or '', by name."""
         turned, turns = self._stamp_delay.unknown_turn, self._turns
+        came, late = self._odometry_lateness
         found = {
             'clock': (self.clock_fault, self.clock_fault),
             'frame': (self._frame != self._first_frame, to_printable(
@@ -316,6 +323,8 @@ class Pipeline:
                       f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
                       'imu/data_raw advanced faster or slower for a time than before: check that '
                       'the driver stamps by a clock and loses no samples, then reset the heading'),
+            'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came,
+                               describe_odometry_clock(late)),
             'odometry': (self._is_odometry_contradictory,
                          'odom turns by its headings while its rate is zero: check its twist, '
                          'without which it does not show that the robot stands'),
@@ -476,13 +485,13 @@ class Pipeline:
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
-            journal.event = (
+            journal.event = journal.refusal = (
                 'a sample without a rate (nan, or -1 in its covariance) is not used'
                 if math.isnan(output) else
-                f'a rate of {output:g} rad/s is beyond the range of this gyro: the sample is not '
-                'used')
+                f'a rate of {output:g} rad/s is beyond the range of this gyro, and not used: '
+                'check that the driver sends rad/s, and the range of the model')
             return False
-        journal.last_received, tracker = now, estimator.tracker
+        journal.last_received, journal.refusal, tracker = now, '', estimator.tracker
         counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)
         counts['beyond_range'] += int(estimator.last_compensated.beyond_range)
         counts['lost_samples'] = tracker.intervals.lost_samples
@@ -613,6 +622,8 @@ class Pipeline:
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
         conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
+        if self._clock.steady() - self.journal.last_received > RunLimits.max_gap:
+            conflict = conflict or self.journal.refusal
         self.session.poll(self.values, receivers,
                           self.ros_time.paused_duration > FAULT_DURATION, conflict)
 
