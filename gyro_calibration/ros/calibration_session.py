@@ -477,6 +477,9 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     limits = run.limits
     temperature = float(np.mean(run.temperatures)) if run.temperatures else None
     if run.kind == REST:
+        if not output.any():
+            raise DataRefused('the gyro reports zero only: either it sets its output to zero at '
+                              'rest, and shows no bias, or it is dead; turn the robot to find out')
         bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
         turned = 0.0  # rad; by the headings or the rates of odometry
         if len(run.odometry) > 1:

@@ -415,9 +415,12 @@ class CompensationReport:
         tolerated = {'lost_samples': 3}  # per report
         growing = {name for name, count in journal.counts.items()
                    if count - self._previous_counts[name] > tolerated.get(name, 0)}
-        silent = self._clock.steady() - journal.last_received
+        now = self._clock.steady()
+        silent = now - journal.last_received
+        # a healthy gyro may do this, but at rest only
+        doubt = pipeline.repeat_suspicion if pipeline.wheels.is_moving(now) else ''
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
-                     or pipeline.repeat_fault or pipeline.repeat_suspicion):
+                     or pipeline.repeat_fault or doubt):
             return ERROR, error
         if pipeline.ros_time.paused_duration > 1.0:
             return ERROR, ROS_TIME_PAUSED
@@ -441,7 +444,8 @@ class CompensationReport:
             f'{high:g} degC; the correction is extrapolated, and its variance increases',
         }.items() if name in growing]
         warnings += filter(None, (
-            pipeline.session.warning, *pipeline.faults.values(), pipeline.heading_loss))
+            pipeline.session.warning, pipeline.repeat_suspicion, *pipeline.faults.values(),
+            pipeline.heading_loss))
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
             warnings.append('no temperature comes; the model is used at its reference temperature '
                             f'of {estimator.model.reference_temperature:g} degC')

@@ -410,7 +410,7 @@ class Pipeline:
         self._check_repeats(time, output, now)
         self._alternate_turns.add(time, output)
         run, moving = self.session.run, self.wheels.is_moving(now)
-        if moving:
+        if moving or self._repeat_detector.is_zeroed:
             self.monitor.restart()
         elif self.monitor.is_enabled and self.monitor.add(time, output,
                                                           self.estimator.corrected_rate):

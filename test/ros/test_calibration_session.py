@@ -616,3 +616,6 @@ def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature
         run.add(0.02 * number, BIAS, BIAS + noise, 25.0)
     with pytest.raises(DataRefused, match='the gyro is dead'):
         fit_run(run, Noise(), '')
+    run.outputs = [0.0 for _ in run.outputs]
+    with pytest.raises(DataRefused, match='sets its output to zero at rest'):
+        fit_run(run, Noise(), '')
