@@ -218,6 +218,11 @@ class Drive:
                 f'and samples up to {self.sample_lateness:.2f} s; reduce its load and run again')
 
 
+def read_profile(file: str) -> Motion:
+    """Return the motion of a profile, the built-in one for ''; raise `MotionError`."""
+    return read_motion(Path(os.path.expanduser(file))) if file else CALIBRATION_MOTION
+
+
 def _max_rate(motion: Motion) -> float:
     """Return the fastest rate of a motion, rad/s."""
     return float(np.abs(motion.rate_at(motion.time)).max())
@@ -258,9 +263,7 @@ class CalibrationSession:
         duration = {ODOMETRY: values.calibration_duration, REST: 15.0}.get(kind, math.inf)
         if kind == PROFILE:
             try:
-                file = values.calibration_profile_file
-                motion = (read_motion(Path(os.path.expanduser(file)))
-                          if file else CALIBRATION_MOTION)
+                motion = read_profile(values.calibration_profile_file)
             except MotionError as error:
                 return str(error)
             duration = motion.duration

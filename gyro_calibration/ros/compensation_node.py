@@ -33,7 +33,9 @@ from gyro_calibration.logs.cdr import (
     NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading, serialize,
     UNMEASURED_VARIANCE, z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
+from gyro_calibration.model.motion import MotionError
+from gyro_calibration.ros.calibration_session import (
+    Drive, read_profile, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.inputs import Clock, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
@@ -88,6 +90,10 @@ class CompensationNode(Node):
                                   self._publish_command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
+        try:
+            read_profile(values.calibration_profile_file)
+        except MotionError as error:
+            self.get_logger().warning(f'{error}; calibrate refuses until it can be read')
         self._receivers = 0
         self._pending_answer: tuple[Trigger.Response, Future] | None = None
         self._timer: Timer | None = None

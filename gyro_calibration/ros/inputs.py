@@ -73,6 +73,8 @@ class NodeParameter:
                 self._refuse(value, f'from {low} to {high} {self.unit}'.rstrip())
         if self.choices and value not in self.choices:
             self._refuse(value, self.choices_text)
+        if value == '' and self.default:
+            self._refuse(value, f'not empty, for example {self.default!r}')
         return value
 
     def _refuse(self, value: object, wanted: str) -> None:
@@ -254,12 +256,14 @@ class TurnComparison:
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
     wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Turns by the gyro
+    that are larger than those by odometry, beyond the largest scale factor error that a
+    calibration accepts and two in a row, are of a wrong sensitivity: wheels that slip turn more.
     """
 
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
-        self.is_contradictory = False
+        self.is_contradictory = self.is_larger = False
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
@@ -302,7 +306,9 @@ class TurnComparison:
         self._path += abs(heading - before)
         self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
-            self.ratio = self._by_gyro / self._by_wheels
+            before, self.ratio = self.ratio, self._by_gyro / self._by_wheels
+            self.is_larger = source == ODOMETRY and (
+                min(before, self.ratio) > 1.0 + RunLimits.max_scale_factor_error)
             confused, rate = 180.0 / math.pi, self._path / self._duration
             is_wrong = (self.ratio > math.sqrt(confused)
                         and (source == ODOMETRY or self.ratio * rate > confused)

@@ -319,6 +319,9 @@ class Pipeline:
                      f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check '
                      'the unit and the sense of rotation of the gyro, and those of '
                      f'{turns.source}'),
+            'scale': (turns.is_larger,
+                      f'the gyro turns by {turns.ratio:.2f} times what odom shows: check the '
+                      'sensitivity of the gyro, and diameter and distance of the wheels of odom'),
             'stamp': (turned > MIN_TURN_ANGLE,
                       f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
                       'imu/data_raw advanced faster or slower for a time than before: check that '
@@ -382,10 +385,12 @@ class Pipeline:
             first, fastest = self._frozen_stamp or (now, 0.0)
             self._frozen_stamp = first, max(fastest, abs(output))
             journal.event = (
-                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                f'the stamp stands still at {stamp / NSEC_PER_SEC:.3f} s; the sample is not used: '
+                'check that the driver stamps its samples'
                 if now - first > FAULT_DURATION else
-                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
-                'on its arrival; only the first of them is used: stamp when the gyro measures')
+                f'several samples have the stamp {stamp / NSEC_PER_SEC:.3f} s, as where a driver '
+                'stamps a queue on its arrival; only the first of them is used: stamp when the '
+                'gyro measures')
             return None
         if self._frozen_stamp is not None:
             (first, fastest), self._frozen_stamp = self._frozen_stamp, None
