@@ -326,13 +326,15 @@ class AlternateTurns:
     by more than the largest scale factor error that a calibration accepts, in the same proportion
     in turns of a row whose sense changes twice: samples of another gyro, with another axis or
     without a function, have the same topic and frame. A vibration near half the sample rate has
-    the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
-    biases of the two may differ.
+    the opposite proportion in the other sense. Where the stamps alternate between two intervals
+    that differ as much, two such turns in a row suffice. Turns of less than 0.025 rad/s do not
+    count, as the biases of the two may differ.
     """
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, float]] = []  # the last ones, up to 2; s and rad/s
-        self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
+        self._turned, self._between = 0.0, 0.0  # rad
+        self._duration = self._before = 0.0  # s, and the part before each sample between, s
         # difference over sum in turns of a row, their last sense, and how often it changed
         self._share, self._sense, self._changes = math.nan, 0.0, 0
         self.is_contradictory = False
@@ -342,28 +344,31 @@ class AlternateTurns:
         self._samples.append((time, rate))
         if len(self._samples) < 3:
             return
-        (begin, before), (_, middle), _ = self._samples
+        (begin, before), (place, middle), _ = self._samples
         self._samples, interval = self._samples[2:], time - begin
         if not 0.0 < interval <= MAX_VELOCITY_AGE:
-            self._turned = self._between = self._duration = 0.0
+            self._turned = self._between = self._duration = self._before = 0.0
             return
         # the mean of both neighbours is the rate between them also while the robot accelerates
         self._turned += 0.5 * (before + rate) * interval
         self._between += middle * interval
         self._duration += interval
+        self._before += place - begin
         total = self._turned + self._between
         if abs(total) > 1.0:  # rad
             apart = self._turned - self._between
             allowed, share = RunLimits.max_scale_factor_error, apart / total
+            after = self._duration - self._before
+            is_uneven = abs(self._before - after) > allowed * max(self._before, after)
             if not abs(apart) > allowed * max(abs(self._turned), abs(self._between)):
                 share = math.nan
             is_alike = abs(share - self._share) <= allowed * abs(share)
             self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
-            self.is_contradictory = self._changes > 1
+            self.is_contradictory = self._changes > 1 or is_alike and is_uneven
             self._share, self._sense = self._share if is_alike else share, total
         elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
             return
-        self._turned = self._between = self._duration = 0.0
+        self._turned = self._between = self._duration = self._before = 0.0
 
 
 class Wheels:

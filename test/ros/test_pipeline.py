@@ -502,6 +502,22 @@ def test_every_other_sample_of_another_gyro_is_a_warning_and_the_heading_claims_
     assert ('every other sample' in rig.pipeline.find_obstacle()) == warns
 
 
+@pytest.mark.parametrize('other, offset, warns', [
+    (lambda rate: 0.0, 3, True), (lambda rate: 0.0, 8, True), (lambda rate: 0.0, 5, False),
+    (lambda rate: rate, 3, False)], ids=['3 ms', '8 ms', 'midway', 'same axis'])
+def test_two_gyros_whose_stamps_alternate_unevenly_are_found_in_one_turn(
+        tmp_path, other, offset, warns):
+    rig = rested(tmp_path)
+    sample, generator = rig.sample, np.random.default_rng(1)
+
+    def both(stamp, output, heading):
+        sample(stamp, output, heading)
+        sample(stamp + offset * 10 ** 6, other(output) + 1e-3 * generator.standard_normal())
+    rig.sample = both
+    rig.turn(0.8, 4.0)
+    assert bool(rig.pipeline.faults['alternation']) == warns
+
+
 def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     """As of a relay that joins two topics: the stamps increase, and the graph shows one node."""
     rig = Rig(tmp_path, model='')
