@@ -162,8 +162,8 @@ class Pipeline:
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
-        self._last_time, self._usual_interval = -math.inf, math.inf
-        self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
+        self._last_time, self._last_stamp = -math.inf, 0
+        self._jump_times = deque[float](maxlen=2)
         self._stamps = deque[int](maxlen=_MAX_LATE_SAMPLES)  # the last ones, in order of arrival
         self._intervals = Intervals()  # between all of them, so that they can end a conflict
         self._first_frame: str | None = None
@@ -378,8 +378,8 @@ class Pipeline:
         time = self._since_epoch(stamp)
         if self._clock.simulated() is None:
             self._update_host_clock()
-            time = self._host_time.convert_sample(time, self._last_time, self._usual_interval,
-                                                  silence)
+            time = self._host_time.convert_sample(
+                time, self._last_time, self._intervals.usual_interval, silence)
         if time == self._last_time:
             counts['repeated_stamps'] += 1
             first, fastest = self._frozen_stamp or (now, 0.0)
@@ -399,8 +399,6 @@ class Pipeline:
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                  'came; turns in this time are not in the heading')
         interval = time - self._last_time
-        if 0.0 < interval <= self.values.maximum_gap:
-            self._usual_interval = min(interval, self.estimator.tracker.intervals.usual_interval)
         # Perhaps a loss of power; after a mere delay the stamps continue.
         if (now - journal.last_received > _POWER_OFF_SILENCE and interval < math.inf
                 and not 0.0 < interval < _POWER_OFF_SILENCE):
@@ -518,10 +516,10 @@ class Pipeline:
     def _corrected_sample(self, stamp: int, time: float) -> CorrectedSample | None:
         """Return what is published of the present state; None where it is not finite."""
         estimator, tracker, known = self.estimator, self.estimator.tracker, self._noise_is_known
-        spread = (0.0 if known and self._usual_interval < math.inf
-                  else self.values.assumed_bias ** 2)
+        usual = self._intervals.usual_interval
+        spread = 0.0 if known and usual < math.inf else self.values.assumed_bias ** 2
         # After a reset the variance is that of one sample; zero would state an exact heading.
-        least = tracker.rate_variance * min(self._usual_interval, 1.0) ** 2
+        least = tracker.rate_variance * min(usual, 1.0) ** 2
         found = CorrectedSample(stamp + self._stamp_offset, tracker.heading,
                                 max(self.heading_variance, least) if known
                                 else UNMEASURED_VARIANCE,
