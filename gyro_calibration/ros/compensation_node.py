@@ -369,7 +369,7 @@ class CompensationReport:
         values: dict[str, object] = {
             **counts, 'rate_hz': f'{rate:.1f}',
             'longest_gap_s': f'{tracker.intervals.longest_gap:.3f}',
-            'clock_steps': journal.clock_steps,
+            'clock_steps': journal.clock_steps, 'stamp_pace': f'{pipeline.stamp_delay.pace:.4f}',
             'heading_deg': f'{tracker.heading / DEGREE:.3f}',
             'heading_standard_deviation_deg': f'{deviation:.3f}',
             'deleted_heading_deg': f'{tracker.deleted_heading / DEGREE:.3f}',
@@ -423,8 +423,9 @@ class CompensationReport:
                    if count - self._previous_counts[name] > tolerated.get(name, 0)}
         now = self._clock.steady()
         silent = now - journal.last_received
-        # a healthy gyro may do this, but at rest only
-        doubt = pipeline.repeat_suspicion if pipeline.wheels.is_moving(now) else ''
+        # a healthy gyro may begin so, at rest
+        doubt = (pipeline.repeat_suspicion if pipeline.repeat_detector.has_changed
+                 or pipeline.wheels.is_moving(now) else '')
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
                      or pipeline.repeat_fault or doubt):
             return ERROR, error

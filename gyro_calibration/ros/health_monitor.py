@@ -167,6 +167,11 @@ class RepeatedOutputDetector:
         self.is_suspected = self.is_suspected or sample > 0.0 and self._changes == 1
         return self._is_fault
 
+    @property
+    def has_changed(self) -> bool:
+        """Tell whether a second value came."""
+        return self._changes > 1
+
     def _excludes_chance(self, width: float, count: float, sample: float,
                          level: float = 100.0) -> bool:
         """

@@ -158,6 +158,12 @@ class StampDelay:
             self.unknown_turn = max(self.unknown_turn, abs(self._false_turn))
 
     @property
+    def pace(self) -> float:
+        """Return the mean advance of the stamps in 1 s of the clock, s; nan in the beginning."""
+        (then, before, _), (now, late, _) = self._begin or self._least, self._least
+        return 1.0 - (late - before) / (now - then) if now > then else math.nan
+
+    @property
     def min_delay(self) -> float:
         """Return the least delay in the shortest duration, s."""
         return self._least_delay(self._tolerances[0][0])

@@ -177,10 +177,10 @@ class Pipeline:
         # that the gyro is dead, or may be so
         self.repeat_fault = self.repeat_suspicion = ''
         self.heading_loss, self._last_variance = '', 0.0  # why the heading is unknown; rad²
-        self._repeat_detector = RepeatedOutputDetector(noise)
+        self.repeat_detector = RepeatedOutputDetector(noise)
         self._pulse_detector, self._outlier_count = PulseDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
-        self._stamp_delay = self._new_stamp_delay()
+        self.stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
         self._odometry_lateness = -math.inf, 0.0  # when it came, and its lateness, s
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
@@ -304,7 +304,7 @@ class Pipeline:
     @property
     def faults(self) -> dict[str, str]:
         """Return the faults of clocks, frames and turns, each a sentence or '', by name."""
-        turned, turns = self._stamp_delay.unknown_turn, self._turns
+        turned, turns = self.stamp_delay.unknown_turn, self._turns
         came, late = self._odometry_lateness
         found = {
             'clock': (self.clock_fault, self.clock_fault),
@@ -409,11 +409,11 @@ class Pipeline:
         journal.channels = set() if specific_force is None else {'specific_force'}
         if not self._integrate(time, interval, silence, output, specific_force, now):
             return None
-        self._stamp_delay.add(time, self._heading)
+        self.stamp_delay.add(time, self._heading)
         self._check_repeats(time, output, now)
         self._alternate_turns.add(time, output)
         run, moving = self.session.run, self.wheels.is_moving(now)
-        if moving or self._repeat_detector.is_zeroed:
+        if moving or self.repeat_detector.is_zeroed:
             self.monitor.restart()
         elif self.monitor.is_enabled and self.monitor.add(time, output,
                                                           self.estimator.corrected_rate):
@@ -503,7 +503,7 @@ class Pipeline:
             counts['restarts'] += 1
             journal.event = f'{restarted}: integration was restarted'
             self.monitor.restart()
-            self._stamp_delay = self._new_stamp_delay()
+            self.stamp_delay = self._new_stamp_delay()
             self._recent_rates.clear()
             self.session.interrupt(restarted)
         elif unseen and moving is not False and tracker.intervals.lost_samples > lost:
@@ -548,16 +548,16 @@ class Pipeline:
         """Detect repeated values and pulses, and add an unknown turn to the heading."""
         outliers, self._outlier_count = self._outlier_count, self.estimator.tracker.outlier_count
         pulse, size = self._pulse_detector.add(time, output)
-        is_repeated = self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
-                                                self.monitor.has_noise_at_rest)
+        is_repeated = self.repeat_detector.add(time, output, self.wheels.turn_rate(now),
+                                               self.monitor.has_noise_at_rest)
         self.repeat_suspicion = (
             f'the gyro repeats the rate {output:g} rad/s without the noise of its model: it is '
             'dead, or shows this at rest; turn the robot to find out'
-            if self._repeat_detector.is_suspected and not is_repeated else '')
+            if self.repeat_detector.is_suspected and not is_repeated else '')
         if not is_repeated:
             if self._outlier_count > outliers:  # the tracker has not used the sample
                 pulse = 0.0
-            unseen = math.hypot(self._repeat_detector.unseen_turn, pulse)
+            unseen = math.hypot(self.repeat_detector.unseen_turn, pulse)
             if unseen and not self.repeat_fault:  # several samples may be a turn
                 self.estimator.tracker.add_unknown_turn(unseen, -pulse if size == 1 else 0.0)
             self.repeat_fault = ''
@@ -636,9 +636,9 @@ class Pipeline:
             self._update_host_clock()
         # Two faults in a row: delayed samples come in a burst, and are late until then.
         before = self._suspected_clock_fault
-        self._suspected_clock_fault = self._stamp_delay.find_fault()
+        self._suspected_clock_fault = self.stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
-        unknown, tracker = self._stamp_delay.unknown_turn, self.estimator.tracker
+        unknown, tracker = self.stamp_delay.unknown_turn, self.estimator.tracker
         added = unknown ** 2 - self._stamp_turn ** 2
         if added > 0.01 * tracker.variance:  # else the deviation changes by less than 0.5 %
             tracker.add_unknown_turn(math.sqrt(added))
@@ -655,7 +655,7 @@ class Pipeline:
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
-        self._stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
+        self.stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
         if self.conflict or self.repeat_fault:  # turns are not measured now
             self.estimator.set_heading(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
