@@ -269,7 +269,7 @@ class TurnComparison:
 
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
-        self.is_contradictory = self.is_larger = False
+        self.is_contradictory = self.is_larger = self._was_larger = False
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
@@ -312,9 +312,12 @@ class TurnComparison:
         self._path += abs(heading - before)
         self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
-            before, self.ratio = self.ratio, self._by_gyro / self._by_wheels
-            self.is_larger = source == ODOMETRY and (
-                min(before, self.ratio) > 1.0 + RunLimits.max_scale_factor_error)
+            self.ratio, allowed = (self._by_gyro / self._by_wheels,
+                                   1.0 + RunLimits.max_scale_factor_error)
+            # of one sense: where it changes, late odometry turns less
+            is_larger = (source == ODOMETRY and self.ratio > allowed
+                         and self._path < allowed * abs(self._by_gyro))
+            self.is_larger, self._was_larger = is_larger and self._was_larger, is_larger
             confused, rate = 180.0 / math.pi, self._path / self._duration
             is_wrong = (self.ratio > math.sqrt(confused)
                         and (source == ODOMETRY or self.ratio * rate > confused)
