@@ -80,8 +80,8 @@ class CalibrationRun:
     outputs: list[float] = field(default_factory=list)  # rad/s
     rates: list[float] = field(default_factory=list)  # after the model, rad/s
     temperatures: list[float] = field(default_factory=list)  # degC
-    #: Stamp, s, heading, rad, and rate, rad/s, of each odometry message.
-    odometry: list[tuple[float, float, float]] = field(default_factory=list)
+    #: Stamp, s, heading, rad, rate, rad/s, and time behind the gyro, s, of each odometry message.
+    odometry: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def add(self, time: float, output: float, rate: float, temperature: float | None) -> None:
         """Add a sample; temperature in degC, or None if unknown."""
@@ -118,6 +118,29 @@ class CalibrationRun:
     def max_duration(self) -> float:
         """Return the longest duration of the run, s."""
         return FINISH_TIMEOUT if math.isinf(self.duration) else self.duration + self.extra_duration
+
+    @property
+    def odometry_fault(self) -> str:
+        """Return a sentence on odometry of another clock, with a gap or a jump; else ''."""
+        if self.kind != ODOMETRY or len(self.odometry) < 2 or not self.times:
+            return ''
+        at, headings, rates, lateness = np.array(self.odometry).T
+        at -= self.times[0]
+        if abs(late := float(np.median(lateness))) > self.limits.max_time_offset:
+            return describe_odometry_clock(late)
+        intervals, turns = np.diff(at), np.abs(np.diff(np.unwrap(headings)))
+        gap, largest = int(intervals.argmax()), 4.0 * float(np.median(intervals))
+        if intervals[gap] > max(self.limits.max_gap, largest):
+            return (f'no message came on odom for {intervals[gap]:.1f} s, from {at[gap]:.1f} s of '
+                    'the run on: check the odometry and its connection, and run again')
+        # by neither rate the robot turned as far from one message to the next
+        excess = turns - max(np.abs(rates).max(), np.abs(self.rates).max()) * intervals
+        jump = int(excess.argmax())
+        if excess[jump] > MIN_TURN_ANGLE:
+            return (f'the heading of odom jumps by {turns[jump] / DEGREE:.0f} deg at '
+                    f'{at[jump]:.1f} s of the run, as where its node restarts or its pose is set: '
+                    'run again without that')
+        return ''
 
     @property
     def status(self) -> str:
@@ -195,6 +218,11 @@ class Drive:
                 f'and samples up to {self.sample_lateness:.2f} s; reduce its load and run again')
 
 
+def read_profile(file: str) -> Motion:
+    """Return the motion of a profile, the built-in one for ''; raise `MotionError`."""
+    return read_motion(Path(os.path.expanduser(file))) if file else CALIBRATION_MOTION
+
+
 def _max_rate(motion: Motion) -> float:
     """Return the fastest rate of a motion, rad/s."""
     return float(np.abs(motion.rate_at(motion.time)).max())
@@ -235,9 +263,7 @@ class CalibrationSession:
         duration = {ODOMETRY: values.calibration_duration, REST: 15.0}.get(kind, math.inf)
         if kind == PROFILE:
             try:
-                file = values.calibration_profile_file
-                motion = (read_motion(Path(os.path.expanduser(file)))
-                          if file else CALIBRATION_MOTION)
+                motion = read_profile(values.calibration_profile_file)
             except MotionError as error:
                 return str(error)
             duration = motion.duration
@@ -280,16 +306,16 @@ class CalibrationSession:
             self.end(reason)
         self._command_if_due()
 
-    def add_odometry(self, time: float, heading: float, rate: float) -> None:
-        """Add a heading, rad, and a rate, rad/s, of the odometry."""
+    def add_odometry(self, time: float, heading: float, rate: float, late: float) -> None:
+        """Add a heading, rad, and a rate, rad/s, of odometry that is late for the gyro, s."""
         if self.run:
-            self.run.odometry.append((time, heading, rate))
-        late = self._clock.steady() - self._stop_time
+            self.run.odometry.append((time, heading, rate, late))
+        since = self._clock.steady() - self._stop_time
         alone = self._last_foreign_command < self._stop_time and not self._drive
-        if (alone and _STOPPING_DURATION < late < 2.0 * _STOPPING_DURATION
+        if (alone and _STOPPING_DURATION < since < 2.0 * _STOPPING_DURATION
                 and abs(rate) > 1.0 * DEGREE):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
-                            f'{late:.1f} s after it was commanded to stop: set the command '
+                            f'{since:.1f} s after it was commanded to stop: set the command '
                             'time-out of its base, and check for other nodes that command it')
 
     def add_command(self, velocity: Velocity) -> None:
@@ -429,14 +455,21 @@ class CalibrationSession:
             return True, '; '.join(filter(None, [
                 f'{calibration}, from {len(run.times)} samples', remark, difference, trouble]))
         except DataRefused as error:
-            late = drive.describe_lateness(run.limits) if drive and not run.end_reason else ''
-            return False, f'{late} (the run shows: {error})' if late else str(error)
+            cause = ('' if run.end_reason else drive.describe_lateness(run.limits) if drive
+                     else run.odometry_fault)
+            return False, f'{cause} (the run shows: {error})' if cause else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:
             if drive:
                 self.max_lateness = drive.command_lateness, drive.sample_lateness
             self.run = self._drive = None
+
+
+def describe_odometry_clock(late: float) -> str:
+    """Say that the stamps of odometry are behind those of the gyro by a time, s."""
+    return (f'odom is stamped {abs(late):.1f} s {"behind" if late > 0.0 else "ahead of"} '
+            'imu/data_raw: stamp both by one clock, or synchronize those of their computers')
 
 
 def fit_run(run: CalibrationRun, noise: Noise, date: str,
@@ -447,10 +480,13 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     limits = run.limits
     temperature = float(np.mean(run.temperatures)) if run.temperatures else None
     if run.kind == REST:
+        if not output.any():
+            raise DataRefused('the gyro reports zero only: either it sets its output to zero at '
+                              'rest, and shows no bias, or it is dead; turn the robot to find out')
         bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
         turned = 0.0  # rad; by the headings or the rates of odometry
         if len(run.odometry) > 1:
-            at, headings, rates = np.array(run.odometry).T
+            at, headings, rates, _ = np.array(run.odometry).T
             turned = max(float(np.mean(rates) * np.ptp(at)),
                          float(np.unwrap(headings)[-1] - headings[0]), key=abs)
         if abs(turned) > MIN_TURN_ANGLE:
@@ -481,13 +517,15 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
         if (covered := float(np.ptp(rows[:, 0]))) < 0.8 * run.duration:
             raise DataRefused(f'{len(rows)} messages came on odom, but in {covered:.0f} s of '
                               f'{run.duration:.0f} s only: check that it does not stop')
-        at, headings, rates = rows.T
+        at, headings, rates, _ = rows.T
         begin, headings = at[0], np.unwrap(headings)
         motion = (motion_from_headings(at, headings) if np.ptp(headings) > MIN_TURN_ANGLE
                   else motion_from_rates(at - begin, rates))
         motion = replace(motion, name='odometry')
     time = time - begin
-    inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
+    # before and after a profile the robot rests, but odometry may begin or end in a turn
+    around = limits.max_time_offset * (-1.0 if by_odometry else 1.0)
+    inside = (time >= -around) & (time <= motion.duration + around)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
                          reference=run.reference_errors if by_odometry else None,
                          output=output[inside], prior=prior)

@@ -33,7 +33,9 @@ from gyro_calibration.logs.cdr import (
     NOT_REPORTED, NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, quaternion_heading, serialize,
     UNMEASURED_VARIANCE, z_axis_covariance)
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.ros.calibration_session import Drive, REST, ROS_TIME_PAUSED
+from gyro_calibration.model.motion import MotionError
+from gyro_calibration.ros.calibration_session import (
+    Drive, read_profile, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.inputs import Clock, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
@@ -88,6 +90,10 @@ class CompensationNode(Node):
                                   self._publish_command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
+        try:
+            read_profile(values.calibration_profile_file)
+        except MotionError as error:
+            self.get_logger().warning(f'{error}; calibrate refuses until it can be read')
         self._receivers = 0
         self._pending_answer: tuple[Trigger.Response, Future] | None = None
         self._timer: Timer | None = None
@@ -363,7 +369,7 @@ class CompensationReport:
         values: dict[str, object] = {
             **counts, 'rate_hz': f'{rate:.1f}',
             'longest_gap_s': f'{tracker.intervals.longest_gap:.3f}',
-            'clock_steps': journal.clock_steps,
+            'clock_steps': journal.clock_steps, 'stamp_pace': f'{pipeline.stamp_delay.pace:.4f}',
             'heading_deg': f'{tracker.heading / DEGREE:.3f}',
             'heading_standard_deviation_deg': f'{deviation:.3f}',
             'deleted_heading_deg': f'{tracker.deleted_heading / DEGREE:.3f}',
@@ -415,9 +421,13 @@ class CompensationReport:
         tolerated = {'lost_samples': 3}  # per report
         growing = {name for name, count in journal.counts.items()
                    if count - self._previous_counts[name] > tolerated.get(name, 0)}
-        silent = self._clock.steady() - journal.last_received
+        now = self._clock.steady()
+        silent = now - journal.last_received
+        # a healthy gyro may begin so, at rest
+        doubt = (pipeline.repeat_suspicion if pipeline.repeat_detector.has_changed
+                 or pipeline.wheels.is_moving(now) else '')
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
-                     or pipeline.repeat_fault or pipeline.repeat_suspicion):
+                     or pipeline.repeat_fault or doubt):
             return ERROR, error
         if pipeline.ros_time.paused_duration > 1.0:
             return ERROR, ROS_TIME_PAUSED
@@ -441,7 +451,8 @@ class CompensationReport:
             f'{high:g} degC; the correction is extrapolated, and its variance increases',
         }.items() if name in growing]
         warnings += filter(None, (
-            pipeline.session.warning, *pipeline.faults.values(), pipeline.heading_loss))
+            pipeline.session.warning, pipeline.repeat_suspicion, *pipeline.faults.values(),
+            pipeline.heading_loss))
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
             warnings.append('no temperature comes; the model is used at its reference temperature '
                             f'of {estimator.model.reference_temperature:g} degC')

@@ -73,7 +73,8 @@ class RepeatedOutputDetector:
     counts does so until the value changes.
 
     A gyro with noise `is_suspected` while it repeats the value of its first sample, whose step is
-    not known, or zero against chance for the first time: it is dead, or shows that at rest.
+    not known, or zero against chance for the first time: it is dead, or shows that at rest. Later
+    such zeros mean that it `is_zeroed`: it has neither noise nor bias now.
 
     A value that was held for less time, but longer than usual and not by chance, leaves a possible
     error of the integrated rate, `unseen_turn`, rad, with the sample that ends it; a full turn
@@ -85,7 +86,7 @@ class RepeatedOutputDetector:
         self._value, self._since, self._count = math.nan, 0.0, 0
         self._last_step = self._acceleration = 0.0  # to this value, rad/s, and rad/s² less noise
         self._reports_zero, self._holds = False, Intervals()
-        self._is_fault = self.is_suspected = self._has_left_zero = False
+        self._is_fault = self.is_suspected = self.is_zeroed = self._has_left_zero = False
         self._first = 0.0, 0  # value, rad/s, and number of samples before the first change
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # Smallest and largest value since a time, s, and the number of samples after the first.
@@ -116,7 +117,8 @@ class RepeatedOutputDetector:
             changed_after = abs(time - self._since)
             if self._holds.add(changed_after) and self._changes > 100 and (
                     self._value or has_noise_at_rest
-                    or self._acceleration > MAX_ANGULAR_ACCELERATION):
+                    or self._acceleration > (_MAX_DECELERATION if self._has_left_zero
+                                             else MAX_ANGULAR_ACCELERATION)):
                 usual, held = self._holds.usual_interval, self._until - self._since
                 sample = self._noise.angle_random_walk / math.sqrt(usual)
                 # a chance of e^-20 is once in 50 days at 100 Hz
@@ -134,7 +136,7 @@ class RepeatedOutputDetector:
                 if sample and self._excludes_chance(self._step, self._first[1], sample):
                     self.unseen_turn = math.tau
                 self._first = 0.0, 0
-            self._is_fault = self.is_suspected = False
+            self._is_fault = self.is_suspected = self.is_zeroed = False
             self._has_left_zero = self._reports_zero
             self._last_step = step
             self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
@@ -159,10 +161,16 @@ class RepeatedOutputDetector:
             or self._excludes_chance(self._step, self._count, sample))
         if output == 0.0 and self._reports_zero and not is_sudden:
             self.is_suspected = not (is_chance or self._has_left_zero)
+            self.is_zeroed = not is_chance and self._has_left_zero
         else:
             self._is_fault = not is_chance
         self.is_suspected = self.is_suspected or sample > 0.0 and self._changes == 1
         return self._is_fault
+
+    @property
+    def has_changed(self) -> bool:
+        """Tell whether a second value came."""
+        return self._changes > 1
 
     def _excludes_chance(self, width: float, count: float, sample: float,
                          level: float = 100.0) -> bool:

@@ -73,6 +73,8 @@ class NodeParameter:
                 self._refuse(value, f'from {low} to {high} {self.unit}'.rstrip())
         if self.choices and value not in self.choices:
             self._refuse(value, self.choices_text)
+        if value == '' and self.default:
+            self._refuse(value, f'not empty, for example {self.default!r}')
         return value
 
     def _refuse(self, value: object, wanted: str) -> None:
@@ -154,6 +156,12 @@ class StampDelay:
             drift = (delay - self._begin[1]) / (then - self._begin[0])
             self._false_turn += (turned - heading) * ((late - delay) / (now - then) - drift)
             self.unknown_turn = max(self.unknown_turn, abs(self._false_turn))
+
+    @property
+    def pace(self) -> float:
+        """Return the mean advance of the stamps in 1 s of the clock, s; nan in the beginning."""
+        (then, before, _), (now, late, _) = self._begin or self._least, self._least
+        return 1.0 - (late - before) / (now - then) if now > then else math.nan
 
     @property
     def min_delay(self) -> float:
@@ -254,12 +262,14 @@ class TurnComparison:
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
     wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Turns by the gyro
+    that are larger than those by odometry, beyond the largest scale factor error that a
+    calibration accepts and two in a row, are of a wrong sensitivity: wheels that slip turn more.
     """
 
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
-        self.is_contradictory = False
+        self.is_contradictory = self.is_larger = self._was_larger = False
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
@@ -302,7 +312,12 @@ class TurnComparison:
         self._path += abs(heading - before)
         self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
-            self.ratio = self._by_gyro / self._by_wheels
+            self.ratio, allowed = (self._by_gyro / self._by_wheels,
+                                   1.0 + RunLimits.max_scale_factor_error)
+            # of one sense: where it changes, late odometry turns less
+            is_larger = (source == ODOMETRY and self.ratio > allowed
+                         and self._path < allowed * abs(self._by_gyro))
+            self.is_larger, self._was_larger = is_larger and self._was_larger, is_larger
             confused, rate = 180.0 / math.pi, self._path / self._duration
             is_wrong = (self.ratio > math.sqrt(confused)
                         and (source == ODOMETRY or self.ratio * rate > confused)
@@ -320,13 +335,15 @@ class AlternateTurns:
     by more than the largest scale factor error that a calibration accepts, in the same proportion
     in turns of a row whose sense changes twice: samples of another gyro, with another axis or
     without a function, have the same topic and frame. A vibration near half the sample rate has
-    the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
-    biases of the two may differ.
+    the opposite proportion in the other sense. Where the stamps alternate between two intervals
+    that differ as much, two such turns in a row suffice. Turns of less than 0.025 rad/s do not
+    count, as the biases of the two may differ.
     """
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, float]] = []  # the last ones, up to 2; s and rad/s
-        self._turned, self._between, self._duration = 0.0, 0.0, 0.0  # rad, rad, s
+        self._turned, self._between = 0.0, 0.0  # rad
+        self._duration = self._before = 0.0  # s, and the part before each sample between, s
         # difference over sum in turns of a row, their last sense, and how often it changed
         self._share, self._sense, self._changes = math.nan, 0.0, 0
         self.is_contradictory = False
@@ -336,28 +353,31 @@ class AlternateTurns:
         self._samples.append((time, rate))
         if len(self._samples) < 3:
             return
-        (begin, before), (_, middle), _ = self._samples
+        (begin, before), (place, middle), _ = self._samples
         self._samples, interval = self._samples[2:], time - begin
         if not 0.0 < interval <= MAX_VELOCITY_AGE:
-            self._turned = self._between = self._duration = 0.0
+            self._turned = self._between = self._duration = self._before = 0.0
             return
         # the mean of both neighbours is the rate between them also while the robot accelerates
         self._turned += 0.5 * (before + rate) * interval
         self._between += middle * interval
         self._duration += interval
+        self._before += place - begin
         total = self._turned + self._between
         if abs(total) > 1.0:  # rad
             apart = self._turned - self._between
             allowed, share = RunLimits.max_scale_factor_error, apart / total
+            after = self._duration - self._before
+            is_uneven = abs(self._before - after) > allowed * max(self._before, after)
             if not abs(apart) > allowed * max(abs(self._turned), abs(self._between)):
                 share = math.nan
             is_alike = abs(share - self._share) <= allowed * abs(share)
             self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
-            self.is_contradictory = self._changes > 1
+            self.is_contradictory = self._changes > 1 or is_alike and is_uneven
             self._share, self._sense = self._share if is_alike else share, total
         elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
             return
-        self._turned = self._between = self._duration = 0.0
+        self._turned = self._between = self._duration = self._before = 0.0
 
 
 class Wheels:

@@ -38,12 +38,12 @@ from gyro_calibration.files import to_printable
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions, HeadingEstimator, MAX_SPECIFIC_FORCE, TEMPERATURE_TIMEOUT)
-from gyro_calibration.heading.integration import MAX_GAP, Threshold
+from gyro_calibration.heading.integration import Intervals, MAX_GAP, Threshold
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
+    CalibrationSession, describe_odometry_clock, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
@@ -121,6 +121,7 @@ class _Journal:
     last_received: float  # time of the last sample, s of the steady clock
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNT_NAMES, 0))
     event: str = ''  # the last one
+    refusal: str = ''  # why the last sample was refused; '' where it was used
     clock_steps: str = ''  # of the host clock
     refused_calibrations: int = 0
     refusal_reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
@@ -161,9 +162,10 @@ class Pipeline:
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
-        self._last_time, self._usual_interval = -math.inf, math.inf
-        self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
+        self._last_time, self._last_stamp = -math.inf, 0
+        self._jump_times = deque[float](maxlen=2)
         self._stamps = deque[int](maxlen=_MAX_LATE_SAMPLES)  # the last ones, in order of arrival
+        self._intervals = Intervals()  # between all of them, so that they can end a conflict
         self._first_frame: str | None = None
         self._frame: str | None = None
         # that the graph lists several publishers, and samples too soon after the one before
@@ -175,11 +177,12 @@ class Pipeline:
         # that the gyro is dead, or may be so
         self.repeat_fault = self.repeat_suspicion = ''
         self.heading_loss, self._last_variance = '', 0.0  # why the heading is unknown; rad²
-        self._repeat_detector = RepeatedOutputDetector(noise)
+        self.repeat_detector = RepeatedOutputDetector(noise)
         self._pulse_detector, self._outlier_count = PulseDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
-        self._stamp_delay = self._new_stamp_delay()
+        self.stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
+        self._odometry_lateness = -math.inf, 0.0  # when it came, and its lateness, s
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
         self._turns, self._alternate_turns = TurnComparison(), AlternateTurns()
@@ -253,14 +256,18 @@ class Pipeline:
             self.estimator.tracker.add_unknown_turn(MIN_TURN_ANGLE)
         elif math.isnan(self._heading_at_rest):
             self._heading_at_rest = heading
+        # how late it is for the last sample, or ahead of one that would come now
+        late = self._last_time - time if self._last_time > -math.inf else 0.0
+        late = max(late, 0.0) or min(late + now - self._last_arrival, 0.0)
+        self._odometry_lateness = now, late
         # A late message is not used, and a contradictory one does not show standstill.
-        if (not self._last_time - time > MAX_VELOCITY_AGE
+        if (not late > MAX_VELOCITY_AGE
                 and (velocity.is_moving or not self._is_odometry_contradictory)):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
             self._compare_turns(ODOMETRY, time, rate,
                                 not velocity.is_moving and not self._is_odometry_contradictory)
-            self.session.add_odometry(time, heading, rate)
+            self.session.add_odometry(time, heading, rate, late)
 
     def _compare_turns(self, source: str, time: float, rate: float, stands: bool = False) -> None:
         """Compare the heading with a rate by odometry or commands, and add an unknown turn."""
@@ -297,7 +304,8 @@ class Pipeline:
     @property
     def faults(self) -> dict[str, str]:
         """Return the faults of clocks, frames and turns, each a sentence or '', by name."""
-        turned, turns = self._stamp_delay.unknown_turn, self._turns
+        turned, turns = self.stamp_delay.unknown_turn, self._turns
+        came, late = self._odometry_lateness
         found = {
             'clock': (self.clock_fault, self.clock_fault),
             'frame': (self._frame != self._first_frame, to_printable(
@@ -311,10 +319,15 @@ class Pipeline:
                      f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check '
                      'the unit and the sense of rotation of the gyro, and those of '
                      f'{turns.source}'),
+            'scale': (turns.is_larger,
+                      f'the gyro turns by {turns.ratio:.2f} times what odom shows: check the '
+                      'sensitivity of the gyro, and diameter and distance of the wheels of odom'),
             'stamp': (turned > MIN_TURN_ANGLE,
                       f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
                       'imu/data_raw advanced faster or slower for a time than before: check that '
                       'the driver stamps by a clock and loses no samples, then reset the heading'),
+            'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came,
+                               describe_odometry_clock(late)),
             'odometry': (self._is_odometry_contradictory,
                          'odom turns by its headings while its rate is zero: check its twist, '
                          'without which it does not show that the robot stands'),
@@ -356,6 +369,8 @@ class Pipeline:
                              'the driver changes their order')
             return None
         self._detect_several_gyros(stamp, frame, now, silence)
+        if 0.0 < (interval := 1e-9 * (stamp - self._last_stamp)) <= self.values.maximum_gap:
+            self._intervals.add(interval)
         self._last_stamp, self._last_arrival = stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
@@ -363,17 +378,19 @@ class Pipeline:
         time = self._since_epoch(stamp)
         if self._clock.simulated() is None:
             self._update_host_clock()
-            time = self._host_time.convert_sample(time, self._last_time, self._usual_interval,
-                                                  silence)
+            time = self._host_time.convert_sample(
+                time, self._last_time, self._intervals.usual_interval, silence)
         if time == self._last_time:
             counts['repeated_stamps'] += 1
             first, fastest = self._frozen_stamp or (now, 0.0)
             self._frozen_stamp = first, max(fastest, abs(output))
             journal.event = (
-                f'the stamp stands still at {time:.3f} s; the sample is not used'
+                f'the stamp stands still at {stamp / NSEC_PER_SEC:.3f} s; the sample is not used: '
+                'check that the driver stamps its samples'
                 if now - first > FAULT_DURATION else
-                f'several samples have the stamp {time:.3f} s, as where a driver stamps a queue '
-                'on its arrival; only the first of them is used: stamp when the gyro measures')
+                f'several samples have the stamp {stamp / NSEC_PER_SEC:.3f} s, as where a driver '
+                'stamps a queue on its arrival; only the first of them is used: stamp when the '
+                'gyro measures')
             return None
         if self._frozen_stamp is not None:
             (first, fastest), self._frozen_stamp = self._frozen_stamp, None
@@ -382,8 +399,6 @@ class Pipeline:
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                  'came; turns in this time are not in the heading')
         interval = time - self._last_time
-        if 0.0 < interval <= self.values.maximum_gap:
-            self._usual_interval = min(interval, self.estimator.tracker.intervals.usual_interval)
         # Perhaps a loss of power; after a mere delay the stamps continue.
         if (now - journal.last_received > _POWER_OFF_SILENCE and interval < math.inf
                 and not 0.0 < interval < _POWER_OFF_SILENCE):
@@ -394,11 +409,11 @@ class Pipeline:
         journal.channels = set() if specific_force is None else {'specific_force'}
         if not self._integrate(time, interval, silence, output, specific_force, now):
             return None
-        self._stamp_delay.add(time, self._heading)
+        self.stamp_delay.add(time, self._heading)
         self._check_repeats(time, output, now)
         self._alternate_turns.add(time, output)
         run, moving = self.session.run, self.wheels.is_moving(now)
-        if moving:
+        if moving or self.repeat_detector.is_zeroed:
             self.monitor.restart()
         elif self.monitor.is_enabled and self.monitor.add(time, output,
                                                           self.estimator.corrected_rate):
@@ -411,12 +426,14 @@ class Pipeline:
 
     def _is_late(self, stamp: int, frame: str) -> bool:
         """Tell whether a sample was overtaken by the last ones, whose stamps left a gap for it."""
-        # two gyros of the same rate leave no gap of one and a half intervals
-        stamps, behind = self._stamps, 1e-9 * (self._last_stamp - stamp)
-        usual = self.estimator.tracker.intervals.usual_interval
-        is_late = (0.0 < behind < _MAX_LATE_SAMPLES * usual < math.inf and frame == self._frame
-                   and not self.publisher_conflict and min(stamps) < stamp
-                   and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
+        stamps, usual = self._stamps, self._intervals.usual_interval
+        behind = 1e-9 * (max(stamps, default=stamp) - stamp)
+        # Before the usual interval is known, what is behind waits; a jump back of the clock shows
+        # when all of the last stamps are beyond it. Two gyros of the same rate leave no gap of one
+        # and a half intervals.
+        is_late = behind > 0.0 and frame == self._frame and not self.publisher_conflict and (
+            usual == math.inf or behind < _MAX_LATE_SAMPLES * usual and min(stamps) < stamp
+            and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
         stamps.append(stamp)
         return is_late
 
@@ -471,13 +488,13 @@ class Pipeline:
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
-            journal.event = (
+            journal.event = journal.refusal = (
                 'a sample without a rate (nan, or -1 in its covariance) is not used'
                 if math.isnan(output) else
-                f'a rate of {output:g} rad/s is beyond the range of this gyro: the sample is not '
-                'used')
+                f'a rate of {output:g} rad/s is beyond the range of this gyro, and not used: '
+                'check that the driver sends rad/s, and the range of the model')
             return False
-        journal.last_received, tracker = now, estimator.tracker
+        journal.last_received, journal.refusal, tracker = now, '', estimator.tracker
         counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)
         counts['beyond_range'] += int(estimator.last_compensated.beyond_range)
         counts['lost_samples'] = tracker.intervals.lost_samples
@@ -486,7 +503,7 @@ class Pipeline:
             counts['restarts'] += 1
             journal.event = f'{restarted}: integration was restarted'
             self.monitor.restart()
-            self._stamp_delay = self._new_stamp_delay()
+            self.stamp_delay = self._new_stamp_delay()
             self._recent_rates.clear()
             self.session.interrupt(restarted)
         elif unseen and moving is not False and tracker.intervals.lost_samples > lost:
@@ -499,10 +516,10 @@ class Pipeline:
     def _corrected_sample(self, stamp: int, time: float) -> CorrectedSample | None:
         """Return what is published of the present state; None where it is not finite."""
         estimator, tracker, known = self.estimator, self.estimator.tracker, self._noise_is_known
-        spread = (0.0 if known and self._usual_interval < math.inf
-                  else self.values.assumed_bias ** 2)
+        usual = self._intervals.usual_interval
+        spread = 0.0 if known and usual < math.inf else self.values.assumed_bias ** 2
         # After a reset the variance is that of one sample; zero would state an exact heading.
-        least = tracker.rate_variance * min(self._usual_interval, 1.0) ** 2
+        least = tracker.rate_variance * min(usual, 1.0) ** 2
         found = CorrectedSample(stamp + self._stamp_offset, tracker.heading,
                                 max(self.heading_variance, least) if known
                                 else UNMEASURED_VARIANCE,
@@ -531,16 +548,16 @@ class Pipeline:
         """Detect repeated values and pulses, and add an unknown turn to the heading."""
         outliers, self._outlier_count = self._outlier_count, self.estimator.tracker.outlier_count
         pulse, size = self._pulse_detector.add(time, output)
-        is_repeated = self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
-                                                self.monitor.has_noise_at_rest)
+        is_repeated = self.repeat_detector.add(time, output, self.wheels.turn_rate(now),
+                                               self.monitor.has_noise_at_rest)
         self.repeat_suspicion = (
             f'the gyro repeats the rate {output:g} rad/s without the noise of its model: it is '
             'dead, or shows this at rest; turn the robot to find out'
-            if self._repeat_detector.is_suspected and not is_repeated else '')
+            if self.repeat_detector.is_suspected and not is_repeated else '')
         if not is_repeated:
             if self._outlier_count > outliers:  # the tracker has not used the sample
                 pulse = 0.0
-            unseen = math.hypot(self._repeat_detector.unseen_turn, pulse)
+            unseen = math.hypot(self.repeat_detector.unseen_turn, pulse)
             if unseen and not self.repeat_fault:  # several samples may be a turn
                 self.estimator.tracker.add_unknown_turn(unseen, -pulse if size == 1 else 0.0)
             self.repeat_fault = ''
@@ -608,6 +625,8 @@ class Pipeline:
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
         conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
+        if self._clock.steady() - self.journal.last_received > RunLimits.max_gap:
+            conflict = conflict or self.journal.refusal
         self.session.poll(self.values, receivers,
                           self.ros_time.paused_duration > FAULT_DURATION, conflict)
 
@@ -617,9 +636,9 @@ class Pipeline:
             self._update_host_clock()
         # Two faults in a row: delayed samples come in a burst, and are late until then.
         before = self._suspected_clock_fault
-        self._suspected_clock_fault = self._stamp_delay.find_fault()
+        self._suspected_clock_fault = self.stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
-        unknown, tracker = self._stamp_delay.unknown_turn, self.estimator.tracker
+        unknown, tracker = self.stamp_delay.unknown_turn, self.estimator.tracker
         added = unknown ** 2 - self._stamp_turn ** 2
         if added > 0.01 * tracker.variance:  # else the deviation changes by less than 0.5 %
             tracker.add_unknown_turn(math.sqrt(added))
@@ -636,7 +655,7 @@ class Pipeline:
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
-        self._stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
+        self.stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
         if self.conflict or self.repeat_fault:  # turns are not measured now
             self.estimator.set_heading(0.0, math.tau ** 2)
         return 'the heading is zero here and now'

@@ -455,11 +455,12 @@ def test_odometry_that_cannot_be_used_is_refused(tmp_path, spoil, reason):
 
 @pytest.mark.parametrize('spoil, reason', [
     (lambda time, heading: heading + 0.15 * (time > 6.0), 'differs by .* deg from the odometry'),
+    (lambda time, heading: heading - 2.0 * (time > 6.0), 'odom jumps by 11. deg at 6.0 s'),
     (lambda time, heading: heading * (time < 6.0), 'of the odometry|the gyro .* the odometry'),
     (lambda time, heading: heading / DEGREE, 'the odometry in deg and read as rad'),
     (lambda time, heading: -heading, 'the other way than the odometry'),
     (lambda time, heading: 0.0, 'the odometry does not turn')],
-    ids=['a jump', 'a reset', 'deg', 'sense', 'no turn'])
+    ids=['a slip', 'a jump', 'a reset', 'deg', 'sense', 'no turn'])
 def test_what_is_wrong_with_odometry_is_not_said_of_a_profile(tmp_path, spoil, reason):
     rig = rested(tmp_path, calibration_reference=ODOMETRY)
     begin = rig.clock.now
@@ -469,6 +470,46 @@ def test_what_is_wrong_with_odometry_is_not_said_of_a_profile(tmp_path, spoil, r
     turn_to_and_fro(rig, 13.5)
     success, message = rig.session.conclude()
     assert not success and re.search(reason, message) and 'profile' not in message, message
+
+
+@pytest.mark.parametrize('late, is_missing, reason', [
+    (-5.0, lambda time: False, 'odom is stamped 5.0 s ahead of imu/data_raw'),
+    (3600.0, lambda time: False, 'odom is stamped 3600.0 s behind imu/data_raw'),
+    (0.0, lambda time: 2.0 < time < 9.0, 'no message came on odom for 7.0 s, from 2.0 s'),
+    (0.0, lambda time: 4.5 < time < 6.5, '')],
+    ids=['ahead', 'behind', 'a gap with two turns', 'a gap at rest'])
+def test_a_clock_or_gap_of_odometry_is_named_as_the_cause_of_a_refusal(
+        tmp_path, late, is_missing, reason):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    begin, odometry = rig.clock.now, rig.odometry
+    rig.odometry = lambda stamp, reading: is_missing(rig.clock.now - begin) or odometry(
+        stamp - round(1e9 * late), reading)
+    turn_to_and_fro(rig, 13.5)
+    assert ('odom is stamped' in rig.pipeline.faults['odometry_clock']) == bool(late)
+    success, message = rig.session.conclude()
+    assert reason in message and success != bool(reason), message
+
+
+@pytest.mark.parametrize('turns', [
+    ((0.0, 16.0), (0.6, 6.0), (-0.6, 5.0)), ((0.7, 3.0), (0.0, 15.0), (-0.7, 9.0))],
+    ids=['a turn at the end', 'turns at both ends'])
+def test_odometry_may_begin_and_end_in_a_turn(tmp_path, turns):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    if turns[0][0]:
+        rig.turn(turns[0][0], 2.0)
+    rig.begin(ODOMETRY)
+    for each in turns:
+        rig.turn(*each)
+    success, message = rig.session.conclude()
+    assert success and stored(rig).scale_factor_error == pytest.approx(SCALE, abs=5e-3), message
+
+
+def test_a_gyro_beyond_its_range_during_a_calibration_is_named_by_its_rate(tmp_path):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    rig.robot.distort = lambda output: output * 57.3 * 3.0
+    turn_to_and_fro(rig, 13.5)
+    success, message = rig.session.conclude()
+    assert not success and 'beyond the range of this gyro, and not used' in message
 
 
 @pytest.mark.parametrize('kind', [ODOMETRY, TURNS])
@@ -574,4 +615,7 @@ def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature
     for number, noise in enumerate(1e-5 * np.random.default_rng(1).standard_normal(520)):
         run.add(0.02 * number, BIAS, BIAS + noise, 25.0)
     with pytest.raises(DataRefused, match='the gyro is dead'):
+        fit_run(run, Noise(), '')
+    run.outputs = [0.0 for _ in run.outputs]
+    with pytest.raises(DataRefused, match='sets its output to zero at rest'):
         fit_run(run, Noise(), '')

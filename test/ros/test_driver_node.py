@@ -51,7 +51,8 @@ KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temper
     ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
     ({'baud': -1}, 'parameter baud is -1, but must be from 0 to 4000000 bit/s'),
     ({'sample_rate': 'often'}, "parameter sample_rate is 'often', but must be a number"),
-    ({'axis': 'w'}, "parameter axis is 'w', but must be x, y or z")])
+    ({'axis': 'w'}, "parameter axis is 'w', but must be x, y or z"),
+    ({'frame_id': ''}, "parameter frame_id is '', but must be not empty, for example 'gyro'")])
 def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
     with pytest.raises(ValueError, match=sentence) as refused:
         values = parameter_values(PARAMETERS, given)
@@ -278,10 +279,12 @@ def test_an_impossible_parameter_ends_it_with_one_sentence(start_node):
 
 def test_a_mistyped_parameter_is_named_and_the_end_of_its_terminal_ends_a_node_as_ctrl_c_does(
         start_node, wait_until, tmp_path):
-    node = start_node('compensation_node', {'calibration_file': tmp_path / 'own.yaml',
-                                            'wheel': 'odom'})
-    words = 'there is no parameter wheel, and its value is not used: is wheels meant?'
-    wait_until(lambda: words in node.output, what=words)
+    node = start_node('compensation_node', {
+        'calibration_file': tmp_path / 'own.yaml', 'wheel': 'odom',
+        'calibration.profile_file': tmp_path / 'gone.csv'})
+    for words in ('there is no parameter wheel, and its value is not used: is wheels meant?',
+                  'gone.csv'):
+        wait_until(lambda: words in node.output, what=words)  # noqa: B023
     assert node.stop(signal.SIGHUP) == 0, 'it has stopped the robot'
 
 
