@@ -29,7 +29,7 @@ from gyro_calibration.diagnosis.causes import sized_finding
 from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.gates import (
     fit_line, identify_unit_factor, is_at_rest, is_implausible_factor, model_scale_factor,
-    reference_rate, resample_reference, select_reference, UNIT_FACTORS)
+    reference_rate, resample_reference, select_reference, spline_rate, UNIT_FACTORS)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps, encoder_step, find_codes, find_runs, QuantizationCodes, robust_deviation,
@@ -345,7 +345,9 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     log, notes = select_reference(log)
     resampled = resample_reference(log)
     output, rate = require_output(log), reference_rate(resampled)
-    has_output = np.isfinite(output)
+    has_output, heading = np.isfinite(output), resampled.reference_heading
+    if log.time is not None and log.reference_rate is None and heading is not None:
+        rate = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
     line = None if rate is None else fit_line(log.time, rate, output)
     units = []
     if rate is not None and line is not None:

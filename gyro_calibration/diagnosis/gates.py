@@ -44,6 +44,7 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy import stats
 from scipy.interpolate import make_interp_spline
+from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
 _FACTORS = {'pi/180': DEGREE, '180/pi': 1.0 / DEGREE, '2': 2.0, '1/2': 0.5}
@@ -112,10 +113,16 @@ def reference_rate(log: Log) -> Array | None:
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         return log.reference_rate
     if (log.reference_heading is None or log.time is None
-            or len(log) < 6 or np.isfinite(log.reference_heading).sum() < 2):
+            or np.isfinite(log.reference_heading).sum() < 2):
         return None
-    return np.where(np.isfinite(log.reference_heading),
-                    spline_rate(log.time, log.reference_heading), np.nan)
+    known = np.isfinite(log.reference_heading)
+    # parabolas over 0.15 s; shorter ones would show the quantization of the heading
+    length = min(max(5, 2 * round(0.075 / float(np.median(np.diff(log.time)))) + 1),
+                 (len(known) - 1) // 2 * 2 + 1)
+    if length < 3:
+        return None
+    smooth = savgol_filter(bridge_gaps(log.reference_heading), length, 2)
+    return np.where(known, np.gradient(smooth, log.time), np.nan)
 
 
 def spline_rate(time: Array, heading: Array) -> Array:
