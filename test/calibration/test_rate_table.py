@@ -84,6 +84,20 @@ def test_no_dwell_is_taken_as_exact(stated):
     assert np.abs(errors).max() < 4.0
 
 
+def test_a_complete_model_lacks_an_effect_as_rarely_as_the_p_value_says():
+    chances, rates = {0.0: [], 2e-3: []}, np.append(0.0, np.outer(np.arange(1, 8), [0.5, -0.5]))
+    for seed in range(50):
+        generator = np.random.default_rng(seed)
+        truth = [5e-3, 1e-2] * generator.standard_normal(2)
+        noise = 1e-4 * generator.standard_normal(15)
+        for asymmetry, found in chances.items():
+            error = truth @ [np.ones(15), rates] + asymmetry * np.abs(rates) + noise
+            found.append(fit_effects(dwells(rates, error),
+                                     [BIAS, SCALE_FACTOR_ERROR]).fit_p_value)
+    assert np.sum(np.array(chances[0.0]) < 0.01) <= binom.ppf(1.0 - RARE, 50, 0.01)
+    assert np.max(chances[2e-3]) < 0.01
+
+
 def test_dwells_of_any_deviations_beside_each_other_are_no_error():
     """Outputs on few steps have means without scatter, to rounding, beside ones with much."""
     generator = np.random.default_rng(0)
