@@ -15,9 +15,9 @@ The error of a dwell, output less rate, is the sum of the effects and of three s
 that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
 that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
 dwells of one sweep do not count as thirty independent ones: about a smooth surface over rate and
-temperature, as about too few effects they would include the error of a missing effect. The prior is
-uniform in the deviation of the quietest dwell, relative to all (Chung et al. 2013, Psychometrika
-78:685): by the likelihood alone, a single dwell of small deviation is taken as exact.
+temperature, as about too few effects they would include the error of a missing effect. The prior
+is uniform in the deviation of the quietest dwell, relative to all (Chung et al. 2013,
+Psychometrika 78:685): by the likelihood alone, a dwell of small deviation may be taken as exact.
 
 The covariance of the values states how well the dwells determine them, if the model is complete
 and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
