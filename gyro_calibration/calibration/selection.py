@@ -133,8 +133,7 @@ def _choice_covariance(fit: Calibration) -> Array | float:
     if not slopes or not fit.dof or BIAS_TEMPERATURE_QUADRATIC in fit.effects:
         return 0.0
     assert fit.used.temperature is not None
-    others = [effect for effect in STATIC_EFFECTS.values()
-              if not {effect, CONFOUNDERS.get(effect)} & {*fit.effects}
+    others = [effect for effect in STATIC_EFFECTS.values() if effect not in fit.effects
               and 'temperature' not in effect.inputs and not effect.nonlinear_parameters]
     found = [fit]
     for count in range(1, len(slopes) + 1):
