@@ -72,7 +72,6 @@ class Calibration:
     condition_number: float  # number of the columns, each of length one
     dof: int  # dwells less fitted values
     misfit: float  # sum of the whitened squared residuals; about `dof` where no effect is missing
-    choice_covariance: Array | float = 0.0  # of the values by the choice of the effects, (m, m)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -113,10 +112,8 @@ class Calibration:
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
         output, temperature = self.used.output, self.used.temperature
-        model = GyroModel(
-            self.terms,
-            self.uncertainty.covariance() + self.choice_covariance if self.dof else None,
-            (float(output.min()), float(output.max())))
+        model = GyroModel(self.terms, self.uncertainty.covariance() if self.dof else None,
+                          (float(output.min()), float(output.max())))
         if temperature is not None:
             model = replace(
                 model, temperature_range=(float(temperature.min()), float(temperature.max())),

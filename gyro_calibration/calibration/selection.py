@@ -19,21 +19,20 @@ distinguish them, the one by the physics of the instrument is taken, if the inst
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 import math
 
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import (
-    Calibration, channels_of, CONFOUNDERS, fit_effects, sensitivity_columns)
+    Calibration, channels_of, CONFOUNDERS, fit_effects)
 from gyro_calibration.calibration.scatter import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
-    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, Channels, CUBIC_NONLINEARITY, Effect,
+    BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, Effect,
     SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
-from scipy.special import softmax
 from scipy.stats import f as fisher
 
 #: Probability of taking an effect that is not there, and of a false alarm in a fleet.
@@ -101,7 +100,6 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> SelectedEff
     best = _add_slopes(find_supported_effects(dwells, FALSE_ALARM_RATE, base=base))
     best, confounders = resolve_confounders(
         best, technology, None if technology else SINE_RESPONSE)
-    best = replace(best, choice_covariance=_choice_covariance(best))
     tried = len(STATIC_EFFECTS) - len({*BASIC_EFFECTS} & {*best.effects})
     choices = (_explain_choice(best, effect, FALSE_ALARM_RATE / tried, confounders)
                for effect in STATIC_EFFECTS.values())
@@ -117,39 +115,6 @@ def _add_slopes(fit: Calibration) -> Calibration:
                 and extended.effect_deviation(slope) < typical_deviation):
             fit = extended
     return fit
-
-
-def _choice_covariance(fit: Calibration) -> Array | float:
-    """
-    Return the covariance of the values by the choice between slopes and another effect, (m, m).
-
-    Over few kelvins, slopes belong to the model without being significant, and may explain what a
-    nonlinearity causes. Fits with no more effects, in which another one replaces slopes, or none,
-    have the weights of the Bayesian information criterion (Kass and Raftery 1995); their distance
-    is that of their rates between the dwells' rates and temperatures.
-    """
-    slopes = [effect for effect in (BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE)
-              if effect in fit.effects]
-    if not slopes or not fit.dof or BIAS_TEMPERATURE_QUADRATIC in fit.effects:
-        return 0.0
-    assert fit.used.temperature is not None
-    others = [effect for effect in STATIC_EFFECTS.values() if effect not in fit.effects
-              and 'temperature' not in effect.inputs and not effect.nonlinear_parameters]
-    found = [fit]
-    for count in range(1, len(slopes) + 1):
-        for removed in combinations(slopes, count):
-            kept = tuple(effect for effect in fit.effects if effect not in removed)
-            found += filter(None, (try_fit(fit, each)
-                                   for each in (kept, *((*kept, other) for other in others))))
-    rate, temperature = (values.ravel() for values in np.meshgrid(*(
-        np.linspace(values.min(), values.max(), count)
-        for values, count in ((fit.used.rate, 21), (fit.used.temperature, 3)))))
-    channels, size = Channels(rate, rate, temperature), len(fit.used)
-    logarithms = np.array([-0.5 * (size * math.log(max(each.misfit, 1e-300))
-                                   + (size - each.dof) * math.log(size)) for each in found])
-    errors = np.array([GyroModel(each.terms).error(channels) for each in found])
-    changes = (errors - errors[0]) @ np.linalg.pinv(sensitivity_columns(channels, fit.terms)).T
-    return np.asarray((softmax(logarithms) * changes.T) @ changes)
 
 
 def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
