@@ -81,6 +81,9 @@ class ScaleBiasFit:
     start_heading_deviation: float = math.nan
     residual_squares: float = math.nan  # their sum, in units of white noise of 1 rad/√s
     dof: float = 0.0  # degrees of freedom of these
+    # ln of the likelihood of each ratio of the noises of gyro and reference, the variance of the
+    # gyro's, rad²/s, and degrees of freedom, shape (k, 3)
+    noise_profile: Array = field(default_factory=lambda: np.empty((0, 3)))
     goodness: GoodnessOfFit | None = None  # None where the noise is not known
     slip_deviation: float = 0.0  # of the fraction that each turn of a profile lost, 1
     # √6 times the rms of the difference of the headings that the fit leaves, rad
@@ -529,10 +532,11 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, weighted: Ar
 
 
 def _average_over_noise(data: _Increments, prior_factors: Array,
-                        has_shaft: bool) -> tuple[Array, Array, _Estimate]:
+                        has_shaft: bool) -> tuple[Array, Array, _Estimate, Array]:
     """
-    Return means over all ratios of noises and factors of priors, covariance, likeliest estimate.
+    Return means over all ratios of noises and factors of priors, and their covariance.
 
+    The others are the likeliest estimate, and `ScaleBiasFit.noise_profile`.
     An error of the shaft is included only where the likelihoods show it: over less than a
     revolution it has nearly the effect of a scale factor error. Errors that repeat count once.
     """
@@ -553,7 +557,9 @@ def _average_over_noise(data: _Increments, prior_factors: Array,
                 MIN_FIT_PROBABILITY):
             logarithms[has_error] = -math.inf
     weights = softmax(logarithms)
-    return (*average_hypotheses(weights, values, covariances), estimates[int(weights.argmax())])
+    profile = np.column_stack([logarithms, [(each.rate_variance, each.dof) for each in estimates]])
+    return (*average_hypotheses(weights, values, covariances), estimates[int(weights.argmax())],
+            profile)
 
 
 def _repetition(data: _Increments, estimate: _Estimate) -> float:
@@ -660,8 +666,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         cross_rotation = np.empty((len(motion.time), 0))
     alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation,
                               cross_rotation, bias_wanders)
-    offset, data, averages, averaged_covariance, estimate, response_deviation = _fit_offset(
-        alignment, largest_time_offset)
+    offset, data, averages, averaged_covariance, estimate, profile, response_deviation = (
+        _fit_offset(alignment, largest_time_offset))
     values = estimate.values[:2]
     covariance = averaged_covariance[:2, :2] + np.diag([response_deviation ** 2, 0.0])
     start = math.nan, math.nan
@@ -684,6 +690,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
     dof = alone.dof + (not alignment.is_measured)
+    if not alignment.is_measured:
+        profile = np.array([[0.0, residual_squares / dof, dof]])
     reference_noise = (math.sqrt(estimate.rate_variance * estimate.noise.ratio)
                        / abs(_nonzero_scale(estimate.values[0])))
     return ScaleBiasFit(
@@ -692,7 +700,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
          math.sqrt(found.explained_squares) / noise_deviation),
         math.sqrt(averaged_covariance[2, 2]),
         np.column_stack([estimate.influence(data), data.time[1:]]), (begin, end), *start,
-        residual_squares, dof, slip_deviation=_rms_slip(data, averages, slip_deviation),
+        residual_squares, dof, profile, slip_deviation=_rms_slip(data, averages, slip_deviation),
         heading_difference=math.sqrt(6.0 * np.mean(np.cumsum(estimate.residual) ** 2)),
         response_deviation=response_deviation,
         misalignment=estimate.values[of_axes],
@@ -709,14 +717,15 @@ def _rms_slip(data: _Increments, values: Array, slip_deviation: float) -> float:
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
-        float, _Increments, Array, Array, _Estimate, float]:
+        float, _Increments, Array, Array, _Estimate, Array, float]:
     """
     Return the time offset, s, the increments there, and their fits.
 
     First values and covariance averaged over the noise, then the estimate at the likeliest one,
-    and the standard deviation of the scale by a lag that the motion does not determine. Half the
-    variance of the times by which a smoothed heading, or a gyro, is late is from 0, of a delay, to
-    half the square of their mean, of a first-order lag, a standard deviation of the prior.
+    the profile, and the deviation of the scale by a lag that the motion does not determine. Half
+    the variance of the times by which a smoothed heading, or a gyro, is late is from 0, of a
+    delay, to half the square of their mean, of a first-order lag, a standard deviation of the
+    prior.
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
@@ -732,8 +741,8 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
                     data, estimate, offset, possible)
                 alignment.set_lag(float(estimate.values[3]))
             data = alignment.increments_at(offset, lag)
-        values, covariance, estimate = _average_over_noise(data, prior_factors,
-                                                           alignment.has_shaft)
+        values, covariance, estimate, profile = _average_over_noise(data, prior_factors,
+                                                                    alignment.has_shaft)
         for _ in range(8):
             for _ in range(3 * alignment.is_measured):
                 # errors in variables: with the reference smoothed by the gyro as the instrument
@@ -758,7 +767,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
                 and np.abs(alignment.shaft_error ** 2 - shaft_error ** 2).max() < 1e-6):
             break
     assert estimate is not None
-    return offset, data, values, covariance, estimate, response_deviation
+    return offset, data, values, covariance, estimate, profile, response_deviation
 
 
 #: Largest additional delay of a robot that follows its profile with a lag, s.

@@ -29,7 +29,7 @@ from gyro_calibration.calibration.dwells import (
     Dwells, MIN_TEMPERATURE_SPREAD, Numbers, select_dwells)
 from gyro_calibration.calibration.scatter import (
     cross_validation_parts, estimate_scatter, estimate_tolerance, rms, Scatter, sum_by_part,
-    Uncertainty, Whitener)
+    surface_dof, Uncertainty, Whitener)
 from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -202,6 +202,14 @@ class Calibration:
         columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         return (known, error - known @ (known.T @ error),
                 columns - known @ (known.T @ columns))
+
+    @property
+    def fit_p_value(self) -> float:
+        """Return the p-value of the residual, by an F test against the surface of the scatter."""
+        spare = surface_dof(self.used)
+        beyond = self.dof - spare
+        return (1.0 if min(spare, beyond) < 1 else
+                float(fisher.sf((self.misfit - spare) / beyond, beyond, spare)))
 
     @cached_property
     def given_errors(self) -> Array:

@@ -15,7 +15,9 @@ The error of a dwell, output less rate, is the sum of the effects and of three s
 that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
 that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
 dwells of one sweep do not count as thirty independent ones: about a smooth surface over rate and
-temperature, as about too few effects they would include the error of a missing effect.
+temperature, as about too few effects they would include the error of a missing effect. The prior
+is uniform in the deviation of the quietest dwell, relative to all (Chung et al. 2013,
+Psychometrika 78:685): by the likelihood alone, a dwell of small deviation may be taken as exact.
 
 The covariance of the values states how well the dwells determine them, if the model is complete
 and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
@@ -169,12 +171,15 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
                        inliers=kept)  # type: ignore[misc]
 
     def deviance(logarithms: Array) -> float:
-        """Return -ln of the restricted likelihood, up to a constant."""
+        """Return -ln of the restricted likelihood and the prior, up to a constant."""
         tried = scatter(logarithms)
         deviation = tried.deviation(used)
         log_determinant, misfit, *_ = _fit_values(
             used, deviation, surface, error, np.array([[tried.sweep_bias, tried.sweep_scale]]))
-        return 0.5 * float(log_determinant[0] + 2.0 * np.log(deviation).sum() + misfit[0])
+        # the likelihood does not fall where the values pass through a dwell that is taken as exact
+        exactness = math.log(rms(deviation) / deviation.min())
+        return exactness + 0.5 * float(
+            log_determinant[0] + 2.0 * np.log(deviation).sum() + misfit[0])
 
     # a simplex would collapse onto a bound
     best = minimize(

@@ -39,7 +39,7 @@ from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtr, chdtrc, ndtr, ndtri
+from scipy.special import chdtrc, ndtr, ndtri
 
 #: Standard deviations from which on a stretch is a slip: 6 of 800 good runs exceed it, and 1 deg,
 #: with three times the noise of the XV-3500, none with its own.
@@ -160,13 +160,18 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
     _refuse_fit(fit, run, motion, limits, white_noise)
-    # a reference that follows the noise of the gyro: that of the model, or less by the samples
+    # A reference that follows the noise of the gyro, that of the model, or less by the samples: by
+    # the likelihood ratio to the same fits with at least this noise.
     own = min(noise.angle_random_walk, white_noise) ** 2
-    if own and fit.dof and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-_MIN_SLIP_SIGMAS):
-        raise DataRefused(
-            'the reference is computed from this gyro, since they differ by '
-            f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
-            'gyro: give a reference without it, such as odometry of the wheels')
+    if own and fit.dof:
+        likelihood, variance, dof = fit.noise_profile.T
+        share = np.minimum(variance / own, 1.0)
+        with_noise = likelihood - 0.5 * dof * (share - 1.0 - np.log(share))
+        if chdtrc(1.0, 2.0 * (likelihood.max() - with_noise.max())) < MIN_FIT_PROBABILITY:
+            raise DataRefused(
+                'the reference is computed from this gyro, since they differ by '
+                f'{math.sqrt(share[likelihood.argmax()]):.2f} times the noise of the '
+                'gyro: give a reference without it, such as odometry of the wheels')
     return fit
 
 

@@ -26,7 +26,8 @@ from gyro_calibration.calibration.encoder import calibrate, EncoderCalibration
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.rate_table import bin_errors, Calibration
 from gyro_calibration.calibration.scatter import MIN_SWEEPS, rms
-from gyro_calibration.calibration.selection import SelectedEffects, TECHNOLOGY_EFFECTS
+from gyro_calibration.calibration.selection import (
+    FALSE_ALARM_RATE, SelectedEffects, TECHNOLOGY_EFFECTS)
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
@@ -277,7 +278,7 @@ def _describe_excess(fit: Calibration) -> Iterator[str]:
     if not fit.dof:
         return
     excess, used = math.sqrt(fit.misfit / fit.dof), fit.used
-    if excess > 1.2:
+    if excess > 1.2 and fit.fit_p_value < FALSE_ALARM_RATE:
         yield (f'The residual is {excess:.1f} times the scatter of the dwells about a smooth '
                'surface: the model lacks an effect. The intervals are widened by this factor.')
     # Where most rates occur once, nothing shows the scatter of dwells beyond their own noise.

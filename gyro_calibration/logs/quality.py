@@ -11,7 +11,7 @@
 """The quality of samples: white noise, quantization, outliers, repeated and saturated samples."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.logs.columns import ROTATIONS
@@ -94,14 +94,25 @@ def find_codes(values: Array) -> QuantizationCodes:
     gaps = np.diff(codes.values)
     if not gaps.size:
         return codes
-    # where many codes do not occur, few gaps are as small as the step
-    for start in sorted(
-            {float(gap) for gap in np.quantile(gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5))},
-            reverse=True):
-        step, aligned, deviation = _refine_step(codes, start)
-        if aligned > _MIN_ALIGNMENT:
-            return QuantizationCodes(codes.values, codes.counts, step, aligned, deviation)
-    return codes
+    # where many codes do not occur, few gaps are as small as the step, or none is
+    starts = {*np.quantile(gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5)).tolist(),
+              gaps.min() / 2.0, gaps.min() / 3.0}
+    fitting = [replace(codes, step=step, alignment=length, step_deviation=deviation)
+               for step, length, deviation in (
+                   _refine_step(codes, start) for start in sorted(starts, reverse=True))
+               if length > _MIN_ALIGNMENT]
+    # The best one, and the coarsest of equal ones. A few frequent codes, of rests and turns, fit
+    # many steps, and the codes of a ramp nearly its change from sample to sample.
+    seldom = np.minimum(codes.counts, np.median(codes.counts))
+    aligned = [abs(_mean_phasor(codes.values, seldom, each.step)) for each in fitting]
+    if max(aligned, default=0.0) > _MIN_ALIGNMENT:
+        return fitting[int(np.argmax(np.round(aligned, 6)))]
+    return (*fitting, codes)[0]
+
+
+def _mean_phasor(values: Array, counts: Array, step: float) -> complex:
+    """Return the mean phasor of the positions of values on a lattice."""
+    return complex(np.sum(counts * np.exp(2j * np.pi * values / step)) / counts.sum())
 
 
 def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, float]:
@@ -117,13 +128,12 @@ def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, f
     reach, deviation = float(span[first]) / step + 0.5, 0.0
     while True:
         within = np.abs(place) < reach * step
-        # the mean phasor of the positions on the lattice, without the most frequent one: a value
-        # at every rest would outweigh all others
+        # without the most frequent code: a value at every rest would outweigh all others
         counts = codes.counts[within]
         if len(counts) > 1:
             counts = np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
-        mean = np.sum(counts * np.exp(2j * np.pi * place[within] / step)) / counts.sum()
-        aligned, offset = float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
+        mean = _mean_phasor(place[within], counts, step)
+        aligned, offset = abs(mean), float(np.angle(mean)) * step / (2.0 * np.pi)
         if aligned < _MIN_ALIGNMENT:
             return step, aligned, deviation
         number = np.rint((place[within] - offset) / step)
@@ -289,18 +299,22 @@ def refuse_dead(output: Array) -> None:
 
 def refuse_saturated(output: Array) -> None:
     """Refuse an output that is clipped at its largest or smallest value."""
-    # Not if its codes are too coarse to show its noise: less than a fifth of neighbouring samples
-    # differ in the flattest quarter of blocks of ten samples away from the extreme values.
+    # A range holds both senses: the lesser end of turns one way is a rest, and no limit.
+    values, counts = np.unique(output, return_counts=True)
+    ends = [end for end in (-1, 0) if abs(values[end]) > 0.5 * np.abs(values).max()]
+    # Not if its codes are too coarse to show its noise at any place in a step: most of the
+    # flattest quarter of blocks of ten samples, away from the limits, hold one or two values.
     blocks = output[:len(output) // 10 * 10].reshape(-1, 10)
-    blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
+    blocks = blocks[~np.isin(blocks, values[ends]).any(axis=1)]
     slopes = np.abs(blocks[:, 5:].mean(axis=1) - blocks[:, :5].mean(axis=1))
     flattest = blocks[np.argsort(slopes)[:len(blocks) // 4]]
-    if not len(flattest) or not np.mean(np.diff(flattest, axis=1) != 0.0) > 0.2:
+    differing = np.count_nonzero(np.diff(np.sort(flattest), axis=1), axis=1)
+    if not len(flattest) or np.median(differing) < 2:
         return
     # A clipped output has at least 10 samples and 0.5 % of all at a limit, and three times as many
     # as at the next value.
-    values, counts = np.unique(output, return_counts=True)
-    for end, neighbour in ((-1, -2), (0, 1)):
+    for end in ends:
+        neighbour = -2 if end else 1
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
             raise DataRefused(f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of '
                               f'the samples are at its limit of {values[end] / DEGREE:.4g} deg/s; '

@@ -64,6 +64,40 @@ def test_the_steps_of_a_coarse_output_are_in_the_intervals_of_bias_and_scale(noi
         assert (np.abs(values - truth) < 4.0 * np.sqrt(np.diag(found.model.covariance))).all()
 
 
+@pytest.mark.parametrize('stated', [False, True])
+def test_no_dwell_is_taken_as_exact(stated):
+    """A single rest beside turns, as if it scattered less, and a dwell of a tiny deviation."""
+    rate, noise = np.append(0.0, np.outer(np.arange(1, 8), [0.5, -0.5])), 1e-4
+    errors = []
+    for seed in range(40):
+        generator = np.random.default_rng(seed)
+        truth = [5e-3, 1e-2] * generator.standard_normal(2)
+        output = rate + truth @ [np.ones(15), rate] + noise * generator.standard_normal(15)
+        deviation = np.full(15, noise if stated else math.nan)
+        deviation[generator.integers(15)] *= 1e-3
+        found = fit_effects(dwells(rate, output - rate, deviation=deviation),
+                            [BIAS, SCALE_FACTOR_ERROR])
+        sizes = np.sqrt(np.diag(found.model.covariance))
+        errors.append((np.concatenate([term.values for term in found.terms]) - truth) / sizes)
+        # a quarter of that by dwells that are known to be alike
+        assert sizes[0] > 0.25 * noise / math.sqrt(15)
+    assert np.abs(errors).max() < 4.0
+
+
+def test_a_complete_model_lacks_an_effect_as_rarely_as_the_p_value_says():
+    chances, rates = {0.0: [], 2e-3: []}, np.append(0.0, np.outer(np.arange(1, 8), [0.5, -0.5]))
+    for seed in range(50):
+        generator = np.random.default_rng(seed)
+        truth = [5e-3, 1e-2] * generator.standard_normal(2)
+        noise = 1e-4 * generator.standard_normal(15)
+        for asymmetry, found in chances.items():
+            error = truth @ [np.ones(15), rates] + asymmetry * np.abs(rates) + noise
+            found.append(fit_effects(dwells(rates, error),
+                                     [BIAS, SCALE_FACTOR_ERROR]).fit_p_value)
+    assert np.sum(np.array(chances[0.0]) < 0.01) <= binom.ppf(1.0 - RARE, 50, 0.01)
+    assert np.max(chances[2e-3]) < 0.01
+
+
 def test_dwells_of_any_deviations_beside_each_other_are_no_error():
     """Outputs on few steps have means without scatter, to rounding, beside ones with much."""
     generator = np.random.default_rng(0)

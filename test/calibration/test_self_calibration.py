@@ -16,11 +16,13 @@ The methods reproduce the paper's numbers, and the fit finds the truth with its 
 
 import contextlib
 from dataclasses import replace
+import math
 
 from chance import fewest, mean_bound, most, rms_bounds
 from coarse_output import run as run_coarse
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias, fit_heading, fit_likelihood, fit_rate, ReferenceErrors, self_calibrate)
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, motion_from_headings, motion_from_rates)
@@ -48,6 +50,22 @@ def sampled(motion, rate=20.0, step=0.0, phase=0.0):
 MOVE = motion_from_rates(np.array([0.0, 0.95, 2.85, 3.8]), np.array([0.0, 0.4, 0.4, 0.0]))
 MOVE_TIME = np.arange(77) / 20.0
 MOVE_RATE = (1 + S) * MOVE.rate_at(MOVE_TIME) + B
+
+
+@pytest.mark.parametrize('noise', [0.02, 0.05, 0.1])
+def test_headings_with_noise_are_not_computed_from_the_gyro_and_its_own_are(noise):
+    """Of 100 Hz: headings of white noise, in degrees, leave that of the gyro undetermined."""
+    gyro = Noise(0.35 * DEGREE / 60)
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        rate = (1 + S) * RATE + B + simulate_noise(gyro, len(TIME), 0.01, generator)
+        true = CALIBRATION_MOTION.heading_at(TIME)
+        measured = true + noise * DEGREE * generator.standard_normal(len(TIME))
+        fit = self_calibrate(TIME, rate, motion_from_headings(TIME, measured), noise=gyro)
+        assert abs(fit.scale_factor_error - S) < 4.0 * math.sqrt(fit.covariance[0, 0])
+        with pytest.raises(DataRefused, match='computed from this gyro'):
+            self_calibrate(TIME, rate, motion_from_headings(
+                TIME, integrate(TIME, rate)), noise=gyro)
 
 
 def test_on_their_move_only_the_sum_of_samples_errs():
