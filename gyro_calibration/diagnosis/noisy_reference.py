@@ -49,7 +49,7 @@ from gyro_calibration.diagnosis.findings import (
     Curve, detectable_sigmas, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress,
     prediction_sigmas, Reference, SEARCH_ALARM_RATE, TIME_LIMIT_REMARK, VALUE_ALARM_RATE)
 from gyro_calibration.diagnosis.regression import (
-    column_evidence, fit_causes, group_columns, RegressionFit)
+    column_evidence, columns_of, fit_causes, group_columns, RegressionFit)
 from gyro_calibration.diagnosis.scans import best_steps, Scored
 from gyro_calibration.diagnosis.search import (
     confirm_causes, explain_selection, Search, search_causes, SelectedCause)
@@ -477,7 +477,7 @@ class SpanProblem:
         return self.base
 
     def rows(self, candidate: Candidate, logs: tuple[Spans, ...]) -> Array:
-        return self.whiten(np.transpose(candidate.columns(self.spans)))
+        return self.whiten(columns_of(replace(candidate, values=()), self.spans).T)
 
     def products(self, one: Array, other: Array) -> Array:
         of_one, of_other = (each @ self.wander.T for each in (one, other))

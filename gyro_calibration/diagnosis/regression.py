@@ -104,7 +104,7 @@ class RegressionProblem:
 
     def rows(self, candidate: Candidate, logs: tuple[Replay, ...]) -> Array:
         """Return the columns of a candidate, whitened by the first noise, shape (k, m)."""
-        return _transforms(candidate, logs) / self.deviation
+        return _transforms(replace(candidate, values=()), logs) / self.deviation
 
     def products(self, one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, ..., rows, of the other)."""
@@ -471,7 +471,15 @@ def _with_distorted_rate(replay: Replay,
     return before.with_rate(distortion(before.channels.rate, before.channels.time, *shapes))
 
 
-@lru_cache(maxsize=32)  # they are needed in many fits, as in a search for a shape
+# columns are needed in many fits, as in a search for a shape
+
+@lru_cache(maxsize=64)
+def columns_of(candidate: Candidate, log: Any) -> Array:
+    """Return the columns of a candidate without values, shape (columns, n)."""
+    return np.array(candidate.columns(log))
+
+
+@lru_cache(maxsize=32)
 def _transforms(candidate: Candidate, replays: tuple[Replay, ...]) -> Array:
     """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
     return np.concatenate([
@@ -493,8 +501,8 @@ def _transforms_without_causes(replays: tuple[Replay, ...],
 
 def forget_fits() -> None:
     """Release the logs and columns that fits keep for the next ones."""
-    for kept in (_with_distorted_rate, _transforms, _transforms_without_causes, _shape_derivative,
-                 _fit_causes):
+    for kept in (_with_distorted_rate, columns_of, _transforms, _transforms_without_causes,
+                 _shape_derivative, _fit_causes):
         kept.cache_clear()
 
 
