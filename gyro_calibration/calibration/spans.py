@@ -50,7 +50,7 @@ from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
@@ -278,26 +278,40 @@ class Spans:
         """Return the stamps of the gyro at times of the reference, s."""
         return (time + self.delay) / (1.0 + self.clock_rate)
 
-    def point_means(self, values: Array, slopes: Array | None = None) -> Array:
-        """Return the means of a signal at the delayed points, linear or with slopes, (n + 1,)."""
-        time = self.stamps
+    @cached_property
+    def _places(self) -> list[tuple[NDArray[np.intp], Array, Array]]:
+        """Return the samples before the values, the shares of the intervals, and these, s."""
+        time, found = self.stamps, list[tuple[NDArray[np.intp], Array, Array]]()
         # a change of code is the mean of two samples, between which the signal may be curved
         half = 0.5 * self.uses_code_changes * float(np.median(np.diff(time)))
-        total: Array = np.zeros(len(self.time))
         for shift in sorted({-half, half}):
             at = np.clip(self.gyro_stamps(self.value_times + shift), time[0], time[-1])
-            total += np.bincount(self.point_index, np.interp(at, time, values) if slopes is None
-                                 else CubicHermiteSpline(time, values, slopes)(at))
-        return total / len({-half, half}) / np.bincount(self.point_index)
+            before = np.clip(np.searchsorted(time, at, side='right') - 1, 0, len(time) - 2)
+            interval = time[before + 1] - time[before]
+            found.append((before, (at - time[before]) / interval, interval))
+        return found
+
+    def point_means(self, values: Array, slopes: Array | None = None) -> Array:
+        """Return the means of a signal at the delayed points, linear or with slopes, (n + 1,)."""
+        total: Array = np.zeros(len(self.time))
+        for before, share, interval in self._places:
+            change = values[before + 1] - values[before]
+            here = values[before] + share * change
+            if slopes is not None:  # by a cubic
+                here += share * (1.0 - share) * (
+                    (1.0 - share) * (interval * slopes[before] - change)
+                    - share * (interval * slopes[before + 1] - change))
+            total += np.bincount(self.point_index, here)
+        return total / len(self._places) / np.bincount(self.point_index)
 
     def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         rate = np.broadcast_to(rate, self.stamps.shape)
         moving: Array = rate * self.is_in_motion
-        whole, in_motion = (integrate_with_curvature(self.stamps, each)
-                            for each in (rate, moving))
-        return self.is_measured * np.append(np.diff(self.point_means(in_motion, moving)),
-                                            np.diff(whole[self.rests])[:, 0])
+        in_motion = self.point_means(integrate_with_curvature(self.stamps, moving), moving)
+        at_rest = (np.diff(integrate_with_curvature(self.stamps, rate)[self.rests])[:, 0]
+                   if len(self.rests) else np.zeros(0))
+        return self.is_measured * np.append(np.diff(in_motion), at_rest)
 
     def span_changes(self, values: Array) -> Array:
         """Return the change of a signal over spans, 0 over rests, shape (n + r,)."""
