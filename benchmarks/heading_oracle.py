@@ -12,6 +12,7 @@
 Compare the tracked heading with an oracle that is told when the robot rests.
 
     python benchmarks/heading_oracle.py [--drives N] [--only TEXT] [--seed N] [--minutes M]
+                                        [--wheels] [--off DEG_PER_S]
 
 Four gyros on six kinds of drive, of which three never rest. Noise, motion and oracle are computed
 here and share nothing with the package: flicker is a sum of Gauss-Markov processes half a decade
@@ -24,7 +25,8 @@ program, live and with hindsight, and the share of all looks (one a second) insi
 with its standard error by the scatter between drives, in which looks are not independent. The
 share of the oracle shows by how much such a sample of drives differs from 95 % by chance. z is the
 rms error at the end of a drive over the stated standard deviation.
-The oracle of drives without rests has the calibration alone.
+The oracle of drives without rests has the calibration alone. With ``--wheels`` this program is
+told the rests too; with ``--off`` the bias of its calibration, but not that of the oracle, is off.
 """
 
 from __future__ import annotations
@@ -168,10 +170,11 @@ def output_of(one: Gyro, rate: np.ndarray, generator: np.random.Generator) -> np
 
 # This program
 
-def program(one: Gyro, output: np.ndarray, hindsight: bool) -> tuple[np.ndarray, ...]:
+def program(one: Gyro, output: np.ndarray, hindsight: bool, off: float,
+            wheels: list[bool] | None) -> tuple[np.ndarray, ...]:
     """Return headings and variances, live or with hindsight, behind a rest before the drive."""
     first = round(CALIBRATED / one.interval)
-    noise, bias = one.noise, float(output[:first].mean())
+    noise, bias = one.noise, float(output[:first].mean()) + off
     variance = noise.angle_random_walk ** 2 / CALIBRATED + noise.allan_floor ** 2
     model = GyroModel(noise=noise, self_calibration=SelfCalibration(
         0.0, bias, ((SCALE ** 2, 0.0), (0.0, variance))))
@@ -179,15 +182,15 @@ def program(one: Gyro, output: np.ndarray, hindsight: bool) -> tuple[np.ndarray,
     rate = np.asarray(model.self_calibration.correct(rest))
     time = np.arange(len(rest)) * one.interval
     found = track(time, rate, rate_sensitivity(model, rest, rate, 25.0), noise,
-                  uncertainty_covariance(model), TrackerSettings(), None, hindsight, 0.0,
+                  uncertainty_covariance(model), TrackerSettings(), wheels, hindsight, 0.0,
                   rate_sensitivity(model, 0.0, 0.0, 25.0))
     return found.heading, found.variance, found.resting
 
 
-def score(one: Gyro, kind: str, minutes: float, generator: np.random.Generator
+def score(one: Gyro, kind: str, given: argparse.Namespace, generator: np.random.Generator
           ) -> dict[str, float]:
     """Return errors, deg, and shares inside the stated 95 %, of one drive."""
-    rate, rests = drive(kind, minutes, one.interval, generator)
+    rate, rests = drive(kind, given.minutes, one.interval, generator)
     output = output_of(one, rate, generator)
     first, every = round(CALIBRATED / one.interval), round(1.0 / one.interval)
     true = np.concatenate([[0.0], np.cumsum(0.5 * one.interval * (rate[1:] + rate[:-1]))])
@@ -200,8 +203,9 @@ def score(one: Gyro, kind: str, minutes: float, generator: np.random.Generator
         found[f'oracle, {name}'] = float(np.abs(error).mean()) / DEG
         found[f'inside, oracle, {name}'] = float(
             (error ** 2 <= BAND * variance[first:])[::every].mean())
+    wheels = (~rests[first:]).tolist() if given.wheels else None
     for name, hindsight in (('live', False), ('later', True)):
-        heading, variance, resting = program(one, output, hindsight)
+        heading, variance, resting = program(one, output, hindsight, given.off * DEG, wheels)
         error = heading - true
         found[name] = float(np.abs(error).mean()) / DEG
         found[f'inside, {name}'] = float((error ** 2 <= BAND * variance)[::every].mean())
@@ -216,6 +220,8 @@ def main() -> None:
     parser.add_argument('--minutes', type=float, default=15.0)
     parser.add_argument('--only', default='', help='gyros and drives whose name has this text')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--wheels', action='store_true', help='the program is told the rests')
+    parser.add_argument('--off', type=float, default=0.0, help='error of the bias, deg/s')
     given = parser.parse_args()
     print('| gyro, drive | at rest, % | oracle, deg: live, hindsight | over it: live, hindsight '
           '| inside 95 %: live, hindsight | its standard error, live | of the oracle, live '
@@ -226,7 +232,7 @@ def main() -> None:
                 continue
             generators = (np.random.default_rng([given.seed, place, DRIVES.index(kind), number])
                           for number in range(given.drives))
-            several = [score(one, kind, given.minutes, each) for each in generators]
+            several = [score(one, kind, given, each) for each in generators]
             mean = {key: float(np.mean([each[key] for each in several])) for key in several[0]}
             scatter = 100.0 * np.std([each['inside, live'] for each in several]) / math.sqrt(
                 given.drives)

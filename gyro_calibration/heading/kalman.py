@@ -326,14 +326,22 @@ def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral]
         if rest:
             start, after, shared = state.measure_rest(turn)
         else:
-            start, after = state, state.propagate(turn)
-            shared = state.covariance @ state.transition(turn).matrix.T
+            step = state.transition(turn)
+            start, after, shared = (state, state.propagate(turn),
+                                    state.covariance @ step.matrix.T)
         # the pseudo-inverse of correlations, as variances may be zero and of any size
         size = np.sqrt(np.diagonal(after.covariance))
         size = np.where(size > 0.0, size, 1.0)
         sizes = np.outer(size, size)
         smoother_gain = shared @ (pinvh(after.covariance / sizes) / sizes)
-        change = smoother_gain @ (later[-1].covariance - after.covariance) @ smoother_gain.T
-        later.append(replace(start, covariance=start.covariance + change,
+        known = later[-1].covariance
+        if rest:
+            covariance = start.covariance + (
+                smoother_gain @ (known - after.covariance) @ smoother_gain.T)
+        else:  # a sum of positive parts, as a rest may reduce the variance by many digits
+            left = np.eye(len(known)) - smoother_gain @ step.matrix
+            covariance = (left @ start.covariance @ left.T
+                          + smoother_gain @ (step.process_noise + known) @ smoother_gain.T)
+        later.append(replace(start, covariance=covariance,
                              mean=start.mean + smoother_gain @ (later[-1].mean - after.mean)))
     return later[::-1]

@@ -60,11 +60,11 @@ _REST_SHARES = (np.arange(5) + 0.5) / 5.0
 _LOG_PRIORS = np.log(np.outer([0.5, *np.full(len(_REST_SHARES), 0.5 / len(_REST_SHARES))],
                               np.full(len(_BENDS), 1.0 / len(_BENDS))))
 #: Variances of the bias of another power-on, relative to the usual one, and their shares.
-TURN_ON_RATIOS, _TURN_ON_SHARES = np.array([1.0, 25.0]), np.array([0.9, 0.1])
+TURN_ON_RATIOS, TURN_ON_SHARES = np.array([1.0, 25.0]), np.array([0.9, 0.1])
 #: Probability below which it is not computed what follows if the vehicle never rests.
 _NEGLIGIBLE = 1e-6
 #: Probability from which on another steady rate is taken for the bias.
-_CHANGE_PROBABILITY = 0.95
+CHANGE_PROBABILITY = 0.95
 
 
 @dataclass
@@ -231,8 +231,8 @@ class SteadyRates:
         self.is_changing, self._has_changed = False, True
         if self._log_weights is not None:
             self._log_weights = _LOG_PRIORS.copy()
-            self._log_weights[0] += math.log(1.0 / _CHANGE_PROBABILITY - 1.0)
-            self.moving_probability = self._ended_probability = 1.0 - _CHANGE_PROBABILITY
+            self._log_weights[0] += math.log(1.0 / CHANGE_PROBABILITY - 1.0)
+            self.moving_probability = self._ended_probability = 1.0 - CHANGE_PROBABILITY
 
     def moving_heading(self, noise: Noise) -> tuple[float, float]:
         """Return the heading now if there was no rest, rad, and its variance, rad²."""
@@ -328,11 +328,11 @@ class SteadyRates:
         if is_known:
             # the calibration is one more reason, as good as that by which a bias is changed: it
             # holds, is given up, or neither is decided
-            least, held = (1.0 - _CHANGE_PROBABILITY) ** 2, float(chances[in_use].sum())
+            least, held = (1.0 - CHANGE_PROBABILITY) ** 2, float(chances[in_use].sum())
             self.variance *= held < 1.0 - least
             if held > least:
                 return None
-        if in_use[best] or together[best] < _CHANGE_PROBABILITY:
+        if in_use[best] or together[best] < CHANGE_PROBABILITY:
             return None
         self.is_changing = is_known
         weights = np.where(agrees[:, best] > 0.5, agrees[:, best] * durations, 0.0)
@@ -360,7 +360,7 @@ def _compare_rests(rate: Array, prior: Array, same: Array, lasting: Array, white
     turns = (-0.5 * (square / spread + np.log(spread)) - np.log(len(turned))
              - lasting[:, None] / MEAN_LAGS[-1])
     as_turn = np.log(1.0 - _REST_PROBABILITY) + logsumexp(turns, axis=0)
-    shares = _TURN_ON_SHARES if is_known else np.ones(1)
+    shares = TURN_ON_SHARES if is_known else np.ones(1)
     assumed = logsumexp(-0.5 * (rate ** 2 / prior + np.log(prior)), axis=0, b=shares[:, None])
     never = -math.inf
     own = np.log(_REST_PROBABILITY) * np.ones(count)

@@ -33,12 +33,13 @@ from gyro_calibration.heading.stationary import (
     Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES, EnergyDetector, Epoch,
     EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SlowTurn,
     Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
-from gyro_calibration.heading.steady_rates import SteadyRates, TURN_ON_RATIOS
+from gyro_calibration.heading.steady_rates import (
+    CHANGE_PROBABILITY, SteadyRates, TURN_ON_RATIOS, TURN_ON_SHARES)
 from gyro_calibration.logs.log import (
-    Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, Number)
+    Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, NORMAL_QUANTILE_975, Number)
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtri, softmax
 
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
@@ -141,7 +142,11 @@ class HeadingTracker:
                                     age if len(covariance) else None)
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
-        self._expects_turn_on = True  # another bias, at the first rest that wheels show
+        # Probability of another power-on, until rests that wheels show decide it.
+        self._turn_on_probability, self._has_rested = 0.5, False
+        # Rates at which the wheels have stood since they moved last, s, and before, rad/s.
+        self._standing_rates, self._standing_since = list[float](), math.nan
+        self._earlier_rate, self._standing_ambiguity = math.nan, 0.0
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         # None with wheels, which tell of rests
         self._steady_rates: SteadyRates | None = SteadyRates(
@@ -240,7 +245,8 @@ class HeadingTracker:
     @property
     def bias_ambiguity(self) -> float:
         """Return the deviation, rad/s, of the bias if another steady rate was that of a rest."""
-        return math.sqrt(0.0 if self._steady_rates is None else self._steady_rates.variance)
+        return (self._standing_ambiguity if self._steady_rates is None
+                else math.sqrt(self._steady_rates.variance))
 
     def ambiguity_variance(self, time: Number) -> Number:
         """Return the variance of the heading at a stamp, s, by `bias_ambiguity`, rad²."""
@@ -537,6 +543,8 @@ class HeadingTracker:
                 self._advance_state()
                 if self._steady_rates is not None and self._steady_rates.is_changing:
                     self._begin_rest_again()  # the bias changes in this rest too
+                elif wheels is False and self._find_other_power_on():
+                    self._begin_rest_again()
                 else:
                     self._compare_means(wheels)
             return
@@ -565,8 +573,10 @@ class HeadingTracker:
         expected, variance = self._state.expected_rest_angle(still)
         difference = (held.angle - expected) / held.duration  # rad/s
         variance /= held.duration ** 2
-        is_first, change = wheels is False and self._expects_turn_on, 0.0
-        if is_first:
+        is_expected = difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance
+        repeats = wheels is False and self._repeats_standing(held, is_expected)
+        change = 0.0
+        if repeats:
             change = math.sqrt(TURN_ON_RATIOS[-1]) * turn_on
         elif wheels is False:
             change = _WHEEL_BIAS_CHANGE
@@ -578,17 +588,61 @@ class HeadingTracker:
             return
         self._advance_state(held)
         change = 0.0
-        if is_first:  # it measures the bias of this power-on
+        lasts = (wheels is False and not is_expected
+                 and self._last_time - self._wheel_motion_time >= _WHEEL_DELAY)
+        if self._turn_on_probability > CHANGE_PROBABILITY or not self._has_rested and (
+                repeats or lasts and self._agrees_with(
+                    float(np.median(self._standing_rates)), held)):
+            # the bias is that of another power-on
             self._change_bias(0.0, max(difference ** 2, turn_on ** 2), still)
-            self._expects_turn_on = False
-        elif (self._last_time - self._wheel_motion_time >= _WHEEL_DELAY
-              and not difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance):
-            # what only the wheels explain may have come at any time since the last rest
-            change = difference
-            self._state = self._state.with_added_variance(
-                HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
+            self._turn_on_probability, self._has_rested = 0.0, True
+        elif lasts or repeats:
+            change = difference  # that only the wheels explain
+        self._has_rested |= is_expected or bool(change)
+        if self._has_rested:
+            self._standing_ambiguity = 0.0
+        # it may have come at any time since the last rest
+        self._state = self._state.with_added_variance(
+            HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
         self._enter_rest(change)
         self._rest_blocks.extend([*self._recent_blocks][1:])
+
+    def _repeats_standing(self, turn: RateIntegral, is_expected: bool) -> bool:
+        """Tell whether wheels have stood at this unexpected rate before they moved last."""
+        # after wheels have stopped a body may creep on for a second, or be pushed
+        if is_expected:
+            self._standing_rates, self._earlier_rate = [], math.nan
+            return False
+        if self._standing_since != self._wheel_motion_time:
+            if self._standing_rates:
+                self._earlier_rate = float(np.median(self._standing_rates))
+            self._standing_rates, self._standing_since = [], self._wheel_motion_time
+        self._standing_rates.append(turn.angle / turn.duration)
+        if not self._has_rested:
+            self._standing_ambiguity = abs(float(np.median(self._standing_rates)))
+            self._state_version += 1
+        return self._agrees_with(self._earlier_rate, turn)
+
+    def _agrees_with(self, rate: float, turn: RateIntegral) -> bool:
+        """Tell whether a rate, rad/s, is that of an integral, as far as white noise shows."""
+        return (turn.angle / turn.duration - rate) ** 2 < (
+            2.0 * NORMAL_QUANTILE_975 ** 2 * self._state.noise.rate_variance(turn.duration))
+
+    def _find_other_power_on(self) -> bool:
+        """Tell whether the rate of a rest that wheels show is that of another power-on."""
+        if not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY:
+            return False
+        rest = self._with_still_sensitivity(self._rest_integral)
+        expected, variance = self._snapshots[0].state.expected_rest_angle(rest)
+        variances = variance / rest.duration ** 2 + self._settings.turn_on ** 2 * np.append(
+            0.0, TURN_ON_RATIOS)
+        rate = (rest.angle - expected) / rest.duration
+        same, *others = softmax(-0.5 * (rate ** 2 / variances + np.log(variances)) + np.log(
+            np.append(0.5, 0.5 * TURN_ON_SHARES)))
+        self._turn_on_probability = float(sum(others))
+        if self._turn_on_probability < (1.0 - CHANGE_PROBABILITY) ** 2:
+            self._turn_on_probability = 0.0
+        return self._turn_on_probability > CHANGE_PROBABILITY
 
     @property
     def _held_integral(self) -> RateIntegral:

@@ -235,9 +235,27 @@ def test_short_rests_that_wheels_show_measure_the_bias_of_another_power_on(bias,
     assert np.abs(errors).max() < 4.0, errors
 
 
+@pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
+@pytest.mark.parametrize('creep', [0.4, 2.0])
+def test_a_body_that_creeps_on_after_its_wheels_have_stopped_has_no_other_bias(creep, hindsight):
+    """For 0.8 s after each way; the rate is no bias, as no other standstill repeats it."""
+    noise, known = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
+    parts = [(60, 0.5), (3, 30), (0.8, creep), (8, 0), (3, -40), (20, 0.3), (0.8, -0.7 * creep),
+             (8, 0)]
+    motion = constant_rate_motion(parts)
+    moving = np.concatenate([np.full(round(duration / 0.01), abs(rate) not in (
+        0.0, creep, 0.7 * creep)) for duration, rate in parts])
+    time, _, heading, rate = gyro(motion, np.random.default_rng(3), noise, bias=0.0)
+    wheels = moving[np.minimum(np.rint(time / 0.01).astype(int), len(moving) - 1)].tolist()
+    found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
+                  TrackerSettings(), wheels, hindsight)
+    assert abs(found.heading[-1] - heading[-1]) < 0.5 * DEGREE
+    assert found.variance[-1] < (1.0 * DEGREE) ** 2
+
+
 def test_wheels_that_are_known_during_a_rest_widen_the_bias_of_the_calibration():
-    """A bias off by less than a short rest shows; the rest begins again with wheels."""
-    tracker, off = HeadingTracker(XV3500, KNOWN, TrackerSettings()), 0.02 * DEGREE
+    """A bias off by five deviations, less than a short rest shows."""
+    tracker, off = HeadingTracker(XV3500, KNOWN, TrackerSettings()), 0.05 * DEGREE
     for index in range(round(120.0 / INTERVAL)):
         tracker.add(INTERVAL * index, off, np.array([0.0, -1.0]),
                     None if index < round(10.0 / INTERVAL) else False)
