@@ -264,12 +264,15 @@ class TurnComparison:
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
     distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Turns by the gyro
     that are larger than those by odometry, beyond the largest scale factor error that a
-    calibration accepts and two in a row, are of a wrong sensitivity: wheels that slip turn more.
+    calibration accepts, twice in a row from one standstill to the next, are of a wrong
+    sensitivity: wheels that slip turn more.
     """
 
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
         self.is_contradictory = self.is_larger = self._was_larger = False
+        self.total_ratio = math.nan  # of the last turn from one standstill to the next
+        self._stood_at, self._since_standstill = math.nan, 0.0  # by the gyro and wheels, rad
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
         self._contradictions = 0
@@ -304,6 +307,9 @@ class TurnComparison:
                 self._least_rate = min(self._least_rate, abs(heading - angle) / (time - past))
             del self._at_rest[3:-1]
             self._at_rest.append((time, heading))
+            if len(self._at_rest) == 3:
+                self._compare_whole_turn(heading)
+        self._since_standstill += rate * (time - then) if is_next else math.nan
         # at slower rates the bias of a gyro may be larger
         if not is_next or abs(rate) <= MIN_ODOMETRY_TURN_RATE:
             return
@@ -312,12 +318,7 @@ class TurnComparison:
         self._path += abs(heading - before)
         self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
-            self.ratio, allowed = (self._by_gyro / self._by_wheels,
-                                   1.0 + RunLimits.max_scale_factor_error)
-            # of one sense: where it changes, late odometry turns less
-            is_larger = (source == ODOMETRY and self.ratio > allowed
-                         and self._path < allowed * abs(self._by_gyro))
-            self.is_larger, self._was_larger = is_larger and self._was_larger, is_larger
+            self.ratio = self._by_gyro / self._by_wheels
             confused, rate = 180.0 / math.pi, self._path / self._duration
             is_wrong = (self.ratio > math.sqrt(confused)
                         and (source == ODOMETRY or self.ratio * rate > confused)
@@ -325,6 +326,15 @@ class TurnComparison:
             self._contradictions = is_wrong * (self._contradictions + 1)
             self.is_contradictory = self._contradictions > 1
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
+
+    def _compare_whole_turn(self, heading: float) -> None:
+        """Compare the turn since the last standstill, of which late odometry misses nothing."""
+        turned, by_wheels = heading - self._stood_at, self._since_standstill
+        self._stood_at, self._since_standstill = heading, 0.0
+        if self.source == ODOMETRY and abs(by_wheels) > 1.0:  # rad
+            self.total_ratio = turned / by_wheels
+            is_larger = self.total_ratio > 1.0 + RunLimits.max_scale_factor_error
+            self.is_larger, self._was_larger = is_larger and self._was_larger, is_larger
 
 
 class AlternateTurns:

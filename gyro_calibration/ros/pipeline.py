@@ -320,8 +320,8 @@ class Pipeline:
                      'the unit and the sense of rotation of the gyro, and those of '
                      f'{turns.source}'),
             'scale': (turns.is_larger,
-                      f'the gyro turns by {turns.ratio:.2f} times what odom shows: check the '
-                      'sensitivity of the gyro, and diameter and distance of the wheels of odom'),
+                      f'the gyro turns by {turns.total_ratio:.2f} times what odom shows: check '
+                      'the sensitivity of the gyro, and diameter and distance of the wheels'),
             'stamp': (turned > MIN_TURN_ANGLE,
                       f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
                       'imu/data_raw advanced faster or slower for a time than before: check that '
