@@ -106,7 +106,8 @@ class HeadingTracker:
         self.recalibrations = list[tuple[int, HeadingState]]()
         self._interval, self.intervals = math.inf, Intervals()
         self._last_time = 0.0
-        self._motion_start_time = self._wheel_motion_time = 0.0  # since the last rest, s
+        # Begin of the motion since the last rest, and last time when the wheels did not stand, s.
+        self._motion_start_time = self._wheel_motion_time = 0.0
         self._last_sample: tuple[float, float, float, Array] | None = None
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
         # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump, and turn
@@ -300,7 +301,7 @@ class HeadingTracker:
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
             self._remember([time], [rate])
-            self._last_time = self._motion_start_time = time
+            self._last_time = self._motion_start_time = self._wheel_motion_time = time
             self._heading_begin_time = time
             self.rate = rate - self._rate_error(sensitivity)
             return ''

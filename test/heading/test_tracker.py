@@ -253,6 +253,15 @@ def test_a_body_that_creeps_on_after_its_wheels_have_stopped_has_no_other_bias(c
     assert found.variance[-1] < (1.0 * DEGREE) ** 2
 
 
+def test_a_slow_turn_with_which_a_recording_begins_is_no_bias_though_wheels_stand():
+    tracker = HeadingTracker(XV3500, KNOWN, TrackerSettings())
+    for index in range(round(20.0 / INTERVAL)):
+        rate = DEGREE * (index < round(2.0 / INTERVAL))
+        tracker.add(1000.0 + INTERVAL * index, rate, np.array([-rate, -1.0]), False)
+    assert tracker.is_resting and abs(tracker.bias[0]) < 0.05 * DEGREE
+    assert abs(tracker.heading - 2.0 * DEGREE) < 3.0 * math.sqrt(tracker.variance)
+
+
 def test_wheels_that_are_known_during_a_rest_widen_the_bias_of_the_calibration():
     """A bias off by five deviations, less than a short rest shows."""
     tracker, off = HeadingTracker(XV3500, KNOWN, TrackerSettings()), 0.05 * DEGREE
