@@ -571,9 +571,7 @@ class HeadingTracker:
         """Begin a rest with the last blocks if their mean is that of a rest."""
         held = self._held_integral - self._recent_blocks[0]  # in which the robot may still move
         still, turn_on = self._with_still_sensitivity(held), self._settings.turn_on
-        expected, variance = self._state.expected_rest_angle(still)
-        difference = (held.angle - expected) / held.duration  # rad/s
-        variance /= held.duration ** 2
+        difference, variance = _rate_difference(self._state, still)
         is_expected = difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance
         repeats = wheels is False and self._repeats_standing(held, is_expected)
         change = 0.0
@@ -609,7 +607,7 @@ class HeadingTracker:
         self._rest_blocks.extend([*self._recent_blocks][1:])
 
     def _repeats_standing(self, turn: RateIntegral, is_expected: bool) -> bool:
-        """Tell whether wheels have stood at this unexpected rate before they moved last."""
+        """Keep an unexpected rate while wheels stand; tell whether they stood so before."""
         # after wheels have stopped a body may creep on for a second, or be pushed
         if is_expected:
             self._standing_rates, self._earlier_rate = [], math.nan
@@ -633,14 +631,13 @@ class HeadingTracker:
         """Tell whether the rate of a rest that wheels show is that of another power-on."""
         if not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY:
             return False
-        rest = self._with_still_sensitivity(self._rest_integral)
-        expected, variance = self._snapshots[0].state.expected_rest_angle(rest)
-        variances = variance / rest.duration ** 2 + self._settings.turn_on ** 2 * np.append(
-            0.0, TURN_ON_RATIOS)
-        rate = (rest.angle - expected) / rest.duration
-        same, *others = softmax(-0.5 * (rate ** 2 / variances + np.log(variances)) + np.log(
-            np.append(0.5, 0.5 * TURN_ON_SHARES)))
-        self._turn_on_probability = float(sum(others))
+        difference, variance = _rate_difference(
+            self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))
+        # of the calibration, and of other power-ons, which together are as probable
+        variances = variance + self._settings.turn_on ** 2 * np.append(0.0, TURN_ON_RATIOS)
+        chances = softmax(-0.5 * (difference ** 2 / variances + np.log(variances))
+                          + np.log(np.append(1.0, TURN_ON_SHARES)))
+        self._turn_on_probability = float(chances[1:].sum())
         if self._turn_on_probability < (1.0 - CHANGE_PROBABILITY) ** 2:
             self._turn_on_probability = 0.0
         return self._turn_on_probability > CHANGE_PROBABILITY
@@ -689,11 +686,10 @@ class HeadingTracker:
         self._enter_rest()
         return True
 
-    def _normalized_innovation(self, state: HeadingState, turn: RateIntegral,
-                               bias_change: float = 0.0) -> float:
+    def _normalized_innovation(self, state: HeadingState, turn: RateIntegral) -> float:
         """Return the deviation of an integral from that at rest, in standard deviations."""
-        expected, variance = state.expected_rest_angle(turn)
-        return (turn.angle - expected) / math.sqrt(variance + (bias_change * turn.duration) ** 2)
+        difference, variance = _rate_difference(state, turn)
+        return difference / math.sqrt(variance)
 
     def _compare_means(self, wheels: bool | None) -> None:
         """Compare the means over the longer lags with the bias that was known before them."""
@@ -1076,3 +1072,9 @@ class HeadingTracker:
         return min(((self._sigmas[lag] + power_sigmas)
                     * math.sqrt(self._state.expected_rest_angle(turn)[1]) / lag
                     for lag, turn in turns), default=math.nan)
+
+
+def _rate_difference(state: HeadingState, turn: RateIntegral) -> tuple[float, float]:
+    """Return what a mean rate differs by from that at rest, rad/s, and its variance."""
+    expected, variance = state.expected_rest_angle(turn)
+    return (turn.angle - expected) / turn.duration, variance / turn.duration ** 2

@@ -424,10 +424,10 @@ class CompensationReport:
         now = self._clock.steady()
         silent = now - journal.last_received
         # a healthy gyro may begin so, at rest
-        doubt = (pipeline.repeat_suspicion if pipeline.repeat_detector.has_changed
-                 or pipeline.wheels.is_moving(now) else '')
+        suspicion = (pipeline.repeat_suspicion if pipeline.repeat_detector.has_changed
+                     or pipeline.wheels.is_moving(now) else '')
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
-                     or pipeline.repeat_fault or doubt):
+                     or pipeline.repeat_fault or suspicion):
             return ERROR, error
         if pipeline.ros_time.paused_duration > 1.0:
             return ERROR, ROS_TIME_PAUSED

@@ -262,10 +262,11 @@ class TurnComparison:
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
     wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Turns by the gyro
-    that are larger than those by odometry, beyond the largest scale factor error that a
-    calibration accepts, twice in a row from one standstill to the next, are of a wrong
-    sensitivity: wheels that slip turn more.
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+
+    The sensitivity of the gyro is wrong where it turns further than odometry from one standstill
+    to the next, twice in a row and by more than the largest scale factor error that a calibration
+    accepts: wheels that slip turn further than the gyro.
     """
 
     def __init__(self) -> None:
