@@ -12,6 +12,6 @@
 Logs to a model: self-calibration, whole turns, rate table, encoder, course over ground.
 
 Reading order: `noise_grid`, `run_faults`, `likelihood`, `self_calibration`, `whole_turns`,
-`motion_design`, `dwells`, `scatter`, `rate_table`, `selection`, `reference_noise`, `spans`,
-`heading_regression`, `reference_kind`, `encoder`.
+`motion_design`, `dwells`, `scatter`, `rate_table`, `selection`, `reference_noise`, `joined_logs`,
+`spans`, `heading_regression`, `reference_kind`, `encoder`.
 """

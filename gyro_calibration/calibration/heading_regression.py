@@ -151,7 +151,8 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
 
 def _correct_rate(spans: Spans, causes: Sequence[CauseTerm]) -> tuple[Spans, Array]:
     """Return the spans with the rate corrected by first values, and variances of points."""
-    corrected, scale = replace(spans, delay=spans.delay or find_reference_delay(spans)), 0.0
+    scale, is_known = 0.0, spans.delay or spans.joined
+    corrected = spans if is_known else replace(spans, delay=find_reference_delay(spans))
     for number in range(20):
         values, left = robust_least_squares(design_matrix(corrected, causes), corrected.observed,
                                             spans.prior_deviations(causes))
@@ -232,16 +233,18 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
                  walk_size: float | None = None, **options: Any) -> GridFit:
         parts = heading_noise(in_motion, rates, point_variances, correlation=correlation,
                               angle_random_walk=(low * least, high * most),
-                              reference_walk=reference_walk)
+                              reference_walk=reference_walk,
+                              is_measured=spans.is_measured[:len(spans.time) - 1])
         if walk_size is not None:
             parts[2] = replace(parts[2], size_range=(walk_size, walk_size))
         parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
                          off_diagonal=None if part.off_diagonal is None
                          else np.append(part.off_diagonal, 0.0 * durations))
-                 for part, of_rests in zip(parts, (durations, 0.0 * durations, 0.0 * durations))]
+                 for part, of_rests in zip(parts, [
+                     durations, *[0.0 * durations] * (len(parts) - 1)])]
         return fit_noise_grid(
-            observed, columns, parts if spans.treatment.errs_as_heading else parts[:1], waves,
-            shared, prior_deviation=deviation, carried=None if correlation is None
+            observed, columns, parts if spans.treatment.errs_as_heading else parts[:1] + parts[3:],
+            waves, shared, prior_deviation=deviation, carried=None if correlation is None
             else np.append(carried_shares(correlation), 0.0 * durations), **options)
 
     if spans.treatment.is_fine:

@@ -59,11 +59,15 @@ from dataclasses import dataclass, replace
 from itertools import product
 import math
 
-from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import logsumexp, softmax
+
+
+#: Standard deviation of a turn that nothing shows, rad.
+_ANY_TURN = 100.0
 
 
 @dataclass(frozen=True)
@@ -154,7 +158,8 @@ class TridiagonalMatrix:
 def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
                   angle_random_walk: tuple[float, float] | None = None,
                   correlation: Array | None = None,
-                  reference_walk: Array | None = None) -> list[BandedNoise]:
+                  reference_walk: Array | None = None,
+                  is_measured: Mask | None = None) -> list[BandedNoise]:
     """
     Return the parts of the noise of increments between headings.
 
@@ -169,7 +174,8 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     correlation : of the errors of the reference at both ends of each span, shape (n,); the parts
         are then those of the differences by `carried_shares`. None where they are independent
     reference_walk : variance by which errors of a reference that add up grow over each span,
-        relative to the others, shape (n,); the last part is then 'reference_walk'
+        relative to the others, shape (n,); the third part is then 'reference_walk'
+    is_measured : whether the gyro is known in each span, (n,); any turn is possible in others
 
     """
     points = np.ones(len(time)) if point_variance is None else point_variance
@@ -179,9 +185,13 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
               if reference_walk is not None else BandedNoise(
                   'motion', *difference_covariance(points * rate ** 2, correlation),
                   (1e1 * sizes[0] / rate_rms, sizes[1] / rate_rms)))
+    unknown = np.zeros(0) if is_measured is None else (~is_measured).astype(float)
+    holes = [BandedNoise('hole', *_walk_covariance(unknown, correlation), (_ANY_TURN, _ANY_TURN))
+             ] if unknown.any() else []
     return [BandedNoise('angle_random_walk', *_walk_covariance(np.diff(time), correlation),
                         angle_random_walk or sizes),
-            BandedNoise('reference', *difference_covariance(points, correlation), sizes), moving]
+            BandedNoise('reference', *difference_covariance(points, correlation), sizes), moving,
+            *holes]
 
 
 def _walk_covariance(variance: Array,

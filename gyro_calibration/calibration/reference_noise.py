@@ -229,6 +229,9 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     for run in (each for each in find_runs(is_standing) if each.stop - each.start >= 3):
         inner = slice(run.start + 1, run.stop - 1)
         is_quiet[inner] = np.sqrt(np.mean(scatter[inner] ** 2)) <= 2.0 * quietest + 1e-12
+    # what comes after a gap may be another rest
+    apart = np.diff(time, append=time[-1])[:blocks * second].reshape(blocks, second)
+    is_quiet &= apart.max(axis=1, initial=0.0) <= second * np.median(np.diff(time))
     rests = [(second * run.start, second * run.stop - 1, stands)
              for stands, each in enumerate((binary_erosion(is_lost, border_value=1), is_standing))
              for run in find_runs(is_quiet & each) if run.stop - run.start >= 3]

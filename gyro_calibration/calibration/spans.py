@@ -36,6 +36,7 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import find_lost_reference
+from gyro_calibration.calibration.joined_logs import JoinedLogs
 from gyro_calibration.calibration.noise_grid import bias_wander_columns, SharedNoise
 from gyro_calibration.calibration.reference_noise import (
     find_rests, heading_difference, is_slow, keep_own_instants, OwnInstants, rate_noise_share)
@@ -117,7 +118,7 @@ class CauseTerm(NamedTuple):
     """One cause with the shapes of its effect, as columns of the regression."""
 
     cause: str
-    shapes: tuple[float, ...] = ()
+    shapes: tuple[float, ...] = ()  # of `OWN_BIAS` and `OWN_DELAY` the number of the log
 
     @property
     def is_single_event(self) -> bool:
@@ -135,6 +136,8 @@ class CauseTerm(NamedTuple):
 
 _CLOCK_TERM, DRIFT_TERM, MISALIGNMENT_TERM = map(
     CauseTerm, ('clock_rate', 'reference_drift', 'axis_misalignment'))
+#: Of each log of several but the first: its bias, or delay, less the mean of all.
+OWN_BIAS, OWN_DELAY = 'own_bias', 'own_delay'
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +163,7 @@ class Spans:
     holes: Array
     output_step: float  # quantization step of the output, rad/s; 0 without one
     adds_up: bool  # whether the reference is never lost, as odometry, which adds up its errors
+    joined: JoinedLogs | None = None  # the logs of which it consists, if these are several
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
     clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
 
@@ -190,6 +194,15 @@ class Spans:
                           & np.append(covered, np.ones(len(self.rests), dtype=bool)))
 
     @property
+    def of_logs(self) -> list[slice]:
+        """Return the spans of each log."""
+        if self.joined is None:
+            return [slice(0, len(self.time) - 1)]
+        number = self.joined.find(self.time)
+        return [slice(int(own[0]), int(own[-1])) for own in (
+            np.flatnonzero(number == place) for place in range(len(self.joined.begins)))]
+
+    @property
     def time_outside(self) -> Array:
         """Return the mean time of each point before the log, or after it, s, shape (n + 1,)."""
         at = self.gyro_stamps(self.value_times)
@@ -216,13 +229,25 @@ class Spans:
         """Return causes, after those that are always fitted, misalignment and drift."""
         own = [MISALIGNMENT_TERM] * bool(self.cross_rotation.size)
         own += [DRIFT_TERM] * bool(self.stands.any())
+        if self.joined is not None:
+            own += [CauseTerm(name, (float(number),))
+                    for name in [OWN_BIAS, *[OWN_DELAY] * bool(len(self.joined.delays))]
+                    for number in range(1, len(self.joined.begins))]
         return [*dict.fromkeys([*own, *causes])]
 
     def prior_deviations(self, causes: Sequence[CauseTerm]) -> Array:
         """Return the prior standard deviations of the values, infinite of most causes."""
+        own = {MISALIGNMENT_TERM.cause: MISALIGNMENT_DEVIATION,
+               OWN_BIAS: self.treatment.prior[1], OWN_DELAY: self.treatment.prior[2]}
         return np.concatenate([self.treatment.prior, *(
-            np.full(each.value_count, MISALIGNMENT_DEVIATION if each == MISALIGNMENT_TERM
-                    else math.inf) for each in self.all_causes(causes))])
+            np.full(each.value_count, own.get(each.cause, math.inf))
+            for each in self.all_causes(causes))])
+
+    def _of_log(self, term: CauseTerm) -> Array:
+        """Return 1 in the samples of the log of a term, -1 in those of the first, (m,)."""
+        assert self.joined is not None
+        number = self.joined.find(self.stamps)
+        return (number == term.shapes[0]) - 1.0 * (number == 0)
 
     def value_slice(self, causes: Sequence[CauseTerm], cause: CauseTerm) -> slice:
         """Return the places of the values of one of the causes."""
@@ -352,6 +377,12 @@ class Spans:
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
         time, heading = self.stamps, np.asarray(self.channels.heading)
+        if cause.cause == OWN_BIAS:
+            return -self.span_integrals(self._of_log(cause))[:, None]
+        if cause.cause == OWN_DELAY:
+            return self.span_changes(self._of_log(cause) * self.smooth_rate)[:, None]
+        if cause.cause == 'bias_step':
+            return self.step_columns(np.array(cause.shapes))
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
@@ -388,6 +419,9 @@ class Spans:
                  / np.bincount(self.point_index)[:, None])
         at_rest = np.diff(np.maximum(time[self.rests][:, :, None] - begin, 0.0), axis=1)[:, 0]
         turned = np.concatenate([np.diff(means, axis=0), at_rest])
+        if self.joined is not None:  # it ends with its log
+            of_rows = np.append(self.time[:-1], self.stamps[self.rests[:, 0]])
+            turned *= self.joined.find(of_rows)[:, None] == self.joined.find(times)
         return np.asarray(-turned * self.is_measured[:, None])
 
     def with_corrected_rate(self, values: Array, causes: Sequence[CauseTerm] = ()) -> Spans:
@@ -402,6 +436,8 @@ class Spans:
             own = values[self.value_slice(causes, cause)]
             if cause == _CLOCK_TERM:
                 clock_rate += float(own[0])
+            elif cause.cause == OWN_BIAS:
+                errors = errors + own * self._of_log(cause)
             elif (cause.cause in CATALOGUE.keys() - {'bandwidth'}
                     and 'rate' in CATALOGUE[cause.cause].inputs):
                 errors = errors + sum(size * column for size, column in zip(
@@ -445,16 +481,26 @@ class Spans:
         """Return the columns of a wandering bias, and the parts of its noise."""
         least, most = self.walk_bounds
         # rad/s and rad/s/√s; beside a fine reference relative to the angle random walk
-        waves, parts = bias_wander_columns(self.time, *(
-            ((3e-3 * least, 0.5 * most), (1e-4 * least, 0.1 * most)) if self.treatment.is_fine
-            else (None, (1e-7, 1e-4), WANDER_COSINES)))
-        begin, end = self.time[0], self.time[-1]
-        omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
-        rest_times = np.clip(self.stamps[self.rests], begin, end)[:, :, None] - begin
-        rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
-        around = np.searchsorted(self.time - begin, rest_times.mean(axis=(1, 2))) - 1
-        np.subtract.at(waves, np.clip(around, 0, len(waves) - 1), rows)
-        waves = np.concatenate([waves, rows])
+        options = (((3e-3 * least, 0.5 * most), (1e-4 * least, 0.1 * most))
+                   if self.treatment.is_fine else (None, (1e-7, 1e-4), WANDER_COSINES))
+        of_logs = []
+        for own in self.of_logs:  # each log has a wander of its own
+            time = self.time[own.start:own.stop + 1]
+            columns, parts = bias_wander_columns(time, *options)
+            omega = math.pi * np.arange(1, columns.shape[1] + 1) / (time[-1] - time[0])
+            rest_times = np.clip(self.stamps[self.rests], time[0], time[-1])[:, :, None] - time[0]
+            rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
+            around = np.searchsorted(self.time - time[0], rest_times.mean(axis=(1, 2))) - 1
+            waves = np.zeros((len(self.time) - 1, columns.shape[1]))
+            waves[own] = columns
+            np.subtract.at(waves, np.clip(around, 0, len(waves) - 1), rows)
+            of_logs.append((np.concatenate([waves, rows]), parts))
+        waves = np.column_stack([each for each, _ in of_logs])
+        # the mean bias of all is that of independent walks
+        parts = [replace(each[0], variance=np.concatenate([one.variance for one in each]),
+                         unobservable_variance=sum(
+                             one.unobservable_variance for one in each) / len(each) ** 2)
+                 for each in zip(*(parts for _, parts in of_logs))]
         # column and size of what is shared by spans or rests
         single = []
         if self.rest_rounding:
@@ -515,16 +561,21 @@ class Spans:
         return self.span_changes((after - 2.0 * now + before) / half ** 2)
 
 
-def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
+def lay_out_spans(log: Log | JoinedLogs, kind: str = 'course', prior: Array | None = None,
                   instants: OwnInstants | None = None, technology: str = 'mems') -> Spans:
     """
-    Divide a log with a reference of some kind into spans.
+    Divide a log, or logs, with a reference of some kind into spans.
 
     The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, the instants those
     of a slow reference.
     """
-    treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
-    if not treatment.is_fine:
+    treatment = _TREATMENTS.get(kind, COURSE_TREATMENT)
+    joined = log if isinstance(log, JoinedLogs) else None
+    if joined is not None:
+        log, instants = joined.log, joined.instants
+    assert isinstance(log, Log)
+    given = log.reference_heading
+    if not (treatment.is_fine or joined):
         log, instants = keep_own_instants(log)
     assert log.time is not None and log.output is not None
     measured_type = np.full(2, math.inf) if prior is None else prior
@@ -576,13 +627,14 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None,
         known = known[np.diff(place, prepend=-1) > 0]
         place = np.arange(len(known))
     count = np.bincount(place)
-    channels = replace(channels_from_log(log), rate=output, time=time,
+    channels = replace(joined.channels if joined else channels_from_log(log), rate=output,
                        heading=integrate(time, output))
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
                  find_holes(time[measured_rows], length), step,
-                 not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any())
+                 not find_lost_reference(np.isfinite(given[known[0]:known[-1] + 1])).any(),
+                 joined)
 
 
 def _number_points(stamps: Array, length: float) -> NDArray[np.intp]:
@@ -601,7 +653,8 @@ def _find_code_changes(time: Array, output: Array, codes: Array) -> tuple[Array,
     (begin, end), turned = (rows[:-1], rows[1:]), integrate(time, output)
     middle = 0.5 * (time[begin] + time[end])
     bent = np.interp(middle, time, turned) - 0.5 * (turned[begin] + turned[end])
-    passed = (codes[begin] != codes[end]) & (end - begin <= 1.5 * np.median(end - begin))
+    apart = time[end] - time[begin]
+    passed = (codes[begin] != codes[end]) & (apart <= 1.5 * np.median(apart))
     at, reference = time.copy(), np.full(len(time), np.nan)
     at[begin] = middle
     reference[begin[passed]] = (0.5 * (codes[begin] + codes[end]) + bent)[passed]

@@ -21,6 +21,7 @@ samples, repeated samples, outliers, a limit on either side) has a level of 2e-4
 units are reported if they are large enough to matter.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -465,3 +466,10 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
     return replace(quality, findings=tuple(findings), usable=valid,
                    limit=limit if math.isfinite(limit) else None,
                    output_step=codes.step if matters else 0.0)
+
+
+def strongest_findings(records: Sequence[DataQuality]) -> list[Finding]:
+    """Return the findings of records, of each effect that with the smallest p-value."""
+    return [*{each.effect: each for each in sorted(
+        (each for record in records for each in record.findings),
+        key=lambda each: -each.p_value)}.values()]

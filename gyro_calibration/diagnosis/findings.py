@@ -282,7 +282,7 @@ class Diagnosis(_Record):
     gates: tuple[Gate, ...] = ()  # checks before causes were named
     # cause, 'reference' or 'left' -> share in the mean square of the heading error over 60 s
     heading_shares: Mapping[str, float] = field(default_factory=dict)
-    reference: Reference | None = None  # of the log; None for several logs or a rate table
+    reference: Reference | None = None  # None for several logs by an exact one, or a rate table
 
     @property
     def verdict(self) -> str:

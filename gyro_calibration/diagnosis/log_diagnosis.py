@@ -29,7 +29,7 @@ from gyro_calibration.diagnosis.candidates import (
 from gyro_calibration.diagnosis.causes import (
     Cause, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES, REFERENCES, slip_times,
     untestable_causes, value_finding)
-from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record
+from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, strongest_findings
 from gyro_calibration.diagnosis.extended_model import (
     add_causes, complete_diagnosis, drop_samples, extend_model, heading_contributions,
     heading_curve, heading_error_shares, is_scale_implausible, measure_gain,
@@ -128,15 +128,10 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                         for log, each in zip(logs, references)))
     limiting_logs = [place for place, log in enumerate(logs)
                      if not is_at_rest(log) and is_reference_limiting(log, references[place])]
-    if limiting_logs and len(logs) > 1:
-        where = ((list(names)
-                  or [f'log {place + 1}' for place in range(len(logs))])[limiting_logs[0]])
-        raise DataRefused(
-            f'the errors of the reference of {where} are larger than those of the gyro, and such '
-            'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
+    if limiting_logs:
+        _refuse_different_references(logs, references, names, limiting_logs[0])
     try:
-        found = (diagnose_by_noisy_reference(logs[0], references[0], model, on_progress,
-                                             instants[0])
+        found = (diagnose_by_noisy_reference(logs, references[0], model, on_progress, instants)
                  if limiting_logs else _diagnose_by_exact_reference(
                      logs, generator, model, names, on_progress, references,
                      reference_kind == 'rate_command'))
@@ -148,6 +143,21 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         found, logs=tuple(names), gates=tuple(all_gates),
         findings=(*findings, *(each for each in slips if each is not None)),
         remarks=(*dict.fromkeys(remarks), *found.remarks)))
+
+
+def _refuse_different_references(logs: Sequence[Log], references: Sequence[Reference],
+                                 names: Sequence[str], place: int) -> None:
+    """Raise `DataRefused` if logs have references whose errors cannot be compared."""
+    for other, log in enumerate(logs):
+        if (references[other].kind != references[place].kind
+                or (log.reference_heading is None) != (logs[place].reference_heading is None)):
+            of_one, of_other = ([*names] or [f'log {number + 1}' for number in range(len(logs))]
+                                )[place], references[other].kind.replace('_', ' ')
+            raise DataRefused(
+                f'the errors of the reference of {of_one} are larger than those of the gyro, and '
+                f'beside {references[place].kind.replace("_", " ")} a log with {of_other} cannot '
+                'be diagnosed together with it: give logs with one kind of reference (state it '
+                'with --reference-kind if it is the same), or diagnose each alone')
 
 
 def _keep_unextended_model(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
@@ -264,7 +274,7 @@ def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: 
     assert motion is not None and log.reference_rate is not None
     of_motion = np.where(motion.valid, log.reference_rate + motion.reference - given.reference,
                          np.nan)
-    found = diagnose_by_noisy_reference(replace(log, reference_rate=of_motion), reference, model,
+    found = diagnose_by_noisy_reference([replace(log, reference_rate=of_motion)], reference, model,
                                         on_progress)
     # nor can a single event be told from what the motion has of its own
     hidden = {name: _HIDDEN_REASON
@@ -409,11 +419,10 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
-    """Return the record findings with the smallest p-value of all logs, and changed values."""
-    best = {each.effect: each for each in sorted(
-        (each for clean in quality for each in clean.findings), key=lambda each: -each.p_value)}
-    covered = {name for each in best.values() for name in each.ambiguous_with}
-    return [*best.values(), *(each for each in changed if each.effect not in covered)]
+    """Return the findings of records, and changed values that they do not explain."""
+    best = strongest_findings(quality)
+    covered = {name for each in best for name in each.ambiguous_with}
+    return [*best, *(each for each in changed if each.effect not in covered)]
 
 
 def _mean_bias_deviation(fit: RegressionFit, noise: Noise) -> float:

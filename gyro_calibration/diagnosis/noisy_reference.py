@@ -9,7 +9,7 @@
 # under the License.
 
 """
-The diagnosis of a log whose reference has errors of its own, such as a course over ground.
+The diagnosis of logs whose reference has errors of its own, such as a course over ground.
 
 Causes are searched for as beside an exact reference, but over spans, under the noise of gyro and
 reference that is found with a column of each cause, and under any wander of the bias.
@@ -18,6 +18,8 @@ The score of a cause is also summed over stretches. Its variance is that by the 
 the scatter of the stretches, whichever is larger, and its distribution is Fisher's, with the
 effective number of stretches less that of the columns as the degrees of freedom. The evidence is
 at most that of this test.
+
+Several logs are joined, each with a bias of its own; a cause has the same values in all.
 """
 
 from __future__ import annotations
@@ -28,20 +30,22 @@ from functools import cached_property
 from itertools import product
 import math
 
+from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.calibration.heading_regression import (
     fit_spans, MIN_STRETCHES, SpanFit, whiten_regression, WhitenedRegression)
+from gyro_calibration.calibration.joined_logs import join_logs
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
 from gyro_calibration.calibration.noise_grid import GridFit
 from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.spans import (
     BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
-    Spans)
+    OWN_BIAS, OWN_DELAY, Spans)
 from gyro_calibration.diagnosis.candidates import (
     Candidate, indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
     Cause, CAUSES, sized_finding, untestable_causes, value_finding)
-from gyro_calibration.diagnosis.data_quality import inspect_record
+from gyro_calibration.diagnosis.data_quality import inspect_record, strongest_findings
 from gyro_calibration.diagnosis.extended_model import (
     add_terms, gain_from_errors, heading_curve, heading_error_shares, HEADING_WINDOW,
     MAX_WINDOW_SHARE, previous_origins, window_changes)
@@ -83,23 +87,27 @@ _ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropp
                   'unit_error', 'quantization', 'saturation'}
 
 
-def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
-                                on_progress: OnProgress,
-                                instants: OwnInstants | None = None) -> Diagnosis:
+def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
+                                model: GyroModel | None, on_progress: OnProgress,
+                                instants: Sequence[OwnInstants | None] = (None,)) -> Diagnosis:
     """
-    Diagnose a log with a reference whose errors are larger than those of the gyro.
+    Diagnose logs with a kind of reference whose errors are larger than those of the gyro.
 
-    The instants are those of a slow reference, by `keep_own_instants`.
+    The instants are those of a slow reference in each log, by `keep_own_instants`.
     """
     on_progress(None, 'data quality')
-    record = inspect_record(replace(log, reference_heading=None, reference_rate=None))
-    assert log.output is not None
-    cleaned_log = replace(log, output=np.where(record.usable, log.output, np.nan))
+    records = [inspect_record(replace(log, reference_heading=None, reference_rate=None))
+               for log in logs]
+    cleaned = [replace(log, output=np.where(record.usable, require_output(log), np.nan))
+               for log, record in zip(logs, records)]
     prior = None if model is None else model.prior_deviations
     on_progress(None, 'bias and scale factor error')
     if model is not None:
-        cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
-    plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior, instants))
+        cleaned = [replace(log, output=compensate_log(model, log)) for log in cleaned]
+    each_alone = [fit_spans(lay_out_spans(log, reference.kind, prior, own))
+                  for log, own in zip(cleaned, instants)]
+    plain = each_alone[0] if len(logs) == 1 else _fit_joined(
+        cleaned, reference.kind, prior, instants, each_alone)
     extended, found = select_causes(plain, SEARCH_ALARM_RATE, on_progress)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
@@ -117,17 +125,17 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
             extended = fit_spans(plain.spans, events) if events else plain
         gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
-    parts, time = _heading_contributions(extended), extended.spans.time
+    of_logs = _heading_contributions(extended)
     noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
     rates = extended.spans.point_means(np.asarray(extended.spans.channels.rate))
     motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
-    of_heading = heading_error_shares([(parts, time)],
+    of_heading = heading_error_shares(of_logs,
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
     findings = [*_value_findings(extended, model, reference), *_reference_findings(extended),
-                *record.findings, *(
+                *(record_findings := strongest_findings(records)), *(
                     each for each in (_cause_finding(cause, extended) for cause in found)
                     if not each.parameters[each.effect].contains_zero)]
-    of_record = {each.effect for each in record.findings}
+    of_record = {each.effect for each in record_findings}
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
     findings = [replace(each, remedy='synchronize the clocks of gyro and reference; the model '
@@ -141,19 +149,62 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                         and each.status == 'established' and not of_clocks), None)
     rejected = gain is not None and gain.is_worse
     before = (model if model is not None else GyroModel() if rejected
-              else _model_with_fit(GyroModel(), plain, log))
+              else _model_with_fit(GyroModel(), plain, logs))
     after = (before if rejected or not (changed or clock_delay or model is None
                                         or prior is not None)
-             else _extend_model(model, model_fit, log, clock_delay, of_clocks))
-    curve, trace = _rate_curve_and_trace(extended, parts)
+             else _extend_model(model, model_fit, logs, clock_delay, of_clocks))
+    curve, trace = _rate_curve_and_trace(extended, of_logs)
     return Diagnosis(tuple(findings), (), _gyro_noise(extended),
                      Noise() if model is None else model.noise,
                      None if not changed and model is not None else gain, before, after,
-                     _untestable_causes(plain), [curve], heading_curve(parts, time), None,
-                     (*record.remarks, *_remarks(reference, extended, prior is not None),
+                     _untestable_causes(plain), [curve], heading_curve(*of_logs[0]), None,
+                     (*(f'log {number}: {remark}' if len(logs) > 1 else remark
+                        for number, record in enumerate(records, 1) for remark in record.remarks),
+                      *_remarks(reference, extended, prior is not None),
+                      *_differences_of_logs(extended, each_alone),
                       *[TIME_LIMIT_REMARK] * bool(time_is_up)),
                      trace=trace, method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
                      reference=replace(reference, noise=noise), heading_shares=of_heading)
+
+
+# several logs
+
+def _fit_joined(logs: Sequence[Log], kind: str, prior: Array | None,
+                instants: Sequence[OwnInstants | None], each_alone: Sequence[SpanFit]) -> SpanFit:
+    """Fit scale factor error, bias and delay to logs with the same quantity as the reference."""
+    delays = [float(fit.values[2]) for fit in each_alone]
+    has_one_clock = kind in _SAME_CLOCK
+    spans = lay_out_spans(join_logs(logs, instants, () if has_one_clock else delays), kind, prior)
+    return fit_spans(replace(spans, delay=float(np.mean(delays))) if has_one_clock else spans)
+
+
+def _own_biases(fit: SpanFit) -> Array:
+    """Return the bias of each log, rad/s."""
+    others = np.array([float(fit.values[fit.value_slice(each)][0])
+                       for each in fit.causes if each.cause == OWN_BIAS])
+    return np.append(-others.sum(), others) + fit.values[1]
+
+
+def _differences_of_logs(fit: SpanFit, each_alone: Sequence[SpanFit]) -> Iterator[str]:
+    """Give what differs between logs, in words."""
+    joined = fit.spans.joined
+    if joined is None:
+        return
+    biases = ', '.join(f'{bias / DEGREE:.4g}' for bias in _own_biases(fit).tolist())
+    yield (f'Each log has a bias of its own: {biases} deg/s in turn; the model has their mean.')
+    if len(joined.delays):
+        yield ('Each log has a delay by its own clock: '
+               f'{", ".join(f"{1000.0 * delay:.4g}" for delay in joined.delays.tolist())} ms in '
+               'turn, which is corrected.')
+    scales, deviations = (np.array([each[place] for each in (
+        (one.values[0], one.deviations[0]) for one in each_alone)]) for place in (0, 1))
+    weights = 1.0 / deviations ** 2
+    square = float(np.sum(weights * (scales - np.average(scales, weights=weights)) ** 2))
+    if chi2.sf(square, len(scales) - 1) < FALSE_ALARM_RATE:
+        shown = ', '.join(f'{100.0 * scale:.3g} +- {100.0 * one.half_width(0):.2g}'
+                          for scale, one in zip(scales.tolist(), each_alone))
+        yield (f'The scale factor errors of the logs alone, {shown} %, differ beyond chance; the '
+               'model has one for all.')
 
 
 # values
@@ -241,11 +292,21 @@ def _cause_finding(found: SelectedCause, extended: SpanFit) -> Finding:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
         values, covariance = values[1:], covariance[1:, 1:]
-    end, temperature = float(spans.time[-1]), spans.log.temperature
+    end, temperature, joined = float(spans.time[-1]), spans.log.temperature, spans.joined
     observed = observed_range([np.asarray(spans.channels.rate)],
                               [] if temperature is None else [temperature], end)
-    return found.finding(values, covariance, shapes, observed,
-                         detectable_sigmas(VALUE_ALARM_RATE), end)
+    finding = found.finding(values, covariance, shapes, observed,
+                            detectable_sigmas(VALUE_ALARM_RATE), end)
+    if joined is None or finding.where is None:
+        return finding
+    number = int(joined.find(begin := finding.where[0]))
+    last = float(spans.stamps[joined.find(spans.stamps) == number][-1])
+    shift, at = float(joined.begins[number]), finding.parameters['step_time']
+    at = replace(at, estimate=at.estimate - shift,
+                 interval=(at.interval[0] - shift, at.interval[1] - shift))
+    return replace(finding, parameters={**finding.parameters, 'step_time': at},
+                   where=(begin - shift, last - shift),
+                   evidence=f'in log {number + 1}, {finding.evidence}')
 
 
 def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
@@ -258,10 +319,10 @@ def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
     return term.shapes[0] * root, 0.5 * term.shapes[0] / max(root, 1e-3)
 
 
-def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
+def _extend_model(model: GyroModel | None, fit: SpanFit, logs: Sequence[Log],
                   delay_finding: Finding | None, left_out: Collection[str]) -> GyroModel:
     """Return the extended model of a fit, with a delay of the gyro, without some causes."""
-    after = _model_with_fit(model or GyroModel(), fit, log, left_out)
+    after = _model_with_fit(model or GyroModel(), fit, logs, left_out)
     if model is not None and model.prior_deviations is not None:
         # the values of this unit replace those of its type
         after = replace(after, tolerance=Tolerance(), origin=previous_origins(model))
@@ -272,7 +333,7 @@ def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
                      np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
 
 
-def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log,
+def _model_with_fit(base_model: GyroModel, fit: SpanFit, logs: Sequence[Log],
                     left_out: Collection[str] = ()) -> GyroModel:
     """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
     own = 1.0 + sum(
@@ -291,10 +352,10 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log,
                 shapes, values, of_term = (shape,), [1.0], [places.start, -1]
             terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
             indices += of_term
-    assert log.output is not None
+    outputs = [log.output for log in logs if log.output is not None]
     new = add_terms(base_model, terms, indices, fit.normal_covariance * np.outer(slopes, slopes),
-                    [log.output[np.isfinite(log.output)]],
-                    [] if log.temperature is None else [log.temperature])
+                    [each[np.isfinite(each)] for each in outputs],
+                    [log.temperature for log in logs if log.temperature is not None])
     return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
 
 
@@ -310,34 +371,42 @@ def _gyro_noise(fit: SpanFit) -> Noise:
 
 # gain
 
-def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
-    """Return contributions of causes to the change of heading over spans, and residual, rad."""
+def _heading_contributions(fit: SpanFit) -> list[tuple[dict[str, Array], Array]]:
+    """Return of each log what causes add to the heading in spans, and residual, rad; times, s."""
     values = fit.values - fit.spans.correction(fit.causes, len(fit.values))
     columns = design_matrix(fit.spans, fit.causes) * values
     found = {name: columns[:, place]
              for place, name in enumerate(BASE_VALUES) if name != 'time_offset'}
     for cause in fit.causes:
-        if cause.cause != 'clock_rate':
-            found[cause.cause] = found.get(cause.cause, 0.0) + columns[
-                :, fit.value_slice(cause)].sum(axis=1)
+        if cause.cause not in ('clock_rate', OWN_DELAY):
+            name = 'bias' if cause.cause == OWN_BIAS else cause.cause
+            found[name] = found.get(name, 0.0) + columns[:, fit.value_slice(cause)].sum(axis=1)
     found['left'] = fit.spans.observed - columns.sum(axis=1)
-    return {name: part[:len(fit.spans.time) - 1] for name, part in found.items()}
+    return [({name: part[spans] for name, part in found.items()},
+             fit.spans.time[spans.start:spans.stop + 1]) for spans in fit.spans.of_logs]
 
 
 def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
-    """Hold out each part of a log in turn, fit the others, and predict heading and rate there."""
-    time, spans = plain.spans.time, plain.spans
-    duration = float(time[-1] - time[0])
-    parts = int(np.clip(duration / 80.0, 2, 6))
-    number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
-    window = min(HEADING_WINDOW, MAX_WINDOW_SHARE * duration / parts)
+    """Hold out each part of logs in turn, fit the others, and predict heading and rate there."""
+    time, spans, parts, window = plain.spans.time, plain.spans, 0, HEADING_WINDOW
+    number = np.full(len(time) - 1, -1)
+    for own in spans.of_logs:
+        begin, duration = time[own.start], float(time[own.stop] - time[own.start])
+        own_parts = int(np.clip(duration / 80.0, 2, 6))
+        number[own] = parts + np.minimum(((
+            time[1:][own] - begin) * own_parts / duration).astype(int), own_parts - 1)
+        parts += own_parts
+        window = min(window, MAX_WINDOW_SHARE * duration / own_parts)
     # under the noise of the plain fit, given the prior of the wandering bias
     noisy = whiten_regression(plain, ())
     prior = len(noisy.observed) - len(spans.observed)
-    # a misalignment is of no model
-    given = slice(2, 3 + spans.cross_rotation.shape[1])
-    models = {'given': (design_matrix(spans, ())[:, given], noisy.design[:, 2:]),
-              'plain': (design_matrix(spans, ()), noisy.design),
+    # a misalignment is of no model, nor are the delays of logs
+    columns = design_matrix(spans, ())
+    given = np.array([2, *range(3, 3 + spans.cross_rotation.shape[1]), *(
+        plain.value_slice(each).start for each in plain.causes if each.cause == OWN_DELAY)])
+    with_given = np.append(given, np.arange(columns.shape[1], noisy.design.shape[1]))
+    models = {'given': (columns[:, given], noisy.design[:, with_given]),
+              'plain': (columns, noisy.design),
               'extended': (design_matrix(extended.spans, extended.causes),
                            whiten_regression(extended, extended.causes, plain).design)}
     errors = []
@@ -356,7 +425,8 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
         if not len(of_part['given'][1]):
             return None
         errors.append(of_part)
-    return gain_from_errors(f'each of {parts} parts of the log in turn, the others being fitted',
+    which = 'the log' if spans.joined is None else 'the logs'
+    return gain_from_errors(f'each of {parts} parts of {which} in turn, the others being fitted',
                             errors, 'given', window)
 
 
@@ -396,20 +466,22 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
                f'{100.0 * done.half_width(0):.2g} %: turn more often, in both directions.')
 
 
-def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Curve]:
-    """Return the residual along the rate, and the measured and simulated rate over time."""
-    steps, time = np.diff(fit.spans.time), fit.spans.time
-    assert fit.spans.log.output is not None
-    measured = fit.spans.span_integrals(fit.spans.log.output)[:len(steps)] / steps
-    before, after = (-each / steps
-                     for each in (sum(parts.values(), 0.0 * parts['left']), parts['left']))
+def _rate_curve_and_trace(fit: SpanFit, of_logs: Sequence[tuple[dict[str, Array], Array]]
+                          ) -> tuple[Curve, Curve]:
+    """Return the residual along the rate, and the rates of the first log over time."""
+    turned, of_first = fit.spans.span_integrals(fit.spans.output), fit.spans.of_logs[0]
+    time = np.concatenate([each[:-1] for _, each in of_logs])
+    steps = np.concatenate([np.diff(each) for _, each in of_logs])
+    measured = np.concatenate([turned[own] for own in fit.spans.of_logs]) / steps
+    before, after = (-np.concatenate(each) / steps for each in zip(*(
+        (sum(parts.values(), 0.0 * parts['left']), parts['left']) for parts, _ in of_logs)))
     order = np.array_split(np.argsort(measured, kind='stable'), min(20, len(steps) // 4 + 1))
     at, given, left = (np.array([float(each[part].mean()) for part in order])
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
     return (Curve('rate', 'rad/s', at, given, left, deviation, np.zeros(len(order))),
-            Curve('time', 's', time[:-1] + 0.5 * steps, before, after,
-                  simulated=measured - before))
+            Curve('time', 's', (time + 0.5 * steps)[of_first], before[of_first], after[of_first],
+                  simulated=(measured - before)[of_first]))
 
 
 # the log as spans
@@ -595,7 +667,7 @@ def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
     terms = [CauseTerm(*each) for each in lasting_shapes(
         has, float(time[-1] - time[0]), np.asarray(fit.spans.channels.temperature))]
     fastest = float(np.abs(fit.spans.channels.rate).max())
-    terms += [CauseTerm('clock_rate'),
+    terms += [*[CauseTerm('clock_rate')] * (fit.spans.joined is None),
               *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
     return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
             and not (fit.lacks_turns and _follows_the_rate(each.cause))]

@@ -104,3 +104,20 @@ def test_differences_of_autoregressive_errors_have_the_covariance_that_is_stated
     spans = heading_noise(np.arange(9.0), np.zeros(9), correlation=correlation)[0]
     assert quasi @ quasi.T == pytest.approx(np.diag(spans.diagonal) + np.diag(
         spans.off_diagonal[1:], -1) + np.diag(spans.off_diagonal[1:], 1))
+
+
+def test_a_span_that_the_gyro_does_not_cover_shows_nothing():
+    """Its points have errors of their own, whatever its observation would be."""
+    generator = np.random.default_rng(1)
+    time, is_measured = np.arange(0.0, 60.0, 0.5), np.ones(119, dtype=bool)
+    is_measured[60] = False
+    turned = np.diff(0.01 * time + 0.02 * generator.standard_normal(120))
+    turned[61] += 0.5  # an error of the point after it that would be one of the point before, too
+    columns = (np.diff(time) * is_measured)[:, None]
+    parts = heading_noise(time, np.zeros(120), is_measured=is_measured)
+    found = []
+    for observation in (0.0, 3.0):
+        turned[60] = observation
+        found.append(fit_noise_grid(turned, columns, [parts[0], parts[1], parts[3]]))
+    assert found[0].values == pytest.approx(found[1].values, rel=1e-3)
+    assert found[0].size('reference') == pytest.approx(found[1].size('reference'), rel=1e-3)

@@ -468,10 +468,63 @@ def swing(seed, rate, noise, interval=0.04, duration=150.0):
                reference_rate=true + 0.3 * white[1])
 
 
+# several logs
+
+def three_drives(seed, hidden=lambda time, rate, heading, temperature: 0.0, step=0.0):
+    """Return drives with a bias and a delay of their own, the last with a step of the bias."""
+    generator, logs = np.random.default_rng(seed), []
+    biases = generator.normal(0.0, 0.3 * DEGREE, 3)
+    for number, bias in enumerate(biases):
+        log = drive(seed * 10 + number, 150.0, hidden)
+        late = step * (log.time > 90.0) * (number == 2)
+        logs.append(replace(log, output=log.output + bias + late, time=1e3 * number + log.time,
+                            reference_heading=np.interp(
+                                log.time + generator.uniform(-0.4, 0.4), log.time,
+                                log.reference_heading)))
+    return logs, BIAS_TRUE + biases
+
+
+@pytest.mark.parametrize('seed', seeds(2))
+def test_logs_have_a_bias_and_a_delay_of_their_own_and_share_the_rest(seed):
+    logs, biases = three_drives(seed)
+    found = diagnose(logs, np.random.default_rng(0), reference_kind='course')
+    assert not established(found), terminal_lines(found)
+    estimates = {each[0]: each[2:4] for each in found.model.estimates()}
+    for name, truth in (('bias', biases.mean()), ('scale_factor_error', SCALE)):
+        assert abs(estimates[name][0] - truth) < 3.5 * estimates[name][1], name
+    assert estimates['bias'][1] < 0.02 * DEGREE
+    (remark,) = (each for each in found.remarks if 'bias of its own' in each)
+    stated = [float(each) for each in remark.split(': ')[1].split(' deg/s')[0].split(', ')]
+    assert stated == pytest.approx(biases / DEGREE, abs=0.05)
+
+
+def test_a_cause_that_one_log_leaves_open_is_established_by_three():
+    logs, _ = three_drives(
+        1, lambda time, rate, heading, temperature: 0.15 * DEGREE * np.sin(heading))
+    name, alone = 'heading_sensitivity', [diagnosed(log, kind='course') for log in logs]
+    together = diagnose(logs, np.random.default_rng(0), reference_kind='course')
+    assert not all(name in established(each) for each in alone)
+    assert name in established(together), [*terminal_lines(together)]
+
+
+def test_a_step_of_the_bias_is_in_its_log_alone():
+    logs, _ = three_drives(2, step=0.8 * DEGREE)
+    found = diagnose(logs, np.random.default_rng(0), reference_kind='course')
+    step = established(found)['bias_step']
+    assert step.evidence.startswith('in log 3, ')
+    assert step.where == (pytest.approx(90.0, abs=8.0), pytest.approx(150.0, abs=1.0))
+    at = step.parameters['step_time']
+    assert at.interval[0] < 90.0 < at.interval[1]
+    assert step.parameters['bias_step'].estimate == pytest.approx(
+        0.8 * DEGREE, abs=0.06 * DEGREE)
+
+
 def test_several_logs_with_a_reference_that_errs_are_not_taken_for_exact():
     logs = [swing(seed, lambda time: 0.5 * np.sin(time), 1e-4, duration=30.0) for seed in (1, 2)]
-    with pytest.raises(DataRefused, match='reference of log 1 are .* diagnose each alone'):
-        diagnose(logs, np.random.default_rng(0))
+    found = diagnose(logs, np.random.default_rng(0))
+    assert not established(found), terminal_lines(found)
+    with pytest.raises(DataRefused, match='reference of log 1 are .* one kind of reference'):
+        diagnose([logs[0], drive(1)], np.random.default_rng(0))
 
 
 @pytest.mark.parametrize('seed', seeds(3))
