@@ -221,7 +221,7 @@ class HeadingEstimator:
                             if here is not None and coefficient else None)
 
     def _largest_bias_slope(self, temperature: float) -> float:
-        """Return that by the covariance of the model within 10 K, rad/s/K; 0 if it is not known."""
+        """Return that of the model within 10 K, rad/s/K; 0 where it states no covariance."""
         model = self.current_model
         if model.covariance is None or model.needs_history:
             return 0.0

@@ -258,6 +258,7 @@ class HeadingTracker:
 
     @property
     def _ambiguity_begin_time(self) -> float:
+        """Return since when the heading contains `bias_ambiguity`, s."""
         return (max(self._heading_begin_time, self._motion_start_time)
                 if self._steady_rates is None and self._has_rested else self._heading_begin_time)
 
@@ -447,8 +448,8 @@ class HeadingTracker:
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
-                     self._pending_correction, self.bias_ambiguity ** 2, self._ambiguity_begin_time,
-                     self._mixture_variance, [self._open_row(place)])
+                     self._pending_correction, self.bias_ambiguity ** 2,
+                     self._ambiguity_begin_time, self._mixture_variance, [self._open_row(place)])
 
     def _open_row(self, place: int) -> tuple[int, float, float, Array]:
         """Return the open integral after a sample as that of an `Epoch`."""
