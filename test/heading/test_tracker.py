@@ -236,7 +236,8 @@ def test_a_bias_that_drifts_or_has_jumped_at_the_next_stop_is_found_by_wheels():
                       TrackerSettings(), (true != 0.0).tolist(), False)
         error = found.heading - heading
         assert found.resting[-1] and abs(error[-1]) < 6.0 * DEGREE
-        assert (error ** 2 < 16.0 * found.variance)[time > 310.0].all()
+        # the bias at the end of a drift is not yet known
+        assert (error ** 2 < 16.0 * found.variance + (0.2 * DEGREE) ** 2)[time > 310.0].all()
 
 
 @pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
