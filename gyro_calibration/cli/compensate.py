@@ -136,6 +136,10 @@ def _describe_bias(found: _Totals, data: dict[str, Any]) -> Iterator[str]:
         yield ('No rest was found: the bias of the calibration was used, and a change since then '
                'is not in the standard deviation; rest for some seconds now and then, or '
                'calibrate before each drive.')
+    if estimator.is_scale_assumed:
+        yield ('The scale factor error is not known from a calibration: '
+               f'{100.0 * Assumptions.scale_factor_error:g} % is in the standard deviation; run '
+               'self-calibrate, or give the model of fit, which states its covariance.')
     if estimator.bias_message:
         yield as_sentence(estimator.bias_message)
     if not data['temperature_known']:

@@ -84,7 +84,7 @@ class HeadingEstimator:
     `corrected_rate` that before the tracker. `temperature`, degC, is None before the first. The
     sum of `heading_before_resets` and the heading of the tracker, rad, is not changed by resets.
     `is_bias_assumed` tells whether neither the model nor a self-calibration has a bias with its
-    variance.
+    variance, `is_scale_assumed` whether neither has a scale factor error.
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
@@ -157,9 +157,11 @@ class HeadingEstimator:
                 (0.0, model.tolerance.bias ** 2 if fits_bias else assumed[1][1])))
         elif calibration is not None and (calibration.covariance is None
                                           or not np.isfinite(calibration.covariance).all()):
-            calibration, fits_bias = replace(calibration, covariance=assumed), False
-        self.is_bias_assumed = not fits_bias and (
+            calibration, fits_scale, fits_bias = (
+                replace(calibration, covariance=assumed), False, False)
+        self.is_bias_assumed, self.is_scale_assumed = (not fits and (
             self.model.self_calibration is None or calibration is not model.self_calibration)
+            for fits in (fits_bias, fits_scale))
         if calibration is not model.self_calibration:
             model = with_self_calibration(model, calibration)
         age: float | None = 0.0
@@ -211,8 +213,20 @@ class HeadingEstimator:
         """Start the temperature correction of the bias at the present temperature, if known."""
         here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
         self._follows_temperature = here is not None
+        if here is not None and coefficient and not self.table.entries:
+            # what a model explains of the temperature, it leaves no more of than that
+            explained = self._largest_bias_slope(here)
+            coefficient *= max(coefficient / explained, 1.0) if explained else 1.0
         self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
                             if here is not None and coefficient else None)
+
+    def _largest_bias_slope(self, temperature: float) -> float:
+        """Return that of the model within 10 K, rad/s/K; 0 where it states no covariance."""
+        model = self.current_model
+        if model.covariance is None or model.needs_history:
+            return 0.0
+        around = temperature + np.array([-10.0, 0.0, 10.0])
+        return float(np.abs(np.diff(compensate(model, np.zeros(3), around).rate)).max() / 10.0)
 
     @property
     def calibration_message(self) -> str:

@@ -48,9 +48,12 @@ MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 _STEP_DURATION = MEAN_LAGS[0]
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
 _BIAS_MARGIN_SIGMAS = 4.0
-#: Change of the bias that is assumed while the wheels stand, rad/s; largest delay of odometry
-#: after the begin of a turn, s.
+#: Change of the bias that is assumed from one stop of the wheels to the next, rad/s, and over the
+#: longest lag while they stand; largest delay of odometry after the begin of a turn, s.
 _WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
+#: Share of sudden changes of the rate while the wheels stand that are changes of the bias. A floor
+#: that turns, or wheels that creep or are pushed, are assumed to be ten times more frequent.
+_CHANGE_SHARE = 0.1
 #: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
 #: which on it is used, and factor of the thresholds of means.
 NOISE_TOLERANCE = 1.25
@@ -251,7 +254,13 @@ class HeadingTracker:
 
     def ambiguity_variance(self, time: Number) -> Number:
         """Return the variance of the heading at a stamp, s, by `bias_ambiguity`, rad²."""
-        return (self.bias_ambiguity * (time - self._heading_begin_time)) ** 2
+        return (self.bias_ambiguity * (time - self._ambiguity_begin_time)) ** 2
+
+    @property
+    def _ambiguity_begin_time(self) -> float:
+        """Return since when the heading contains `bias_ambiguity`, s."""
+        return (max(self._heading_begin_time, self._motion_start_time)
+                if self._steady_rates is None and self._has_rested else self._heading_begin_time)
 
     # Samples
 
@@ -439,8 +448,8 @@ class HeadingTracker:
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
-                     self._pending_correction, self.bias_ambiguity ** 2, self._heading_begin_time,
-                     self._mixture_variance, [self._open_row(place)])
+                     self._pending_correction, self.bias_ambiguity ** 2,
+                     self._ambiguity_begin_time, self._mixture_variance, [self._open_row(place)])
 
     def _open_row(self, place: int) -> tuple[int, float, float, Array]:
         """Return the open integral after a sample as that of an `Epoch`."""
@@ -575,9 +584,9 @@ class HeadingTracker:
         is_expected = difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance
         repeats = wheels is False and self._repeats_standing(held, is_expected)
         change = 0.0
-        if repeats:
+        if repeats and not self._has_rested:
             change = math.sqrt(TURN_ON_RATIOS[-1]) * turn_on
-        elif wheels is False:
+        elif repeats or wheels is False and not self._stands_since_rest:
             change = _WHEEL_BIAS_CHANGE
         is_after_slow_turn = self._quiet_duration > WINDOW_DURATION
         sigmas = (0.5 if is_after_slow_turn else 1.0) * self._sigmas[self._quiet_duration]
@@ -586,8 +595,9 @@ class HeadingTracker:
                 self._enter_motion(self._quiet_duration)
             return
         self._advance_state(held)
-        change = 0.0
-        lasts = (wheels is False and not is_expected
+        # what turned while the wheels stood may have been a change of the bias that has ended
+        of_bias, of_heading = 0.0, self._standing_ambiguity if self._stands_since_rest else 0.0
+        lasts = (wheels is False and not is_expected and not self._stands_since_rest
                  and self._last_time - self._wheel_motion_time >= _WHEEL_DELAY)
         if self._turn_on_probability > CHANGE_PROBABILITY or not self._has_rested and (
                 repeats or lasts and self._agrees_with(
@@ -595,16 +605,20 @@ class HeadingTracker:
             # the bias is that of another power-on
             self._change_bias(0.0, max(difference ** 2, turn_on ** 2), still)
             self._turn_on_probability, self._has_rested = 0.0, True
-        elif lasts or repeats:
-            change = difference  # that only the wheels explain
-        self._has_rested |= is_expected or bool(change)
+        elif lasts or repeats:  # only the wheels explain it; it may have come since the last rest
+            of_bias = of_heading = difference
+        self._has_rested |= is_expected or bool(of_bias)
         if self._has_rested:
             self._standing_ambiguity = 0.0
-        # it may have come at any time since the last rest
         self._state = self._state.with_added_variance(
-            HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
-        self._enter_rest(change)
+            HEADING_INDEX, (of_heading * (self._last_time - self._motion_start_time)) ** 2)
+        self._enter_rest(of_bias)
         self._rest_blocks.extend([*self._recent_blocks][1:])
+
+    @property
+    def _stands_since_rest(self) -> bool:
+        """Tell whether the wheels have not moved since the last rest, whose bias is known."""
+        return self._has_rested and self._wheel_motion_time < self._motion_start_time
 
     def _repeats_standing(self, turn: RateIntegral, is_expected: bool) -> bool:
         """Keep an unexpected rate while wheels stand; tell whether they stood so before."""
@@ -617,8 +631,9 @@ class HeadingTracker:
                 self._earlier_rate = float(np.median(self._standing_rates))
             self._standing_rates, self._standing_since = [], self._wheel_motion_time
         self._standing_rates.append(turn.angle / turn.duration)
-        if not self._has_rested:
-            self._standing_ambiguity = abs(float(np.median(self._standing_rates)))
+        if not self._has_rested or self._stands_since_rest:
+            self._standing_ambiguity = abs(float(np.median(self._standing_rates))) * (
+                math.sqrt(_CHANGE_SHARE) if self._has_rested else 1.0)
             self._state_version += 1
         return self._agrees_with(self._earlier_rate, turn)
 
@@ -703,12 +718,16 @@ class HeadingTracker:
                 variance += (before.scatter * turn.duration
                              * before.state.noise.angle_random_walk ** 2)
             if abs(turn.angle - expected) > self._sigmas[lag] * math.sqrt(variance):
-                if wheels is False:
-                    if lag < _WHEEL_DELAY:
-                        continue
-                    self._enter_rest((turn.angle - expected) / turn.duration)
-                else:
+                change = (turn.angle - expected) / turn.duration
+                # a bias changes slowly, a turn begins at once
+                is_sudden = self._has_rested and abs(change) > (
+                    _WHEEL_BIAS_CHANGE * max(lag, _WHEEL_DELAY) / MEAN_LAGS[-1])
+                if wheels is not False or is_sudden:
                     self._revert_to_motion(lag)
+                elif lag < _WHEEL_DELAY:
+                    continue
+                else:
+                    self._enter_rest(change)
                 return
 
     def _snapshot_before(self, lag: float) -> Snapshot | None:

@@ -177,6 +177,8 @@ def test_compensate_warns_of_a_bias_that_is_not_calibrated(compensate, words, sa
     answer = json.loads(compensate(log, model, *words, '--json').text)
     assert answer['bias_is_calibrated'] == known
     assert ('a change of the bias with it is not in the standard deviation' in text) == bool(words)
+    assert ('The scale factor error is not known from a calibration: 3 %' in text) == (
+        known and bool(words))
     if words:
         assert (answer['bias_ambiguity_rad_s'] > 0.1 * DEGREE) != known
         assert ('everal steady rates may be that of a rest' in text) != known

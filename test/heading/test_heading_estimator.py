@@ -162,6 +162,18 @@ def test_the_variance_grows_with_the_distance_of_the_temperature_and_a_rest_take
         20.0, 0.3, (25.0, 35.0)).live.tracker.bias[1] < 0.1 * known
 
 
+def test_a_model_over_temperature_leaves_no_more_than_it_explains():
+    """Rests at one temperature, off by another power-on, are no slope for the next 10 K."""
+    explained = GyroModel([Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.0,)),
+                           Term(BIAS_TEMPERATURE, (25.0, 4e-4 * DEGREE))], noise=NOISE,
+                          covariance=np.diag([(1e-4 * DEGREE) ** 2, 1e-8,
+                                              (1e-5 * DEGREE) ** 2]))
+    deviations = [Gyro(begun(model), coefficient=4e-4 * DEGREE, bias=0.0).go(
+        30.0, temperature=25.0).go(20.0, 0.3, (25.0, 35.0)).live.tracker.bias[1]
+        for model in (explained, MODEL)]
+    assert deviations[0] < 0.02 * DEGREE < 0.15 * DEGREE < deviations[1]
+
+
 def heated(live):
     """Return a gyro that rested from 25 to 45 degC and back."""
     gyro = Gyro(live, coefficient=0.03 * DEGREE).go(60.0)

@@ -209,15 +209,35 @@ def test_false_alarms_are_as_rare_as_stated():
     assert 0 < alarms <= poisson.isf(RARE, 20.0), alarms
 
 
-@pytest.mark.parametrize('change', [0.001, 0.01, 0.02])
-def test_a_bias_that_jumps_while_the_wheels_stand_does_not_turn_the_heading(change):
-    noise, generator = Noise(1e-5), np.random.default_rng(13)
-    tracker = HeadingTracker(noise, np.diag([1e-12]), TrackerSettings())
-    for index, bias in enumerate([0.0] * 1200 + [change] * 2400 + [0.0] * 2400):
-        drawn = noise.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL)
-        assert not tracker.add(INTERVAL * index, bias + drawn, np.array([-1.0]), False)
-    assert tracker.is_resting and tracker.bias[0] == pytest.approx(0.0, abs=1e-4)
-    assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
+@pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
+@pytest.mark.parametrize('change', [0.06, 0.3, 1.1])
+def test_what_turns_a_robot_whose_wheels_stand_is_a_turn_and_the_deviation_has_a_bias(
+        change, hindsight):
+    """A floor that turns, wheels that creep; or a motor whose vibration changes the bias."""
+    noise, known = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
+    motion = constant_rate_motion([(20, 0), (40, change), (20, 0), (3, 40), (20, 0)])
+    time, true, heading, rate = gyro(motion, np.random.default_rng(13), noise, bias=0.0)
+    found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
+                  TrackerSettings(), (np.abs(true) > 2.0 * DEGREE).tolist(), hindsight)
+    late = time > 62.0
+    assert np.abs(found.heading - heading)[late].max() < 0.5 * DEGREE
+    of_bias = (found.heading - (heading - np.minimum(40.0, time - 20.0) * change * DEGREE))[late]
+    assert (of_bias ** 2 < 16.0 * found.variance[late]).all()
+
+
+def test_a_bias_that_drifts_or_has_jumped_at_the_next_stop_is_found_by_wheels():
+    noise, known = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
+    parts = [(300, 0), (4, 45), (20, 0), (4, -30), (20, 0)]
+    motion = constant_rate_motion(parts)
+    for bias in (lambda t: 0.2 * np.minimum(t / 300.0, 1.0), lambda t: 0.3 * (t > 290.0)):
+        time, true, heading, rate = gyro(motion, np.random.default_rng(3), noise, bias=0.0)
+        rate = rate + DEGREE * bias(time)
+        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
+                      TrackerSettings(), (true != 0.0).tolist(), False)
+        error = found.heading - heading
+        assert found.resting[-1] and abs(error[-1]) < 6.0 * DEGREE
+        # the bias at the end of a drift is not yet known
+        assert (error ** 2 < 16.0 * found.variance + (0.2 * DEGREE) ** 2)[time > 310.0].all()
 
 
 @pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
