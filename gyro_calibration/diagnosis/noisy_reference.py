@@ -125,26 +125,18 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
             extended = fit_spans(plain.spans, events) if events else plain
         gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
-    of_logs = _heading_contributions(extended)
-    noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
-    rates = extended.spans.point_means(np.asarray(extended.spans.channels.rate))
-    motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
-    of_heading = heading_error_shares(of_logs,
-                                      2.0 * (noise['reference'] ** 2 + motion_variance))
-    findings = [*_value_findings(extended, model, reference), *_reference_findings(extended),
-                *(record_findings := strongest_findings(records)), *(
-                    each for each in (_cause_finding(cause, extended) for cause in found)
-                    if not each.parameters[each.effect].contains_zero)]
-    of_record = {each.effect for each in record_findings}
+    of_logs, of_record = _heading_contributions(extended), strongest_findings(records)
     # between two clocks neither a delay nor a clock rate is a property of the gyro
     of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
+    findings = [*_value_findings(extended, model, reference), *_reference_findings(extended),
+                *of_record, *_cause_findings(found, extended)]
     findings = [replace(each, remedy='synchronize the clocks of gyro and reference; the model '
                                      'does not contain it')
                 if each.effect in of_clocks and each.status == 'established' else each
                 for each in findings]
+    not_in_model = {'time_offset', 'bias_step', *of_clocks, *(each.effect for each in of_record)}
     changed = any(each.status == 'established' and CAUSES[each.effect].origin == 'gyro'
-                  and each.effect not in {'time_offset', 'bias_step', *of_record, *of_clocks}
-                  for each in findings)
+                  and each.effect not in not_in_model for each in findings)
     clock_delay = next((each for each in findings if each.effect == 'time_offset'
                         and each.status == 'established' and not of_clocks), None)
     rejected = gain is not None and gain.is_worse
@@ -164,7 +156,9 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
                       *_differences_of_logs(extended, each_alone),
                       *[TIME_LIMIT_REMARK] * bool(time_is_up)),
                      trace=trace, method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
-                     reference=replace(reference, noise=noise), heading_shares=of_heading)
+                     reference=replace(reference, noise={
+                         name: extended.noise_size(name) for name in ('reference', 'motion')}),
+                     heading_shares=heading_error_shares(of_logs, 2.0 * _point_variance(extended)))
 
 
 # several logs
@@ -281,6 +275,14 @@ def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
     return bool(abs(values[place] - left) < 3.0 * np.linalg.norm(inverse[place]))
 
 
+def _cause_findings(found: Sequence[SelectedCause], extended: SpanFit) -> Iterator[Finding]:
+    """Give the causes that the search found, unless they may have the size 0."""
+    for cause in found:
+        finding = _cause_finding(cause, extended)
+        if not finding.parameters[finding.effect].contains_zero:
+            yield finding
+
+
 def _cause_finding(found: SelectedCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
     term, spans = _term_of(found.cause), extended.spans
@@ -384,6 +386,13 @@ def _heading_contributions(fit: SpanFit) -> list[tuple[dict[str, Array], Array]]
     found['left'] = fit.spans.observed - columns.sum(axis=1)
     return [({name: part[spans] for name, part in found.items()},
              fit.spans.time[spans.start:spans.stop + 1]) for spans in fit.spans.of_logs]
+
+
+def _point_variance(fit: SpanFit) -> float:
+    """Return the mean variance of the errors of the reference at a point, rad²."""
+    rates = fit.spans.point_means(np.asarray(fit.spans.channels.rate))
+    return (fit.noise_size('reference') ** 2
+            + fit.noise_size('motion') ** 2 * float(np.mean(rates ** 2)))
 
 
 def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
