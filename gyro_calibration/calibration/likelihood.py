@@ -795,7 +795,7 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     variance += shared @ estimate.covariance[of_shared, of_shared] @ shared
     start = heading + (shared @ estimate.values[of_shared] - error - gyro_angle
                        + bias * elapsed) / scale
-    return float(start), math.sqrt(variance) / abs(scale)
+    return float(start), math.sqrt(max(variance, 0.0)) / abs(scale)
 
 
 #: Standard deviation of a turn beside the profile, by hand or a slip, rad/s.

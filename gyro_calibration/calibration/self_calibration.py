@@ -28,8 +28,8 @@ from gyro_calibration.calibration.likelihood import (
     ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_NOISE_SIGMAS,
     MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
-    RunPieces, split_run)
+    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_limited, refuse_other_motion,
+    refuse_unit_error, RunPieces, split_run)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
@@ -131,6 +131,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
     run = split_run(time, rate)
+    refuse_limited(run, motion, limits.max_time_offset + MAX_TRACKING_LAG, time,
+                   rate if output is None else output)
     _refuse_run(time, run, motion, limits)
     if method == 'likelihood':
         fit = _fit_likelihood(time, rate, motion, limits.max_time_offset,
