@@ -96,7 +96,7 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     unexplained, scale = fit_scale(found.output, found.rate)
     if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
         refuse_unit_error(scale, 'reference')
-    if (limited := _mark_limited(require_output(log), found)).any():
+    if (limited := _mark_limited(log, found)).any():
         places = [place for place, at_limit in zip(found.location, limited) if at_limit]
         remark = (f'{len(places)} dwells are at the limit of the output, '
                   f'{np.abs(found.output[limited]).max() / DEGREE:.4g} deg/s, and left out: '
@@ -112,16 +112,17 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
                    remarks=tuple(f'{name}: {remark}' for remark in found.remarks))
 
 
-def _mark_limited(output: Array, dwells: Dwells) -> Mask:
+def _mark_limited(log: Log, dwells: Dwells) -> Mask:
     """
-    Return which dwells are at the limit of an output of the samples of the log, shape (n,).
+    Return which dwells are at the limit of the output of their log, shape (n,).
 
     They have one output, in one sense or both; a line through the others is beyond it at each of
     their rates, and leaves less than one more effect of the rate in place of the limit. Of an
     output that shows its noise, dwells have the same value by chance seldom.
     """
-    extreme, step = mark_extremes(output)
+    extreme, step = mark_extremes(require_output(log))
     limited = np.array([extreme[rows].mean() > 0.5 for rows in dwells.rows])
+    times = np.array([len(rows) if log.time is None else 1 for rows in dwells.rows])
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
     # dwells of one rate and output have one rounding error, and count once
     group = np.rint(dwells.rate / (0.005 * fastest))
@@ -129,7 +130,7 @@ def _mark_limited(output: Array, dwells: Dwells) -> Mask:
     used[np.unique(np.column_stack([group, np.rint(dwells.output / (1e-9 * fastest))]), axis=0,
                    return_index=True)[1]] = True
     line = np.column_stack([np.ones(len(dwells)), dwells.rate / fastest])
-    others, repeats, spare = used & ~limited, np.count_nonzero(limited) - 1, used.sum() - 3.0
+    others, repeats, spare = used & ~limited, times[limited].sum() - 1, used.sum() - 3.0
     if repeats < 1 or spare < 1 or not others.any() or np.ptp(line[others, 1]) < 0.01:
         return np.zeros(len(dwells), dtype=bool)
 
@@ -149,9 +150,10 @@ def _mark_limited(output: Array, dwells: Dwells) -> Mask:
     chance = min(3.0 * float(fisher.sf((instead - left) * spare / left, 1, spare)), 1.0)
     # the scatter of the others, between those of one rate, or by the samples of a fine output
     group = np.unique(group[~limited], return_inverse=True)[1]
-    error, counts = (dwells.output - expected)[~limited], np.bincount(group)
-    error = error - (np.bincount(group, error) / counts)[group]
-    scatter = max(math.sqrt(float(error @ error) / max(len(group) - len(counts), 1)), 1e-300)
+    error, times = (dwells.output - expected)[~limited], times[~limited]
+    counts = np.bincount(group, times)
+    error = error - (np.bincount(group, times * error) / counts)[group]
+    scatter = max(math.sqrt(float(times @ error ** 2) / max(times.sum() - len(counts), 1)), 1e-300)
     if not len(dwells.rounding):
         scatter = max(scatter, float(np.median(np.nan_to_num(dwells.deviation[~limited]))))
     chance *= min(step / (2.0 * math.sqrt(math.pi) * scatter), 1.0) ** repeats
@@ -232,19 +234,56 @@ def dwells_from_table(log: Log) -> Dwells:
     except ValueError as error:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
-    output = output[rows]
+    output, temperature = output[rows], None if log.temperature is None else log.temperature[rows]
+    first, number = _find_distinct(rate, output, temperature)
+    parts, is_coarse = tuple(np.split(rows, len(rows))), len(first) < len(rows)
     rounding: Array = np.empty((0, 2))
-    if not (deviation > 0.0).any():  # that of the steps is the only one that is known
-        # The step is the largest one that all differences are multiples of. Where the rates
-        # explain it, as those of a gyro without errors, it is at most 1 deg/s.
-        step = largest_divisor(output - output[0])
-        if step > 0.5 * largest_divisor(rate - rate[0]):
-            step = largest_divisor(np.append(output - output[0], DEGREE))
-        rounding, deviation = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
-    return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
+    if is_coarse or not (deviation > 0.0).any():  # that of the steps is the only one that is known
+        # The step is the largest one that all differences are multiples of, those of a coarse
+        # output but for its decimals. Where the rates explain it, as those of a gyro without
+        # errors, it is at most 1 deg/s.
+        changes, of_rates = output - output[0], 0.5 * largest_divisor(rate - rate[0])
+        step = largest_divisor(changes)
+        coarse = largest_divisor(changes, step) if is_coarse else 0.0
+        if 2.0 * math.sqrt(step * np.abs(changes).max()) < coarse < of_rates:
+            step = coarse  # by multiples that the decimals leave certain
+        if step > of_rates:
+            step = largest_divisor(np.append(changes, DEGREE))
+        if len(_coarse_rounding(rate[first], output[first], step, np.zeros(len(first)))[0]):
+            rounding, of_steps = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
+            deviation = np.hypot(np.maximum(np.nan_to_num(deviation), 0.0), of_steps)
+    if is_coarse:  # the sweeps hardly differ
+        sweep = 0 * sweep
+    if is_coarse and not len(rounding):
+        repeats = [str(row + 1) for row in np.delete(rows, first)]
+        remarks.append('sweeps have the same outputs, by the steps of the output, so that rows '
+                       f'which repeat another one count once: {format_list(repeats)}')
+        parts = tuple(rows[number == each] for each in range(len(first)))
+        rows, rate, output, deviation, sweep = (  # type: ignore[assignment]
+            each[first] for each in (rows, rate, output, deviation, sweep))
+        temperature = None if temperature is None else temperature[first]
+    return Dwells(rate, output, temperature,
                   np.where(deviation > 0.0, deviation, np.nan), sweep,
-                  tuple(f'row {row + 1}' for row in rows), tuple(remarks),
-                  tuple(np.split(rows, len(rows))), rounding)
+                  tuple(f'row {row + 1}' for row in rows), tuple(remarks), parts, rounding)
+
+
+def _find_distinct(rate: Array, output: Array,
+                   temperature: Array | None) -> tuple[Numbers, Numbers]:
+    """
+    Return the first of equal dwells, and of which each dwell is one, shape (m,) and (n,).
+
+    Dwells of one rate, output and temperature are equal where most repeats of rates are: they have
+    one error by the steps of the output, of which several do not tell more.
+    """
+    warm = np.zeros(len(rate)) if temperature is None else np.nan_to_num(temperature)
+    warm = np.floor((warm - warm.min()) / MIN_TEMPERATURE_SPREAD)
+    places = len(np.unique(np.column_stack([rate, warm]), axis=0))
+    _, first, number = np.unique(np.column_stack([rate, warm, output]), axis=0, return_index=True,
+                                 return_inverse=True)
+    if 2 * (len(rate) - len(first)) <= len(rate) - places:
+        return np.arange(len(rate)), np.arange(len(rate))
+    order = np.argsort(first)
+    return first[order], np.argsort(order)[number.ravel()]
 
 
 def _number_sweeps(rate: Array) -> tuple[Numbers, str]:

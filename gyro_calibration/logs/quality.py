@@ -297,16 +297,17 @@ def refuse_dead(output: Array) -> None:
                           'move; check power and wires')
 
 
-def largest_divisor(values: Array) -> float:
-    """Return the greatest common divisor of values, to 1e-9 of the largest; else 0."""
+def largest_divisor(values: Array, error: float = 0.0) -> float:
+    """Return the greatest common divisor of values with an error, to 1e-9 of the largest; or 0."""
     values = np.abs(values)
-    smallest = 1e-9 * float(values.max(initial=0.0))
+    smallest = 1e-9 * float(values.max(initial=0.0)) + error
     while (values > smallest).any():
         divisor = float(values[values > smallest].min())
         rest = np.abs(values - divisor * np.rint(values / divisor))
-        if (rest <= smallest).all():
+        off = rest > smallest + error * values / divisor
+        if not off.any():
             return divisor
-        values = np.append(rest, divisor)
+        values = np.append(rest[off], divisor)
     return 0.0
 
 
