@@ -261,7 +261,8 @@ class _RunAlignment:
 
     def find_coarse_offset(self, largest: float) -> float:
         """Return the trial offset, s, at which gyro and motion agree best."""
-        return fit_profile(split_run(self._time, self._rate), self._motion, largest, 0.02)[2]
+        run = split_run(self._time, self._rate, self._motion)
+        return fit_profile(run, self._motion, largest, 0.02)[2]
 
 
 def _second_difference(heading: Callable[[Array], Array], at: Array, base: float) -> Array:

@@ -23,7 +23,7 @@ import math
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import RATE_UNITS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import mark_extremes, Saturated
+from gyro_calibration.logs.quality import mark_extremes, Saturated, white_noise_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from scipy.linalg import orth
@@ -109,12 +109,19 @@ class RunPieces:
         return fit_scale(self.gyro_angle, reference) if len(self.gyro_angle) else (1.0, 0.0)
 
 
-def split_run(time: Array, rate: Array) -> RunPieces:
-    """Return a run in pieces."""
+def split_run(time: Array, rate: Array, motion: Motion | None = None) -> RunPieces:
+    """Return a run in pieces, longer where the noise of a measured heading hides their turns."""
     length = max(_TRIAL_STEP, 2.0 * float(np.median(np.diff(time))),
                  float(time[-1] - time[0]) / 650)  # the time is proportional to the cube of this
-    edges = np.arange(time[0], time[-1], length)
-    return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
+    noise = white_noise_deviation(motion.heading) if motion and motion.is_measured else 0.0
+    heading = integrate(time, rate)
+    while True:
+        edges = np.arange(time[0], time[-1], length)
+        turned = np.diff(np.interp(edges, time, heading))
+        # so that the noise leaves at most half of what a motion may leave
+        if len(turned) < 40 or 2.0 * noise ** 2 < 0.5 * MAX_UNEXPLAINED_SHARE * np.var(turned):
+            return RunPieces(edges, turned)
+        length *= 2.0
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
-    run = split_run(time, rate)
+    run = split_run(time, rate, motion)
     refuse_limited(run, motion, limits.max_time_offset + MAX_TRACKING_LAG, time,
                    rate if output is None else output)
     _refuse_run(time, run, motion, limits)
@@ -139,6 +139,10 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
                               reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
+    # whether s and b are those of the output itself, for which it is its own reference
+    values = np.array([fit.scale_factor_error, fit.bias])
+    is_own = (np.isfinite(fit.covariance).all() and chdtrc(
+        2.0, values @ np.linalg.solve(fit.covariance, values)) > MIN_FIT_PROBABILITY)
     # not observable: wander of the bias, errors of the reference, the slip that all turns have;
     # the rms of slips between zero and a largest one is twice their standard deviation
     scale = 1.0 + fit.scale_factor_error
@@ -163,8 +167,12 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
     _refuse_fit(fit, run, motion, limits, white_noise)
     # A reference that follows the noise of the gyro, that of the model, or less by the samples: by
-    # the likelihood ratio to the same fits with at least this noise.
-    own = min(noise.angle_random_walk, white_noise) ** 2
+    # the likelihood ratio to the same fits with at least this noise. Without a model that of the
+    # quietest samples may be vibration, which both follow, but then s and b are not 0.
+    quiet = [each for part in np.array_split(rate, 10) if (each := white_noise_deviation(part))]
+    known = noise.angle_random_walk or is_own * min(quiet, default=0.0) * math.sqrt(
+        float(np.median(np.diff(time))))
+    own = min(known, white_noise) ** 2
     if own and fit.dof:
         likelihood, variance, dof = fit.noise_profile.T
         share = np.minimum(variance / own, 1.0)
