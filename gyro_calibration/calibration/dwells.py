@@ -236,7 +236,7 @@ def dwells_from_table(log: Log) -> Dwells:
                           'or nan where it is not known') from None
     output, temperature = output[rows], None if log.temperature is None else log.temperature[rows]
     first, number = _find_distinct(rate, output, temperature)
-    parts, is_coarse = tuple(np.split(rows, len(rows))), len(first) < len(rows)
+    is_coarse = len(first) < len(rows)
     rounding: Array = np.empty((0, 2))
     if is_coarse or not (deviation > 0.0).any():  # that of the steps is the only one that is known
         # The step is the largest one that all differences are multiples of, those of a coarse
@@ -252,19 +252,16 @@ def dwells_from_table(log: Log) -> Dwells:
         if len(_coarse_rounding(rate[first], output[first], step, np.zeros(len(first)))[0]):
             rounding, of_steps = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
             deviation = np.hypot(np.maximum(np.nan_to_num(deviation), 0.0), of_steps)
-    if is_coarse:  # the sweeps hardly differ
-        sweep = 0 * sweep
-    if is_coarse and not len(rounding):
-        repeats = [str(row + 1) for row in np.delete(rows, first)]
-        remarks.append('sweeps have the same outputs, by the steps of the output, so that rows '
-                       f'which repeat another one count once: {format_list(repeats)}')
-        parts = tuple(rows[number == each] for each in range(len(first)))
-        rows, rate, output, deviation, sweep = (  # type: ignore[assignment]
-            each[first] for each in (rows, rate, output, deviation, sweep))
-        temperature = None if temperature is None else temperature[first]
-    return Dwells(rate, output, temperature,
-                  np.where(deviation > 0.0, deviation, np.nan), sweep,
-                  tuple(f'row {row + 1}' for row in rows), tuple(remarks), parts, rounding)
+    found = Dwells(rate, output, temperature, np.where(deviation > 0.0, deviation, np.nan),
+                   0 * sweep if is_coarse else sweep, tuple(f'row {row + 1}' for row in rows),
+                   tuple(remarks), tuple(np.split(rows, len(rows))), rounding)
+    if not is_coarse or len(rounding):
+        return found
+    repeats = format_list([str(row + 1) for row in np.delete(rows, first)])
+    remarks.append('most repeats of a rate have the same output, by its steps, so that rows which '
+                   f'repeat another one count once: {repeats}')
+    return replace(select_dwells(found, np.isin(np.arange(len(rows)), first)), rows=tuple(
+        rows[number == each] for each in range(len(first))), remarks=tuple(remarks))
 
 
 def _find_distinct(rate: Array, output: Array,
