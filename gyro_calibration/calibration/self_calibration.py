@@ -384,11 +384,15 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
         * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
     error_without = math.hypot(fit.bias * DRIVE_DURATION, s * math.tau)
     if error_with > max(limits.max_heading_error, error_without):
-        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
-                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
-                          'deg in five minutes; without the calibration it is '
-                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
-                          'for longer')
+        variance = float(fit.covariance[1, 1])
+        cause = (', by the steps of its output,' if fit.rounding_variance > 0.5 * variance else
+                 f', beside headings with a noise of {fit.reference_noise / DEGREE:.2g} deg,'
+                 if motion.is_measured else ',')
+        raise DataRefused(f'the bias is known to {math.sqrt(variance) / DEGREE:.3f} '
+                          f'deg/s only{cause} which lets a heading drift by '
+                          f'{error_with / DEGREE:.0f} deg in five minutes; without the '
+                          f'calibration it is {error_without / DEGREE:.0f} deg: turn more slowly, '
+                          'with rests, or for longer')
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
