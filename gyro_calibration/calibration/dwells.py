@@ -22,17 +22,19 @@ from itertools import compress
 import math
 from typing import Any, NamedTuple
 
+from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.run_faults import (
     fit_scale, MAX_UNEXPLAINED_SHARE, refuse_unit_error)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
-    find_runs, mark_rows, mask_outliers, mask_repeated_samples, noise_before_rounding,
-    quantization_step, rounding_product)
+    find_runs, largest_divisor, mark_extremes, mark_rows, mask_outliers, mask_repeated_samples,
+    noise_before_rounding, quantization_step, rounding_product)
 from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.special import digamma, polygamma
+from scipy.stats import f as fisher
 
 #: Minimum number of samples of a dwell, and minimum duration after all cuts, s.
 _MIN_SAMPLES, _MIN_DURATION = 8, 1.5
@@ -94,10 +96,68 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     unexplained, scale = fit_scale(found.output, found.rate)
     if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
         refuse_unit_error(scale, 'reference')
+    if (limited := _mark_limited(log, found)).any():
+        places = [place for place, at_limit in zip(found.location, limited) if at_limit]
+        remark = (f'{len(places)} dwells are at the limit of the output, '
+                  f'{np.abs(found.output[limited]).max() / DEGREE:.4g} deg/s, and left out: '
+                  f'{format_list(places)}')
+        output = np.array(log.output)
+        output[np.concatenate(list(compress(found.rows, limited)))] = math.nan
+        log = replace(log, output=output)
+        found = dwells_from_table(log) if log.time is None else find_dwells(log, 0.0)
+        found = replace(found, remarks=(remark, *found.remarks))
     if not name:
         return found
     return replace(found, location=tuple(f'{name}: {place}' for place in found.location),
                    remarks=tuple(f'{name}: {remark}' for remark in found.remarks))
+
+
+def _mark_limited(log: Log, dwells: Dwells) -> Mask:
+    """
+    Return which dwells are at the limit of the output of their log, shape (n,).
+
+    They have one output, in one sense or both; a line through the others is beyond it at each of
+    their rates, and leaves less than one more effect of the rate in place of the limit. Of an
+    output that shows its noise, dwells have the same value by chance seldom.
+    """
+    extreme, step = mark_extremes(require_output(log))
+    limited = np.array([extreme[rows].mean() > 0.5 for rows in dwells.rows])
+    times = np.array([len(rows) if log.time is None else 1 for rows in dwells.rows])
+    fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
+    # dwells of one rate and output have one rounding error, and count once
+    group = np.rint(dwells.rate / (0.005 * fastest))
+    used = np.zeros(len(dwells), dtype=bool)
+    used[np.unique(np.column_stack([group, np.rint(dwells.output / (1e-9 * fastest))]), axis=0,
+                   return_index=True)[1]] = True
+    line = np.column_stack([np.ones(len(dwells)), dwells.rate / fastest])
+    others, repeats, spare = used & ~limited, times[limited].sum() - 1, used.sum() - 3.0
+    if repeats < 1 or spare < 1 or not others.any() or np.ptp(line[others, 1]) < 0.01:
+        return np.zeros(len(dwells), dtype=bool)
+
+    def fit(columns: Array, rows: Mask) -> tuple[Array, float]:
+        """Return the values expected in all dwells by a fit to some, and its squares."""
+        expected = columns @ np.linalg.lstsq(columns[rows], dwells.output[rows], rcond=None)[0]
+        return expected, float(np.sum((dwells.output - expected)[rows] ** 2))
+
+    expected, squares = fit(line, others)
+    beyond = (expected * np.sign(dwells.output))[limited] > np.abs(dwells.output[limited])
+    # with the variance of the steps, which is known, for each dwell
+    known = used.sum() * (step ** 2 / 12.0 + (1e-12 * fastest) ** 2)
+    left, spare = squares + known, spare + used.sum() * known / (squares + known)
+    rate = line[:, 1]
+    instead = min(fit(np.column_stack([line, effect]), used)[1]
+                  for effect in (np.abs(rate), rate ** 2, rate ** 3))
+    chance = min(3.0 * float(fisher.sf((instead - left) * spare / left, 1, spare)), 1.0)
+    # the scatter of the others, between those of one rate, or by the samples of a fine output
+    group = np.unique(group[~limited], return_inverse=True)[1]
+    error, times = (dwells.output - expected)[~limited], times[~limited]
+    counts = np.bincount(group, times)
+    error = error - (np.bincount(group, times * error) / counts)[group]
+    scatter = max(math.sqrt(float(times @ error ** 2) / max(times.sum() - len(counts), 1)), 1e-300)
+    if not len(dwells.rounding):
+        scatter = max(scatter, float(np.median(np.nan_to_num(dwells.deviation[~limited]))))
+    chance *= min(step / (2.0 * math.sqrt(math.pi) * scatter), 1.0) ** repeats
+    return limited & bool(beyond.all() and chance < MIN_FIT_PROBABILITY)
 
 
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
@@ -174,32 +234,53 @@ def dwells_from_table(log: Log) -> Dwells:
     except ValueError as error:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
-    output = output[rows]
+    output, temperature = output[rows], None if log.temperature is None else log.temperature[rows]
+    first, number = _find_distinct(rate, output, temperature)
+    is_coarse = len(first) < len(rows)
     rounding: Array = np.empty((0, 2))
-    if not (deviation > 0.0).any():  # that of the steps is the only one that is known
-        # The step is the largest one that all differences are multiples of. Where the rates
-        # explain it, as those of a gyro without errors, it is at most 1 deg/s.
-        step = _largest_divisor(output - output[0])
-        if step > 0.5 * _largest_divisor(rate - rate[0]):
-            step = _largest_divisor(np.append(output - output[0], DEGREE))
-        rounding, deviation = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
-    return Dwells(rate, output, None if log.temperature is None else log.temperature[rows],
-                  np.where(deviation > 0.0, deviation, np.nan), sweep,
-                  tuple(f'row {row + 1}' for row in rows), tuple(remarks),
-                  tuple(np.split(rows, len(rows))), rounding)
+    if is_coarse or not (deviation > 0.0).any():  # that of the steps is the only one that is known
+        # The step is the largest one that all differences are multiples of, those of a coarse
+        # output but for its decimals. Where the rates explain it, as those of a gyro without
+        # errors, it is at most 1 deg/s.
+        changes, of_rates = output - output[0], 0.5 * largest_divisor(rate - rate[0])
+        step = largest_divisor(changes)
+        coarse = largest_divisor(changes, step) if is_coarse else 0.0
+        if 2.0 * math.sqrt(step * np.abs(changes).max()) < coarse < of_rates:
+            step = coarse  # by multiples that the decimals leave certain
+        if step > of_rates:
+            step = largest_divisor(np.append(changes, DEGREE))
+        if len(_coarse_rounding(rate[first], output[first], step, np.zeros(len(first)))[0]):
+            rounding, of_steps = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
+            deviation = np.hypot(np.maximum(np.nan_to_num(deviation), 0.0), of_steps)
+    found = Dwells(rate, output, temperature, np.where(deviation > 0.0, deviation, np.nan),
+                   0 * sweep if is_coarse else sweep, tuple(f'row {row + 1}' for row in rows),
+                   tuple(remarks), tuple(np.split(rows, len(rows))), rounding)
+    if not is_coarse or len(rounding):
+        return found
+    repeats = format_list([str(row + 1) for row in np.delete(rows, first)])
+    remarks.append('most repeats of a rate have the same output, by its steps, so that rows which '
+                   f'repeat another one count once: {repeats}')
+    return replace(select_dwells(found, np.isin(np.arange(len(rows)), first)), rows=tuple(
+        rows[number == each] for each in range(len(first))), remarks=tuple(remarks))
 
 
-def _largest_divisor(values: Array) -> float:
-    """Return the greatest common divisor of values, to 1e-9 of the largest; else 0."""
-    values = np.abs(values)
-    smallest = 1e-9 * float(values.max(initial=0.0))
-    while (values > smallest).any():
-        divisor = float(values[values > smallest].min())
-        rest = np.abs(values - divisor * np.rint(values / divisor))
-        if (rest <= smallest).all():
-            return divisor
-        values = np.append(rest, divisor)
-    return 0.0
+def _find_distinct(rate: Array, output: Array,
+                   temperature: Array | None) -> tuple[Numbers, Numbers]:
+    """
+    Return the first of equal dwells, and of which each dwell is one, shape (m,) and (n,).
+
+    Dwells of one rate, output and temperature are equal where most repeats of rates are: they have
+    one error by the steps of the output, of which several do not tell more.
+    """
+    warm = np.zeros(len(rate)) if temperature is None else np.nan_to_num(temperature)
+    warm = np.floor((warm - warm.min()) / MIN_TEMPERATURE_SPREAD)
+    places = len(np.unique(np.column_stack([rate, warm]), axis=0))
+    _, first, number = np.unique(np.column_stack([rate, warm, output]), axis=0, return_index=True,
+                                 return_inverse=True)
+    if 2 * (len(rate) - len(first)) <= len(rate) - places:
+        return np.arange(len(rate)), np.arange(len(rate))
+    order = np.argsort(first)
+    return first[order], np.argsort(order)[number.ravel()]
 
 
 def _number_sweeps(rate: Array) -> tuple[Numbers, str]:
@@ -559,12 +640,14 @@ def _average(samples: _Samples,
     # error the steps of the encoder. Under white noise its product with the duration is constant.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
+    # of samples of one value nothing is known, but for the rounding of their sum
+    variance[variance < durations * (1e-9 * np.abs(output).max()) ** 2] = 0.0
     # Up to a quarter of a squared step, the variance depends on the place in the step, so such
     # dwells have one noise. Where most are on one step each, the whole output shows the step.
     values = [samples.output[rows] for rows in dwells]
     step = (quantization_step(np.concatenate(values))
             if np.median([np.ptp(each) for each in values]) > 0.0
-            else _largest_divisor(np.unique(samples.output) - samples.output.min()))
+            else largest_divisor(np.unique(samples.output) - samples.output.min()))
     noise: Array = np.zeros(len(dwells))
     if step:
         squares = np.array([float(np.var(each)) for each in values]) / step ** 2

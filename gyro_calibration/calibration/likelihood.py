@@ -261,7 +261,8 @@ class _RunAlignment:
 
     def find_coarse_offset(self, largest: float) -> float:
         """Return the trial offset, s, at which gyro and motion agree best."""
-        return fit_profile(split_run(self._time, self._rate), self._motion, largest, 0.02)[2]
+        run = split_run(self._time, self._rate, self._motion)
+        return fit_profile(run, self._motion, largest, 0.02)[2]
 
 
 def _second_difference(heading: Callable[[Array], Array], at: Array, base: float) -> Array:
@@ -795,7 +796,7 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     variance += shared @ estimate.covariance[of_shared, of_shared] @ shared
     start = heading + (shared @ estimate.values[of_shared] - error - gyro_angle
                        + bias * elapsed) / scale
-    return float(start), math.sqrt(variance) / abs(scale)
+    return float(start), math.sqrt(max(variance, 0.0)) / abs(scale)
 
 
 #: Standard deviation of a turn beside the profile, by hand or a slip, rad/s.

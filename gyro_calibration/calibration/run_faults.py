@@ -23,6 +23,7 @@ import math
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import RATE_UNITS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.quality import mark_extremes, Saturated, white_noise_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from scipy.linalg import orth
@@ -108,12 +109,19 @@ class RunPieces:
         return fit_scale(self.gyro_angle, reference) if len(self.gyro_angle) else (1.0, 0.0)
 
 
-def split_run(time: Array, rate: Array) -> RunPieces:
-    """Return a run in pieces."""
+def split_run(time: Array, rate: Array, motion: Motion | None = None) -> RunPieces:
+    """Return a run in pieces, longer where the noise of a measured heading hides their turns."""
     length = max(_TRIAL_STEP, 2.0 * float(np.median(np.diff(time))),
                  float(time[-1] - time[0]) / 650)  # the time is proportional to the cube of this
-    edges = np.arange(time[0], time[-1], length)
-    return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
+    noise = white_noise_deviation(motion.heading) if motion and motion.is_measured else 0.0
+    heading = integrate(time, rate)
+    while True:
+        edges = np.arange(time[0], time[-1], length)
+        turned = np.diff(np.interp(edges, time, heading))
+        # so that the noise leaves at most half of what a motion may leave
+        if len(turned) < 40 or 2.0 * noise ** 2 < 0.5 * MAX_UNEXPLAINED_SHARE * np.var(turned):
+            return RunPieces(edges, turned)
+        length *= 2.0
 
 
 @dataclass(frozen=True)
@@ -186,6 +194,33 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
                           f'explains {100 * max(1 - unexplained, 0.0):.0f} % of the run): '
                           f'{remedy}')
     raise DataRefused(message)
+
+
+def refuse_limited(run: RunPieces, motion: Motion, largest_offset: float, time: Array,
+                   output: Array) -> None:
+    """
+    Refuse an output that stands at its largest value while the motion turns faster.
+
+    A line through the pieces below it is more than a step beyond it, and explains the run far
+    better. The steps may hide the noise of the gyro, by which others are recognized.
+    """
+    extreme, step = mark_extremes(output)
+    piece, duration = np.searchsorted(run.edges, time, side='right'), np.diff(run.edges)
+    samples, at_limit = (np.bincount(piece, weights, len(run.edges) + 1)[1:-1]
+                         for weights in (None, extreme))
+    below = at_limit < np.maximum(samples, 1)
+    columns = np.column_stack([
+        run.reference_angle(motion, fit_profile(run, motion, largest_offset)[2]), duration])
+    if below.all() or not below.any():
+        return
+    expected, of_all = (columns @ np.linalg.lstsq(columns[rows], run.gyro_angle[rows], rcond=None)[
+        0] for rows in (below, slice(None)))
+    left = run.gyro_angle - expected
+    beyond = -np.sign(run.gyro_angle) * left
+    left[~below] = np.minimum(beyond[~below], 0.0)
+    if (np.median((beyond / duration)[~below]) > step and np.sum((run.gyro_angle - of_all) ** 2)
+            > _SLIP_PENALTY * np.sum(left ** 2)):
+        raise Saturated(float(np.abs(output).max()), float(extreme.mean()))
 
 
 def fit_profile(run: RunPieces, motion: Motion,

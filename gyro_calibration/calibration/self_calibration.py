@@ -28,8 +28,8 @@ from gyro_calibration.calibration.likelihood import (
     ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_NOISE_SIGMAS,
     MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
-    RunPieces, split_run)
+    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_limited, refuse_other_motion,
+    refuse_unit_error, RunPieces, split_run)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
@@ -130,13 +130,19 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
-    run = split_run(time, rate)
+    run = split_run(time, rate, motion)
+    refuse_limited(run, motion, limits.max_time_offset + MAX_TRACKING_LAG, time,
+                   rate if output is None else output)
     _refuse_run(time, run, motion, limits)
     if method == 'likelihood':
         fit = _fit_likelihood(time, rate, motion, limits.max_time_offset,
                               reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
+    # whether s and b are those of the output itself, for which it is its own reference
+    values = np.array([fit.scale_factor_error, fit.bias])
+    is_own = (np.isfinite(fit.covariance).all() and chdtrc(
+        2.0, values @ np.linalg.solve(fit.covariance, values)) > MIN_FIT_PROBABILITY)
     # not observable: wander of the bias, errors of the reference, the slip that all turns have;
     # the rms of slips between zero and a largest one is twice their standard deviation
     scale = 1.0 + fit.scale_factor_error
@@ -161,8 +167,12 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
     _refuse_fit(fit, run, motion, limits, white_noise)
     # A reference that follows the noise of the gyro, that of the model, or less by the samples: by
-    # the likelihood ratio to the same fits with at least this noise.
-    own = min(noise.angle_random_walk, white_noise) ** 2
+    # the likelihood ratio to the same fits with at least this noise. Without a model that of the
+    # quietest samples may be vibration, which both follow, but then s and b are not 0.
+    quiet = [each for part in np.array_split(rate, 10) if (each := white_noise_deviation(part))]
+    known = noise.angle_random_walk or is_own * min(quiet, default=0.0) * math.sqrt(
+        float(np.median(np.diff(time))))
+    own = min(known, white_noise) ** 2
     if own and fit.dof:
         likelihood, variance, dof = fit.noise_profile.T
         share = np.minimum(variance / own, 1.0)
@@ -374,11 +384,15 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
         * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
     error_without = math.hypot(fit.bias * DRIVE_DURATION, s * math.tau)
     if error_with > max(limits.max_heading_error, error_without):
-        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
-                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
-                          'deg in five minutes; without the calibration it is '
-                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
-                          'for longer')
+        variance = float(fit.covariance[1, 1])
+        cause = (', by the steps of its output,' if fit.rounding_variance > 0.5 * variance else
+                 f', beside headings with a noise of {fit.reference_noise / DEGREE:.2g} deg,'
+                 if motion.is_measured else ',')
+        raise DataRefused(f'the bias is known to {math.sqrt(variance) / DEGREE:.3f} '
+                          f'deg/s only{cause} which lets a heading drift by '
+                          f'{error_with / DEGREE:.0f} deg in five minutes; without the '
+                          f'calibration it is {error_without / DEGREE:.0f} deg: turn more slowly, '
+                          'with rests, or for longer')
 
 
 def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:

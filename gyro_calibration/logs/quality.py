@@ -297,6 +297,37 @@ def refuse_dead(output: Array) -> None:
                           'move; check power and wires')
 
 
+def largest_divisor(values: Array, error: float = 0.0) -> float:
+    """Return the greatest common divisor of values with an error, to 1e-9 of the largest; or 0."""
+    values = np.abs(values)
+    smallest = 1e-9 * float(values.max(initial=0.0)) + error
+    while (values > smallest).any():
+        divisor = float(values[values > smallest].min())
+        rest = np.abs(values - divisor * np.rint(values / divisor))
+        off = rest > smallest + error * values / divisor
+        if not off.any():
+            return divisor
+        values = np.append(rest[off], divisor)
+    return 0.0
+
+
+def mark_extremes(output: Array) -> tuple[Mask, float]:
+    """Mark samples at the largest value of a range of both senses; return their step too."""
+    values = np.unique(output[np.isfinite(output)])
+    ends, step = values[[0, -1]], largest_divisor(values - values[0])
+    tolerance = 1e-9 * np.abs(ends).max()
+    ends = ends[np.abs(ends) >= np.abs(ends).max() - step - tolerance]
+    return (np.abs(output[:, None] - ends) <= tolerance).any(axis=1), step
+
+
+class Saturated(DataRefused):
+    """An output whose share of samples is at a limit, rad/s."""
+
+    def __init__(self, limit: float, share: float):
+        super().__init__(f'the gyro is saturated: {100 * share:.0f} % of the samples are at its '
+                         f'limit of {limit / DEGREE:.4g} deg/s; turn slower, or set a wider range')
+
+
 def refuse_saturated(output: Array) -> None:
     """Refuse an output that is clipped at its largest or smallest value."""
     # A range holds both senses: the lesser end of turns one way is a rest, and no limit.
@@ -316,6 +347,4 @@ def refuse_saturated(output: Array) -> None:
     for end in ends:
         neighbour = -2 if end else 1
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
-            raise DataRefused(f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of '
-                              f'the samples are at its limit of {values[end] / DEGREE:.4g} deg/s; '
-                              'turn slower, or set a wider range')
+            raise Saturated(float(values[end]), counts[end] / len(output))

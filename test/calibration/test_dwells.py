@@ -37,7 +37,8 @@ def generator():
 
 def table(rates, **more):
     rate = np.array(rates, dtype=float) * DEGREE
-    return Log(output=SCALE * rate + BIAS, reference_rate=rate, **more)
+    drift = 1e-9 * np.arange(len(rate))  # so that repeats of a rate differ
+    return Log(output=SCALE * rate + BIAS + drift, reference_rate=rate, **more)
 
 
 def run(generator, noise=0.01, rate=RATE, **more):
@@ -259,6 +260,18 @@ def test_a_log_that_swings_or_is_noise_is_refused_with_the_other_way(rate, gener
                       {'reference_heading': encoder(2.0, generator, heading)}):
         with pytest.raises(DataRefused, match='straight line to 0.5 deg.*--method likelihood'):
             find_dwells(run(generator, rate=swing, **reference))
+
+
+def test_stretches_at_the_limit_of_a_coarse_output_are_left_out():
+    for seed in range(20):
+        draw = np.random.default_rng(seed)
+        limit, step = draw.uniform(70.0, 88.0) * DEGREE, draw.uniform(0.1, 1.0) * DEGREE
+        for clipped in (False, True):
+            log = run(draw, 0.01 * draw.uniform(0.1, 1.0))
+            output = np.clip(log.output, -limit, limit) if clipped else log.output
+            found = extract_dwells(replace(log, output=step * np.round(output / step)))
+            fastest = np.abs(found.rate).max()
+            assert (fastest < limit) == clipped == ('at the limit' in ' '.join(found.remarks))
 
 
 # Recordings

@@ -13,10 +13,10 @@
 from dataclasses import replace
 
 from gyro_calibration.calibration.dwells import (
-    Dwells, dwells_from_table, join_dwells, select_dwells)
+    Dwells, dwells_from_table, extract_dwells, join_dwells, select_dwells)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, MIN_DISTINGUISHING_SIGMAS, select_effects, TECHNOLOGY_EFFECTS)
-from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.logs.log import DEGREE, Log, read_log
 from gyro_calibration.model.effects import (
     BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, SINE_RESPONSE)
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -205,3 +205,44 @@ def test_on_the_recorded_table_the_cooler_half_predicts_the_hotter_one(data):
     slow = select_dwells(first, np.abs(first.rate) < 60.0 * DEGREE)
     error, z = judge(select_effects(slow).calibration.model, second)
     assert error < 0.08 and z < 1.6
+
+
+# Tables of outputs in steps or at their limit
+
+def stepped_table(generator, step, limit=np.inf, cubic=0.0, deviation=None):
+    """Return two sweeps of nine rates with noise of 0.02 steps, and s and b of the gyro."""
+    s, b = generator.normal(0.0, 0.01), generator.normal(0.0, 0.2)
+    rate = np.tile(generator.uniform(50.0, 200.0) * np.linspace(-1.0, 1.0, 9), 2)
+    output = (1.0 + s) * rate + b - cubic * rate ** 3
+    output = np.clip(output + 0.02 * step * generator.standard_normal(18), -limit * rate.max(),
+                     limit * rate.max())
+    columns = {} if deviation is None else {'deviation_dps': np.full(18, deviation).astype(str)}
+    return Log(output=step * np.round(output / step) * DEGREE, reference_rate=rate * DEGREE,
+               others=columns), s, b * DEGREE
+
+
+def is_right(selection, s, b):
+    """Tell whether s and b are within 4 deviations, and no other effect was taken."""
+    (_, _, bias, of_bias), (_, _, scale, of_scale) = selection.model.estimates()
+    return abs(bias - b) < 4.0 * of_bias and abs(scale - s) < 4.0 * of_scale
+
+
+@pytest.mark.parametrize('step', [0.001, 0.1, 0.5])
+def test_dwells_at_the_limit_of_an_output_are_left_out_not_taken_for_a_sine(step):
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        table, s, b = stepped_table(generator, step, generator.uniform(0.6, 0.95))
+        dwells = extract_dwells(table)
+        assert 'at the limit of the output' in dwells.remarks[0]
+        assert is_right(select_effects(dwells), s, b)
+        coarse = extract_dwells(stepped_table(generator, step, cubic=1e-6)[0])
+        assert 'at the limit' not in ' '.join(coarse.remarks)
+
+
+@pytest.mark.parametrize('deviation', [None, 0.0001, 0.01])
+@pytest.mark.parametrize('step', [0.061, 0.25])
+def test_identical_sweeps_of_a_coarse_output_show_no_other_effect(step, deviation):
+    """Their rounding errors are the same: a second sweep tells no more of them."""
+    for seed in range(20):
+        table, s, b = stepped_table(np.random.default_rng(seed), step, deviation=deviation)
+        assert is_right(select_effects(extract_dwells(table)), s, b)

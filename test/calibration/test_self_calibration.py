@@ -16,7 +16,6 @@ The methods reproduce the paper's numbers, and the fit finds the truth with its 
 
 import contextlib
 from dataclasses import replace
-import math
 
 from chance import fewest, mean_bound, most, rms_bounds
 from coarse_output import run as run_coarse
@@ -52,7 +51,7 @@ MOVE_TIME = np.arange(77) / 20.0
 MOVE_RATE = (1 + S) * MOVE.rate_at(MOVE_TIME) + B
 
 
-@pytest.mark.parametrize('noise', [0.02, 0.05, 0.1])
+@pytest.mark.parametrize('noise', [0.02, 0.1, 0.5, 2.0])
 def test_headings_with_noise_are_not_computed_from_the_gyro_and_its_own_are(noise):
     """Of 100 Hz: headings of white noise, in degrees, leave that of the gyro undetermined."""
     gyro = Noise(0.35 * DEGREE / 60)
@@ -60,12 +59,36 @@ def test_headings_with_noise_are_not_computed_from_the_gyro_and_its_own_are(nois
         generator = np.random.default_rng(seed)
         rate = (1 + S) * RATE + B + simulate_noise(gyro, len(TIME), 0.01, generator)
         true = CALIBRATION_MOTION.heading_at(TIME)
-        measured = true + noise * DEGREE * generator.standard_normal(len(TIME))
-        fit = self_calibrate(TIME, rate, motion_from_headings(TIME, measured), noise=gyro)
-        assert abs(fit.scale_factor_error - S) < 4.0 * math.sqrt(fit.covariance[0, 0])
-        with pytest.raises(DataRefused, match='computed from this gyro'):
-            self_calibrate(TIME, rate, motion_from_headings(
-                TIME, integrate(TIME, rate)), noise=gyro)
+        white = DEGREE * generator.standard_normal(len(TIME))
+        for known in (gyro, Noise()):
+            fit = self_calibrate(TIME, rate, motion_from_headings(TIME, true + noise * white),
+                                 noise=known)
+            errors = np.abs([fit.scale_factor_error - S, fit.bias - B])
+            assert (errors < 4.0 * np.sqrt(np.diag(fit.covariance))).all()
+            for size in (0.0, 0.003):
+                with pytest.raises(DataRefused, match='computed from this gyro'):
+                    self_calibrate(TIME, rate, motion_from_headings(
+                        TIME, integrate(TIME, rate) + size * white), noise=known)
+
+
+@pytest.mark.parametrize('step', [0.05, 0.2, 1.0])
+def test_a_coarse_output_at_its_limit_is_named_and_an_honest_one_is_not(step):
+    """The steps hide the noise, so that the reference alone shows that the gyro turned faster."""
+    for seed in range(20):
+        draw = np.random.default_rng(seed)
+        rate = ((1.0 + draw.normal(0.0, 0.01)) * RATE + draw.normal(0.0, 0.1) * DEGREE
+                + 0.1 * step * DEGREE * draw.standard_normal(len(TIME)))
+        limit = draw.uniform(0.6, 0.9) * np.abs(rate).max()
+        coarse, clipped = (step * DEGREE * np.round(each / (step * DEGREE))
+                           for each in (rate, np.clip(rate, -limit, limit)))
+        with pytest.raises(DataRefused, match='the gyro is saturated'):
+            self_calibrate(TIME, clipped, CALIBRATION_MOTION)
+        try:
+            self_calibrate(TIME, coarse, CALIBRATION_MOTION)
+        except DataRefused as refused:
+            text = str(refused)
+            assert 'saturated' not in text
+            assert 'the bias is known' not in text or 'by the steps of its output' in text
 
 
 def test_on_their_move_only_the_sum_of_samples_errs():
