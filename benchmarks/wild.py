@@ -13,6 +13,7 @@ Calibrate a gyro on half of a drive against its course over ground, and correct 
 
     python benchmarks/wild.py [FOLDER]           recordings, as `wheeled_drives`, by `diagnose`
     python benchmarks/wild.py drives FOLDER      the same by `fit`
+    python benchmarks/wild.py together FOLDER    two drives of a unit, alone and together
     python benchmarks/wild.py simulated [DRIVES] drives of a simulator of its own, by `fit`
 
 A model is judged by the heading that it gives in the half that it was not fitted on: the output is
@@ -20,7 +21,8 @@ corrected and integrated, and compared with the course within windows of 60 s, e
 at the lag where it fits best. Three models compete: nothing (no correction), a robust least
 squares (course = (1 + s) integral + b t + c at the best lag, residuals by their size), and
 `calibrate_encoder` or `diagnose` as the verbs call them. A refusal counts as nothing. Of diagnoses
-it prints how many causes are found in the other half too, and how many values agree.
+it prints how many causes are found in the other half too, and how many values agree. With
+`together` the model of two drives of a unit corrects two other drives of it.
 
 The simulated car follows a bicycle model with side slip, its course comes at 10 Hz, smoothed over
 some tenths of a second, late or early, with noise that is correlated over a second, gaps below a
@@ -100,9 +102,9 @@ def fitted(log: Log) -> Answer:
             f'{found.time_offset:+.2f} s', [])
 
 
-def diagnosed(log: Log) -> Answer:
+def diagnosed(*logs: Log) -> Answer:
     """Calibrate as `diagnose` does, without a model."""
-    found = diagnose([log], np.random.default_rng(0))
+    found = diagnose(logs, np.random.default_rng(0))
     causes = [each for each in found.findings if each.status == 'established']
     return (lambda other: compensate_log(found.model, other),
             f'{found.verdict}: {", ".join(each.effect for each in causes)}', causes)
@@ -154,6 +156,25 @@ def summary(halves: list[tuple[tuple[float, float, float], list[Finding]]]) -> I
     if causes:
         yield (f'{sum(each is not None for each in twins)} of {len(causes)} causes in the other '
                f'half too; {sum(same)} of {len(same)} values agree')
+
+
+def together(folder: Path) -> Iterator[str]:
+    """Give the errors in two drives of a unit by its model of two others, alone and together."""
+    drives, errors = ('hi', 'jk'), []
+    for unit in range(1, 6):
+        log_of = {drive: read_log(folder / f'rc_car_{drive}_unit{unit}.csv.gz')
+                  for drive in 'hijk'}
+        for mine, others in (drives, drives[::-1]):
+            answers = [diagnosed(log_of[mine[0]]), diagnosed(log_of[mine[1]]),
+                       diagnosed(*map(log_of.get, mine))]
+            row = [math.hypot(*(error(log_of[each], correct(log_of[each])) for each in others))
+                   / math.sqrt(2.0) / DEGREE for correct, _, _ in answers]
+            errors.append(row)
+            yield (f'unit {unit}, {mine} for {others}: first {row[0]:.3f}, second {row[1]:.3f}, '
+                   f'together {row[2]:.3f} deg; {answers[2][1]}')
+    first, second, both = np.sqrt(np.mean(np.square(errors), axis=0))
+    yield (f'rms: first {first:.3f}, second {second:.3f}, together {both:.3f} deg; together '
+           f'over the mean of the two: {both / math.sqrt(0.5 * (first ** 2 + second ** 2)):.2f}')
 
 
 # a simulator of its own
@@ -224,6 +245,10 @@ def held(drives: int) -> Iterator[str]:
 
 
 def main(arguments: list[str]) -> None:
+    if arguments[:1] == ['together']:
+        for line in together(Path(arguments[1])):
+            print(line, flush=True)
+        return
     by_fit = arguments[:1] in (['drives'], ['simulated'])
     if arguments[:1] == ['simulated']:
         drives = int(arguments[1]) if len(arguments) > 1 else 40

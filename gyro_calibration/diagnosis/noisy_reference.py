@@ -109,6 +109,8 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
     plain = each_alone[0] if len(logs) == 1 else _fit_joined(
         cleaned, reference.kind, prior, instants, each_alone)
     extended, found = select_causes(plain, SEARCH_ALARM_RATE, on_progress)
+    if len(logs) > 1:
+        extended, found = _withdraw_differing_causes(extended, found, each_alone)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
     lasting_terms = [each for each in extended.causes if not each.is_single_event]
@@ -170,6 +172,33 @@ def _fit_joined(logs: Sequence[Log], kind: str, prior: Array | None,
     has_one_clock = kind in _SAME_CLOCK
     spans = lay_out_spans(join_logs(logs, instants, () if has_one_clock else delays), kind, prior)
     return fit_spans(replace(spans, delay=float(np.mean(delays))) if has_one_clock else spans)
+
+
+def _withdraw_differing_causes(fit: SpanFit, found: list[SelectedCause],
+                               each_alone: Sequence[SpanFit]
+                               ) -> tuple[SpanFit, list[SelectedCause]]:
+    """Return the fit without causes whose values differ between logs beyond chance."""
+    established = [_term_of(each.cause) for each in found if each.is_established]
+    lasting = [each for each in established if not each.is_single_event]
+    if not lasting:
+        return fit, found
+    fits = [fit_spans(alone.spans, lasting) for alone in each_alone
+            if len(alone.spans.time) > design_matrix(alone.spans, lasting).shape[1] + 1]
+    differing = set[CauseTerm]()
+    for term in lasting:
+        values = np.array([each.values[each.value_slice(term)] for each in fits])
+        weights = 1.0 / np.array([np.diag(each.normal_covariance)[each.value_slice(term)]
+                                  for each in fits])
+        mean = (weights * values).sum(axis=0) / weights.sum(axis=0)
+        square = float(np.sum(weights * (values - mean) ** 2))
+        if chi2.sf(square, max((len(fits) - 1) * values.shape[1], 1)) < FALSE_ALARM_RATE:
+            differing.add(term)
+    if not differing:
+        return fit, found
+    left = [each for each in established if each not in differing]
+    return fit_spans(fit.spans, left), [
+        replace(each, is_established=each.is_established and _term_of(each.cause) in left)
+        for each in found]
 
 
 def _own_biases(fit: SpanFit) -> Array:
