@@ -26,6 +26,7 @@ from types import SimpleNamespace
 from typing import Protocol
 
 from gyro_calibration.calibration.self_calibration import RunLimits
+import numpy as np
 
 _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
                                 str: 'text', list: 'a list of strings'}
@@ -199,6 +200,59 @@ class StampDelay:
                 self._earlier and now - self._earlier[-1][0] < self._tolerances[-1][0]):
             self._earlier.append((now, least))
         return ''
+
+
+#: Number of the last stamps that show their order: a burst of them may come in any order.
+_ORDERED_STAMPS = 24
+
+
+class ArrivalOrder:
+    """
+    Order of the stamps of one publisher, of which others may have overtaken some: late ones.
+
+    A late stamp fits in where the stamps around it leave half of their median spacing. Of two in a
+    row that do not, though they increase, the clock was set back. Late stamps at equal intervals,
+    up to a factor of two, have a clock of their own: that of a second gyro where others come in
+    between, else one that was set back.
+    """
+
+    def __init__(self) -> None:
+        self.has_two_clocks, self._in_time_count = False, 0
+        self._misfit = self._spacing = 0  # ns
+        self.missing_duration = 0  # by a clock that was set back by up to two spacings, ns
+        # the last ones that fit in, ns; the spacing is that before a burst
+        self._stamps = deque[int](maxlen=2 * _ORDERED_STAMPS)
+        # stamps of late ones, ns, and the number of those in time so far
+        self._late = deque[tuple[int, int]](maxlen=_ORDERED_STAMPS)
+
+    def is_late(self, stamp: int) -> bool:
+        """Add a stamp, ns, and tell whether it is late; not if its clock was set back."""
+        misfit, self._misfit, self.missing_duration = self._misfit, 0, 0
+        last = max(self._stamps, default=stamp)
+        if stamp >= last:
+            if misfit and stamp - last < 0.5 * self._spacing:
+                self.missing_duration = last + 2 * self._spacing - stamp
+            self._stamps.append(stamp)
+            self._in_time_count += 1
+            return False
+        self._late.append((stamp, self._in_time_count))
+        late, counts = np.array(self._late).T
+        apart = np.diff(late)
+        self._spacing = int(np.median(np.diff(np.sort(self._stamps)))) if len(
+            self._stamps) >= _ORDERED_STAMPS else 0
+        is_steady = len(late) == _ORDERED_STAMPS and 0 < apart.max() < 2 * apart.min()
+        self.has_two_clocks = is_steady and counts[0] < counts[-1]
+        fits = not self._spacing or min(self._stamps) < stamp and min(
+            abs(each - stamp) for each in self._stamps) > 0.5 * self._spacing
+        is_set_back = is_steady and not self.has_two_clocks or not fits and 0 < misfit < stamp
+        if is_set_back:
+            self._stamps.clear()
+            self._late.clear()
+        if fits or is_set_back:
+            self._stamps.append(stamp)
+        else:
+            self._misfit = stamp
+        return not is_set_back
 
 
 class RosTime:

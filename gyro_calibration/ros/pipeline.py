@@ -17,9 +17,9 @@ the steady clock.
 
 Two publishers are detected by their stamps: a sample of a second one divides an interval so that
 one part is at most half of it. Two such intervals while the graph lists several publishers are the
-proof. The graph alone is not, since it lists a killed driver for up to 20 s. A stamp that jumps
-back is one of several gyros, of a clock that was set, or of a late sample, for which the stamps
-before it have left a gap of one and a half intervals or more.
+proof. The graph alone is not, since it lists a killed driver for up to 20 s. Of one publisher a
+stamp that jumps back is that of a late sample, of a second gyro, or of a clock that was set; see
+`ArrivalOrder`.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
-    AlternateTurns, Clock, COMMAND, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE,
-    NodeParameter, ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
+    AlternateTurns, ArrivalOrder, Clock, COMMAND, FAULT_DURATION, MAX_ANGULAR_ACCELERATION,
+    MAX_VELOCITY_AGE, NodeParameter, ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity,
+    Wheels)
 from gyro_calibration.ros.state_store import StateStore
 
 PARAMETERS = (
@@ -96,8 +97,7 @@ PARAMETERS = (
 _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
-_INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several publishers
-_MAX_LATE_SAMPLES = 8  # samples after which one that was overtaken by them is not expected
+_INTERLEAVING_WINDOW = 1.0  # s; two changes of the frame in it show several publishers
 
 
 class CorrectedSample(NamedTuple):
@@ -164,7 +164,7 @@ class Pipeline:
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last_time, self._last_stamp = -math.inf, 0
         self._jump_times = deque[float](maxlen=2)
-        self._stamps = deque[int](maxlen=_MAX_LATE_SAMPLES)  # the last ones, in order of arrival
+        self._order = ArrivalOrder()
         self._intervals = Intervals()  # between all of them, so that they can end a conflict
         self._first_frame: str | None = None
         self._frame: str | None = None
@@ -364,10 +364,15 @@ class Pipeline:
                              'time; the sample is not used')
             return None
         silence = now - self._last_arrival
-        if self._is_late(stamp, frame):
+        is_late = self._order.is_late(stamp)
+        if is_late and frame == self._frame and not self.publisher_conflict:
+            if self._order.has_two_clocks:
+                self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
             journal.event = ('a sample came after the next one and is not used: the connection to '
                              'the driver changes their order')
             return None
+        if missing := self._order.missing_duration:
+            self.estimator.tracker.add_unknown_turn(1e-9 * missing * abs(self.estimator.rate))
         self._detect_several_gyros(stamp, frame, now, silence)
         if 0.0 < (interval := 1e-9 * (stamp - self._last_stamp)) <= self.values.maximum_gap:
             self._intervals.add(interval)
@@ -424,23 +429,8 @@ class Pipeline:
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
 
-    def _is_late(self, stamp: int, frame: str) -> bool:
-        """Tell whether a sample was overtaken by the last ones, whose stamps left a gap for it."""
-        stamps, usual = self._stamps, self._intervals.usual_interval
-        behind = 1e-9 * (max(stamps, default=stamp) - stamp)
-        # Before the usual interval is known, what is behind waits; a jump back of the clock shows
-        # when all of the last stamps are beyond it. Two gyros of the same rate leave no gap of one
-        # and a half intervals.
-        is_late = behind > 0.0 and frame == self._frame and not self.publisher_conflict and (
-            usual == math.inf or behind < _MAX_LATE_SAMPLES * usual and min(stamps) < stamp
-            and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
-        stamps.append(stamp)
-        return is_late
-
     def _detect_several_gyros(self, stamp: int, frame: str, now: float, silence: float) -> None:
-        """Detect stamps that jump back, frames that alternate, and samples that interleave."""
-        if stamp < self._last_stamp:
-            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
+        """Detect frames that alternate, and samples of two publishers that interleave."""
         if frame != self._frame:
             before, self._frame = self._frame, frame
             if before is None:
