@@ -440,6 +440,14 @@ def test_odometry_is_a_reference(tmp_path, has_yaw):
     assert kept.standard_deviations[0] > 0.0099 * (1 + SCALE), 'no run is better than its odometry'
 
 
+@pytest.mark.parametrize('scale', [-0.31, -0.28, 0.28, 0.31])
+def test_a_scale_factor_error_by_odometry_has_one_limit_for_both_signs(tmp_path, scale):
+    rig = rested(tmp_path, robot=Robot(scale_factor_error=scale), calibration_reference=ODOMETRY)
+    turn_to_and_fro(rig, 13.5)
+    success, message = rig.session.conclude()
+    assert success == (abs(scale) < 0.3) != ('% is beyond 30 %' in message), message
+
+
 @pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
                                            (lambda given: given[:20],
                                             '20 messages came on odom, but in 0 s of 20 s only'),
