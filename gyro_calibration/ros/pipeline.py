@@ -183,8 +183,10 @@ class Pipeline:
         self.stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
         self._odometry_lateness = -math.inf, 0.0  # when it came, and its lateness, s
-        # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
-        self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
+        # Odometry heading when its rate became zero, rad, and times of the last odometry and of a
+        # contradiction, s.
+        self._heading_at_rest = self._odometry_time = math.nan
+        self._contradiction_time, self._is_motion_shown = -math.inf, False
         self._turns, self._alternate_turns = TurnComparison(), AlternateTurns()
         # Time until which gyro and odometry agreed at standstill, s, whether it stands, and the
         # possible error of the heading and the turn by the gyro since then, rad.
@@ -249,12 +251,18 @@ class Pipeline:
     def add_odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Add a heading, rad, and a velocity by the odometry."""
         now, rate, time = self._clock.steady(), velocity.angular[2], self._message_time(stamp)
+        # what a robot may turn between two messages of standstill, unless none shows motion
+        interval, self._odometry_time = time - self._odometry_time, time
+        self._is_motion_shown = self._is_motion_shown or velocity.is_moving
+        hidden = (0.25 * MAX_ANGULAR_ACCELERATION * interval ** 2
+                  if self._is_motion_shown or interval > MAX_VELOCITY_AGE else 0.0)
+        turned = abs(math.remainder(heading - self._heading_at_rest, math.tau))
         if velocity.is_moving:
             self._heading_at_rest = math.nan
-        elif abs(math.remainder(heading - self._heading_at_rest, math.tau)) > MIN_TURN_ANGLE:
+        elif turned > max(hidden, MIN_TURN_ANGLE):
             self._contradiction_time, self._heading_at_rest = now, heading
             self.estimator.tracker.add_unknown_turn(MIN_TURN_ANGLE)
-        elif math.isnan(self._heading_at_rest):
+        elif not turned + hidden <= MIN_TURN_ANGLE:
             self._heading_at_rest = heading
         # how late it is for the last sample, or ahead of one that would come now
         late = self._last_time - time if self._last_time > -math.inf else 0.0

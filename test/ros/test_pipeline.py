@@ -318,6 +318,19 @@ def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill
     assert abs(error) < 4.0 * deviation, (error, deviation)
 
 
+@pytest.mark.parametrize('interval, has_rate, warns', [
+    (2.0, True, False), (1.0, True, False), (0.5, True, False), (0.05, True, False),
+    (1.0, False, True), (0.05, False, True)])
+def test_slow_odometry_may_miss_a_turn_between_two_messages(tmp_path, interval, has_rate, warns):
+    rig, count = rested(tmp_path, wheels='odom'), itertools.count(1)
+    rig.odometry = lambda stamp, reading: next(count) % round(interval / INTERVAL) or (
+        rig.pipeline.add_odometry(stamp, reading.heading, Velocity(
+            angular=(0.0, 0.0, reading.rate * (has_rate and abs(reading.rate) > 1e-3)))))
+    for rate, seconds in ((0.7, 4.0), (0.0, 5.0), *10 * ((0.9, 0.2), (0.0, 3.1))):
+        rig.turn(rate, seconds)
+    assert bool(rig.pipeline.faults['odometry']) == warns
+
+
 @pytest.mark.parametrize('moved, wheels', [(1.5, 'none'), (3.0, 'odom'), (0.0, 'odom')])
 def test_a_turn_by_the_gyro_alone_while_odometry_stands_is_a_warning_and_in_the_variance(
         tmp_path, reported, moved, wheels):
