@@ -50,6 +50,7 @@ import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
+MIN_ODOMETRY_DURATION = 5.0  # s; of a run by odometry, whose first and last second are not fitted
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
 SAMPLE_TIMEOUT = 5.0
@@ -416,6 +417,9 @@ class CalibrationSession:
         if not run.times:
             return False, ('no sample has come since the calibration began: check the gyro and '
                            'its driver')
+        if run.kind == ODOMETRY and run.elapsed < MIN_ODOMETRY_DURATION:
+            return False, (f'the run lasts {run.elapsed:.1f} s so far, and one by odometry '
+                           f'{MIN_ODOMETRY_DURATION:g} s at least: turn both ways, and call again')
         return True, run.finish()
 
     def cancel(self) -> tuple[bool, str]:
@@ -526,6 +530,8 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     # before and after a profile the robot rests, but odometry may begin or end in a turn
     around = limits.max_time_offset * (-1.0 if by_odometry else 1.0)
     inside = (time >= -around) & (time <= motion.duration + around)
+    if not inside.any():
+        raise DataRefused('no sample has a stamp between those of odom')
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
                          reference=run.reference_errors if by_odometry else None,
                          output=output[inside], prior=prior)

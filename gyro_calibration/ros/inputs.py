@@ -316,7 +316,8 @@ class TurnComparison:
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
     wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Odometry that turns
+    further by that mean, and faster than as many rad/s, is in deg/s.
 
     The sensitivity of the gyro is wrong where it turns further than odometry from one standstill
     to the next, twice in a row and by more than the largest scale factor error that a calibration
@@ -326,6 +327,7 @@ class TurnComparison:
     def __init__(self) -> None:
         self.ratio, self.source = math.nan, ''  # of the last turns
         self.is_contradictory = self.is_larger = self._was_larger = False
+        self.is_smaller = self._was_smaller = False
         self.total_ratio = math.nan  # of the last turn from one standstill to the next
         self._stood_at, self._since_standstill = math.nan, 0.0  # by the gyro and wheels, rad
         self._last = math.nan, math.nan
@@ -375,9 +377,14 @@ class TurnComparison:
         if abs(self._by_wheels) > 1.0:  # rad
             self.ratio = self._by_gyro / self._by_wheels
             confused, rate = 180.0 / math.pi, self._path / self._duration
-            is_wrong = (self.ratio > math.sqrt(confused)
+            between = math.sqrt(confused)
+            is_wrong = (self.ratio > between
                         and (source == ODOMETRY or self.ratio * rate > confused)
                         or source == ODOMETRY and self.ratio < -0.5)
+            if source != ODOMETRY or abs(self.ratio) > 1.0 / between:
+                self.is_smaller = self._was_smaller = False
+            elif abs(self._by_wheels) > between * self._duration:
+                self.is_smaller, self._was_smaller = self._was_smaller, True
             self._contradictions = is_wrong * (self._contradictions + 1)
             self.is_contradictory = self._contradictions > 1
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0

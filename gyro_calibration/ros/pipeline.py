@@ -43,7 +43,8 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, describe_odometry_clock, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
+    CalibrationSession, describe_odometry_clock, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION,
+    MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
@@ -84,7 +85,7 @@ PARAMETERS = (
     NodeParameter('calibration.drive', False, 'Drive the motion profile on cmd_vel.',
                   dynamic=True),
     NodeParameter('calibration.duration', 20.0, 'Length of a calibration by odometry.', 's',
-                  (5.0, 600.0), True),
+                  (MIN_ODOMETRY_DURATION, FINISH_TIMEOUT), True),
     NodeParameter('calibration.turns', 0,
                   'Whole turns of a calibration by turns, counter-clockwise positive; 0 takes the '
                   'number that the gyro shows.', '', (-100, 100), True),
@@ -324,9 +325,12 @@ class Pipeline:
                             'every other sample on imu/data_raw shows another turn, as with two '
                             'gyros on one topic: give each gyro a topic of its own'),
             'turn': (turns.is_contradictory,
-                     f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check '
+                     f'the gyro turns by {turns.ratio:.2g} times what {turns.source} shows: check '
                      'the unit and the sense of rotation of the gyro, and those of '
                      f'{turns.source}'),
+            'unit': (turns.is_smaller,
+                     f'the gyro turns by {turns.ratio:.2g} times what odom shows: check the unit '
+                     'of odom, as no robot turns so fast'),
             'scale': (turns.is_larger,
                       f'the gyro turns by {turns.total_ratio:.2f} times what odom shows: check '
                       'the sensitivity of the gyro, and diameter and distance of the wheels'),

@@ -369,9 +369,9 @@ def test_without_odometry_turns_are_compared_with_commands(tmp_path, reported, u
     (1.0 / DEGREE, 1.0, 'check the unit', True), (-1.0, 1.0, 'check the unit', True),
     (1.0, -1.0, 'check the unit', True), (1.0, 1.0, '', False), (1.0, 3.0, '', False),
     (2.0, 1.0, 'check the sensitivity', False), (7.0, 1.0, 'check the sensitivity', False),
-    (1e-3, 1.0, '', False)],
+    (1e-3, 1.0, '', False), (1.0, 1.0 / DEGREE, 'check the unit of odom', False)],
     ids=['deg/s', 'sense', 'sense of odom', 'right', 'odom three times', 'gyro twice',
-         'gyro seven times', 'wheels that slip'])
+         'gyro seven times', 'wheels that slip', 'odom in deg/s'])
 def test_turns_that_contradict_odometry_are_a_warning_and_the_heading_may_claim_nothing(
         tmp_path, reported, gyro, wheels, words, is_unknown):
     rig = rested(tmp_path)
