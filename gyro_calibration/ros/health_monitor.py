@@ -65,20 +65,23 @@ class RepeatedOutputDetector:
     """
     Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
-    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
-    larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
-    a repeated zero counts only after a deceleration that no robot has, 20 rad/s², or if a whole
-    stretch at rest had the noise of the model before the first such zero. Two neighbouring codes,
-    as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above. What
-    counts does so until the value changes.
+    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the
+    noise is larger than the steps of the output, or if chance is excluded. Some gyros report
+    zero at rest: a repeated zero counts only after a deceleration that no robot has, 20
+    rad/s², unless wheels stand then, or if a whole stretch at rest had the noise of the model
+    before the first such zero. Two neighbouring codes, as of a dead gyro whose last bit
+    toggles, count if chance is excluded; zero as above. What counts does so until the value
+    changes.
 
     A gyro with noise `is_suspected` while it repeats the value of its first sample, whose step is
     not known, or zero against chance for the first time: it is dead, or shows that at rest. Later
-    such zeros mean that it `is_zeroed`: it has neither noise nor bias now.
+    such zeros mean that it `is_zeroed`: it has neither noise nor bias now. Where what is suspected
+    ends with an acceleration that no robot has, it was dead, unless wheels stood until then.
 
     A value that was held for less time, but longer than usual and not by chance, leaves a possible
     error of the integrated rate, `unseen_turn`, rad, with the sample that ends it; a full turn
-    where the first value shows later, by step and noise, to have been that of a dead gyro.
+    where the first value shows later, by step and noise, to have been that of a dead gyro. Each
+    value is rounded to the steps of the output, by an error that lasts until the next one.
     """
 
     def __init__(self, noise: Noise):
@@ -89,12 +92,19 @@ class RepeatedOutputDetector:
         self._is_fault = self.is_suspected = self.is_zeroed = self._has_left_zero = False
         self._first = 0.0, 0  # value, rad/s, and number of samples before the first change
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
+        # of the values before, rad², and standard deviation by this value so far, rad
+        self._rounding_variance = self._rounded_turn = 0.0
         # Smallest and largest value since a time, s, and the number of samples after the first.
         self._band = math.nan, math.nan, 0.0, 0
 
     def add(self, time: float, output: float, odometry_rate: float,
-            has_noise_at_rest: bool = False) -> bool:
-        """Add a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
+            has_noise_at_rest: bool = False, stands: bool = False, rests: bool = False) -> bool:
+        """
+        Add a sample, s and rad/s, and tell if it is repeated.
+
+        The rate by odometry, rad/s, is 0 without any; `stands` is whether wheels show standstill,
+        `rests` whether they or the statistics of the rate do.
+        """
         step = abs(output - self._value)
         if step:
             self._step = min(step, self._step)
@@ -113,7 +123,10 @@ class RepeatedOutputDetector:
                    and self._excludes_chance(2.0 * self._step, count, sample))
 
         self.unseen_turn = 0.0
+        if output == self._value and not rests and self.has_changed:
+            self._rounded_turn += self._step / math.sqrt(12.0) * abs(time - self._until)
         if output != self._value:
+            self._rounding_variance, self._rounded_turn = self.rounding_variance, 0.0
             changed_after = abs(time - self._since)
             if self._holds.add(changed_after) and self._changes > 100 and (
                     self._value or has_noise_at_rest
@@ -136,6 +149,9 @@ class RepeatedOutputDetector:
                 if sample and self._excludes_chance(self._step, self._first[1], sample):
                     self.unseen_turn = math.tau
                 self._first = 0.0, 0
+            if self.is_suspected and not stands and (
+                    step - MIN_ODOMETRY_TURN_RATE > _MAX_DECELERATION * (time - self._until)):
+                self.unseen_turn = math.tau
             self._is_fault = self.is_suspected = self.is_zeroed = False
             self._has_left_zero = self._reports_zero
             self._last_step = step
@@ -145,6 +161,8 @@ class RepeatedOutputDetector:
             self._changes += 1
             return toggles
         self._count, self._until = self._count + 1, time
+        if stands:  # the robot has stopped
+            self._acceleration = 0.0
         lasts = time - self._since
         self._is_fault = self._is_fault or (
             lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
@@ -166,6 +184,15 @@ class RepeatedOutputDetector:
             self._is_fault = not is_chance
         self.is_suspected = self.is_suspected or sample > 0.0 and self._changes == 1
         return self._is_fault
+
+    @property
+    def rounding_variance(self) -> float:
+        """Return the variance of the integrated rate by the steps of the output, rad²."""
+        return self._rounding_variance + self._rounded_turn ** 2
+
+    def reset_heading(self) -> None:
+        """Let the heading be exact now."""
+        self._rounding_variance = self._rounded_turn = 0.0
 
     @property
     def has_changed(self) -> bool:

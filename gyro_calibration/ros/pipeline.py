@@ -303,8 +303,9 @@ class Pipeline:
 
     @property
     def heading_variance(self) -> float:
-        """Return the variance of the heading, rad², with a turn while the gyro may be dead."""
-        return self.estimator.tracker.variance + bool(self.repeat_suspicion) * math.tau ** 2
+        """Return the variance of the heading, rad², by codes and while the gyro may be dead."""
+        return (self.estimator.tracker.variance + self.repeat_detector.rounding_variance
+                + bool(self.repeat_suspicion) * math.tau ** 2)
 
     @property
     def _is_odometry_contradictory(self) -> bool:
@@ -550,8 +551,10 @@ class Pipeline:
         """Detect repeated values and pulses, and add an unknown turn to the heading."""
         outliers, self._outlier_count = self._outlier_count, self.estimator.tracker.outlier_count
         pulse, size = self._pulse_detector.add(time, output)
-        is_repeated = self.repeat_detector.add(time, output, self.wheels.turn_rate(now),
-                                               self.monitor.has_noise_at_rest)
+        stands = self.wheels.is_moving(now) is False
+        is_repeated = self.repeat_detector.add(
+            time, output, self.wheels.turn_rate(now), self.monitor.has_noise_at_rest, stands,
+            stands or self.estimator.tracker.is_resting)
         self.repeat_suspicion = (
             f'the gyro repeats the rate {output:g} rad/s without the noise of its model: it is '
             'dead, or shows this at rest; turn the robot to find out'
@@ -657,6 +660,7 @@ class Pipeline:
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
+        self.repeat_detector.reset_heading()
         self.stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
         if self.conflict or self.repeat_fault:  # turns are not measured now
             self.estimator.set_heading(0.0, math.tau ** 2)

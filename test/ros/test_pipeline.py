@@ -160,6 +160,7 @@ REPEATED = {  # outputs, what comes then, rate of the odometry, whether it is a 
     'each sample four times': (noisy(10.0), np.repeat(noisy(30.0), 4), None, False),
     'zero after a stop of a robot': (noisy(10.0, 0.9), stop(5.0), None, False),
     'zero where no robot stops so fast': (noisy(10.0, 0.9), stop(100.0), None, True),
+    'zero after a hard stop that wheels show': (noisy(10.0, 0.9), stop(100.0), 0.0, False),
     'zero after noise at rest': (noisy(15.0), np.zeros(3000), None, True),
     'zero at each rest': (np.concatenate([noisy(5.0), np.zeros(100), noisy(30.0)]), np.zeros(3000),
                           None, False),
@@ -223,9 +224,39 @@ def test_a_gyro_that_repeats_its_value_at_rest_is_suspected_until_it_has_turned(
     assert reported(rig)[0] == ERROR, 'it does not rest'
     turn = noisy(10.0, 0.5)
     found = rig.feed(np.round(turn / step) * step if first[0] else turn, SLOW)
-    assert reported(rig)[0] != ERROR and found[-1].heading_variance < 0.1
+    assert reported(rig)[0] != ERROR and found[-1].heading_variance < (1.0 if first[0] else 0.1)
     rig.feed(first, SLOW)
     assert reported(rig)[0] != ERROR, 'it is known to do so'
+
+
+@pytest.mark.parametrize('seconds, is_known', [(2.0, False), (0.0, True)],
+                         ids=['in the turn', 'before it'])
+def test_a_gyro_whose_first_zeros_end_in_a_turn_has_missed_a_part_of_it(
+        tmp_path, seconds, is_known):
+    rig = rested(tmp_path, seconds=0.0, model=CERTAIN)
+    right, rig.robot.distort = rig.robot.distort, lambda _: 0.0
+    rig.go(10.0)
+    rig.robot.command(0.7)
+    rig.go(seconds)
+    rig.robot.distort = right
+    rig.go(4.0)
+    assert (rig.outputs[-1].heading_variance < 0.1) == is_known
+
+
+def test_the_error_of_a_coarse_output_is_in_the_variance(tmp_path):
+    """Turns at constant rates, each of which is rounded to one code of 0.5 deg/s."""
+    step, errors = 0.5 * DEGREE, []
+    for part in range(8):
+        rig = Rig(_folder(tmp_path, str(part)), model=CERTAIN.replace('0.01}', '0.0}'))
+        rate = 0.5 + (part + 0.5) / 8.0 * step
+        time = np.arange(1900) * INTERVAL
+        turn = rate * np.clip(np.minimum(time - 10.0, 14.25 - time) / 0.25, 0.0, 1.0)
+        wanted = np.round((turn + 1e-3 * np.random.default_rng(part).normal(size=1900)) / step)
+        found = [each for each in rig.feed(wanted * step) if each][-1]
+        deviation = math.sqrt(found.heading_variance)
+        errors.append((found.heading - rate * 4.0) / deviation)
+        assert deviation < 1.5 * DEGREE
+    assert max(map(abs, errors)) < 3.0 and np.std(errors) > 0.3, errors
 
 
 @pytest.mark.parametrize('acceleration', [5.0, 18.0])
@@ -233,7 +264,8 @@ def test_a_gyro_that_reports_zero_at_each_rest_keeps_the_heading_where_a_robot_s
         tmp_path, reported, acceleration):
     rig = Rig(tmp_path, model=CERTAIN.replace('{bias: 0.01}', '{bias: 0.0}'))
     for _ in range(5):
-        turn = np.concatenate([np.zeros(1000), noisy(4.0, 0.9, 0.0), stop(acceleration)])
+        turn = np.concatenate([np.zeros(1000), stop(acceleration)[::-1], noisy(4.0, 0.9, 0.0),
+                               stop(acceleration)])
         found = rig.feed(turn, SLOW)
         assert not rig.pipeline.repeat_fault and not rig.pipeline.monitor.noise_alarm
         assert found[-1].heading_variance < (2.0 * DEGREE) ** 2
