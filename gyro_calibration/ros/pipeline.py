@@ -379,10 +379,10 @@ class Pipeline:
         silence = now - self._last_arrival
         is_late = self._order.is_late(stamp)
         if is_late and frame == self._frame and not self.publisher_conflict:
-            if self._order.has_two_clocks:
-                self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
             journal.event = ('a sample came after the next one and is not used: the connection to '
                              'the driver changes their order')
+            if self._order.has_two_clocks:
+                self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
             return None
         if missing := self._order.missing_duration:
             self.estimator.tracker.add_unknown_turn(1e-9 * missing * abs(self.estimator.rate))
@@ -398,24 +398,9 @@ class Pipeline:
             self._update_host_clock()
             time = self._host_time.convert_sample(
                 time, self._last_time, self._intervals.usual_interval, silence)
-        if time == self._last_time:
+        if self._is_repeated_stamp(time, stamp, output, now):
             counts['repeated_stamps'] += 1
-            first, fastest = self._frozen_stamp or (now, 0.0)
-            self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = (
-                f'the stamp stands still at {stamp / NSEC_PER_SEC:.3f} s; the sample is not used: '
-                'check that the driver stamps its samples'
-                if now - first > FAULT_DURATION else
-                f'several samples have the stamp {stamp / NSEC_PER_SEC:.3f} s, as where a driver '
-                'stamps a queue on its arrival; only the first of them is used: stamp when the '
-                'gyro measures')
             return None
-        if self._frozen_stamp is not None:
-            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
-            if now - first > FAULT_DURATION:
-                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
-                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                 'came; turns in this time are not in the heading')
         interval = time - self._last_time
         # Perhaps a loss of power; after a mere delay the stamps continue.
         if (now - journal.last_received > _POWER_OFF_SILENCE and interval < math.inf
@@ -441,6 +426,25 @@ class Pipeline:
                                          self.estimator.tracker.is_resting or moving is False)
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
+
+    def _is_repeated_stamp(self, time: float, stamp: int, output: float, now: float) -> bool:
+        """Tell whether a sample has the time of the last one; add what turned meanwhile, after."""
+        first, fastest = self._frozen_stamp or (now, 0.0)
+        lasts, text = now - first, f'{stamp / NSEC_PER_SEC:.3f} s'
+        if time == self._last_time:
+            self._frozen_stamp = first, max(fastest, abs(output))
+            self.journal.event = (
+                f'the stamp stands still at {text}; the sample is not used: check that the driver '
+                'stamps its samples' if lasts > FAULT_DURATION else
+                f'several samples have the stamp {text}, as where a driver stamps a queue on its '
+                'arrival; only the first of them is used: stamp when the gyro measures')
+            return True
+        self._frozen_stamp = None
+        if lasts > FAULT_DURATION:
+            self.estimator.tracker.add_unknown_turn(min(fastest * lasts, math.tau))
+            self.journal.event = (f'the stamps stood still for {lasts:.1f} s while samples came; '
+                                  'turns in this time are not in the heading')
+        return False
 
     def _detect_several_gyros(self, stamp: int, frame: str, now: float, silence: float) -> None:
         """Detect frames that alternate, and samples of two publishers that interleave."""
