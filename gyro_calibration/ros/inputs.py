@@ -325,14 +325,13 @@ class TurnComparison:
     """
 
     def __init__(self) -> None:
-        self.ratio, self.source = math.nan, ''  # of the last turns
-        self.is_contradictory = self.is_larger = self._was_larger = False
-        self.is_smaller = self._was_smaller = False
-        self.total_ratio = math.nan  # of the last turn from one standstill to the next
+        # found twice in a row, each a sentence or ''; and what the last turn shows
+        self.faults, self._last_faults = (dict.fromkeys(('turn', 'unit', 'scale'), '')
+                                          for _ in range(2))
+        self._source = ''
         self._stood_at, self._since_standstill = math.nan, 0.0  # by the gyro and wheels, rad
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
-        self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
         self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
 
@@ -353,8 +352,8 @@ class TurnComparison:
             stands: bool = False) -> None:
         """Add time, s, and rate, rad/s, by a source, and the heading by the gyro, not reset."""
         (then, before), self._last = self._last, (time, heading)
-        is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
-        self.source = source
+        is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self._source or source)
+        self._source = source
         if not (is_next and stands):
             self._at_rest.clear()
             self._least_rate = math.inf
@@ -375,28 +374,33 @@ class TurnComparison:
         self._path += abs(heading - before)
         self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
-            self.ratio = self._by_gyro / self._by_wheels
-            confused, rate = 180.0 / math.pi, self._path / self._duration
-            between = math.sqrt(confused)
-            is_wrong = (self.ratio > between
-                        and (source == ODOMETRY or self.ratio * rate > confused)
-                        or source == ODOMETRY and self.ratio < -0.5)
-            if source != ODOMETRY or abs(self.ratio) > 1.0 / between:
-                self.is_smaller = self._was_smaller = False
-            elif abs(self._by_wheels) > between * self._duration:
-                self.is_smaller, self._was_smaller = self._was_smaller, True
-            self._contradictions = is_wrong * (self._contradictions + 1)
-            self.is_contradictory = self._contradictions > 1
+            ratio, rate = self._by_gyro / self._by_wheels, self._path / self._duration
+            confused, is_odometry = 180.0 / math.pi, source == ODOMETRY
+            between, shown = math.sqrt(confused), f'{ratio:.2g} times what {source} shows'
+            is_wrong = (ratio > between and (is_odometry or ratio * rate > confused)
+                        or is_odometry and ratio < -0.5)
+            self._judge('turn', is_wrong * (f'{shown}: check the unit and the sense of rotation '
+                                            f'of the gyro, and those of {source}'))
+            is_smaller = is_odometry and abs(ratio) < 1.0 / between
+            if not is_smaller or abs(self._by_wheels) > between * self._duration:
+                self._judge('unit', is_smaller * (f'{shown}: check the unit of odom, as no robot '
+                                                  'turns so fast'))
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
+
+    def _judge(self, name: str, fault: str) -> None:
+        """Take what a turn shows of a fault, or ''."""
+        before, self._last_faults[name] = self._last_faults[name], fault
+        self.faults[name] = fault and before and f'the gyro turns by {fault}'
 
     def _compare_whole_turn(self, heading: float) -> None:
         """Compare the turn since the last standstill, of which late odometry misses nothing."""
         turned, by_wheels = heading - self._stood_at, self._since_standstill
         self._stood_at, self._since_standstill = heading, 0.0
-        if self.source == ODOMETRY and abs(by_wheels) > 1.0:  # rad
-            self.total_ratio = turned / by_wheels
-            is_larger = self.total_ratio > 1.0 + RunLimits.max_scale_factor_error
-            self.is_larger, self._was_larger = is_larger and self._was_larger, is_larger
+        if self._source == ODOMETRY and abs(by_wheels) > 1.0:  # rad
+            ratio = turned / by_wheels
+            self._judge('scale', (ratio > 1.0 + RunLimits.max_scale_factor_error) * (
+                f'{ratio:.2f} times what odom shows: check the sensitivity of the gyro, and '
+                'diameter and distance of the wheels'))
 
 
 class AlternateTurns:

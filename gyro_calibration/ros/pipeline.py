@@ -314,42 +314,29 @@ class Pipeline:
     @property
     def faults(self) -> dict[str, str]:
         """Return the faults of clocks, frames and turns, each a sentence or '', by name."""
-        turned, turns = self.stamp_delay.unknown_turn, self._turns
-        came, late = self._odometry_lateness
-        found = {
-            'clock': (self.clock_fault, self.clock_fault),
-            'frame': (self._frame != self._first_frame, to_printable(
+        turned, (came, late) = self.stamp_delay.unknown_turn, self._odometry_lateness
+        return {
+            'clock': self.clock_fault,
+            'frame': (self._frame != self._first_frame) * to_printable(
                 f"the samples on imu/data_raw have the frame '{self._frame!s:.99}', and had "
                 f"'{self._first_frame!s:.99}': the calibration may be that of another gyro; "
-                'restart this node, and calibrate another gyro')),
-            'alternation': (self._alternate_turns.is_contradictory,
-                            'every other sample on imu/data_raw shows another turn, as with two '
-                            'gyros on one topic: give each gyro a topic of its own'),
-            'turn': (turns.is_contradictory,
-                     f'the gyro turns by {turns.ratio:.2g} times what {turns.source} shows: check '
-                     'the unit and the sense of rotation of the gyro, and those of '
-                     f'{turns.source}'),
-            'unit': (turns.is_smaller,
-                     f'the gyro turns by {turns.ratio:.2g} times what odom shows: check the unit '
-                     'of odom, as no robot turns so fast'),
-            'scale': (turns.is_larger,
-                      f'the gyro turns by {turns.total_ratio:.2f} times what odom shows: check '
-                      'the sensitivity of the gyro, and diameter and distance of the wheels'),
-            'stamp': (turned > MIN_TURN_ANGLE,
-                      f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
-                      'imu/data_raw advanced faster or slower for a time than before: check that '
-                      'the driver stamps by a clock and loses no samples, then reset the heading'),
-            'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came,
-                               describe_odometry_clock(late)),
-            'odometry': (self._is_odometry_contradictory,
-                         'odom turns by its headings while its rate is zero: check its twist, '
-                         'without which it does not show that the robot stands'),
-            'standstill': (self._false_turn[1],
-                           f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom '
-                           'shows that the robot stands: unless others turn it, call '
-                           'calibrate_bias, or check odom')}
-        return {name: sentence if is_present else ''
-                for name, (is_present, sentence) in found.items()}
+                'restart this node, and calibrate another gyro'),
+            'alternation': self._alternate_turns.is_contradictory * (
+                'every other sample on imu/data_raw shows another turn, as with two gyros on one '
+                'topic: give each gyro a topic of its own'),
+            **self._turns.faults,
+            'stamp': (turned > MIN_TURN_ANGLE) * (
+                f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
+                'imu/data_raw advanced faster or slower for a time than before: check that the '
+                'driver stamps by a clock and loses no samples, then reset the heading'),
+            'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came) * (
+                describe_odometry_clock(late)),
+            'odometry': self._is_odometry_contradictory * (
+                'odom turns by its headings while its rate is zero: check its twist, without '
+                'which it does not show that the robot stands'),
+            'standstill': (self._false_turn[1] > 0.0) * (
+                f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
+                'the robot stands: unless others turn it, call calibrate_bias, or check odom')}
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel, also one of this node."""
