@@ -364,8 +364,9 @@ class Pipeline:
                              'time; the sample is not used')
             return None
         silence = now - self._last_arrival
-        is_late = self._order.is_late(stamp)
-        if is_late and frame == self._frame and not self.publisher_conflict:
+        if self.publisher_conflict:
+            self._order = ArrivalOrder()
+        elif self._order.is_late(stamp) and frame == self._frame:
             journal.event = ('a sample came after the next one and is not used: the connection to '
                              'the driver changes their order')
             if self._order.has_two_clocks:
@@ -445,14 +446,14 @@ class Pipeline:
                     'imu/data_raw'))
         if not self.publisher_conflict:
             return
-        # Samples that follow too soon are not of the same publisher. A restarted driver that sends
-        # twice as fast as before is refused while the middleware lists the killed one. Delayed
-        # samples also follow too soon, until they have caught up.
+        # Samples that follow too soon, or go back, are not of the same publisher. A restarted
+        # driver that sends twice as fast as before is refused while the middleware lists the
+        # killed one. Delayed samples also follow too soon, until they have caught up.
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
         interval, behind = stamp - self._last_stamp, self._backlog
         self._backlog = 0.0 if silence > FAULT_DURATION else min(
             max(behind + interval - usual, 0.0), NSEC_PER_SEC * FAULT_DURATION)
-        self._interleaved_count += not (2.0 * interval > usual or behind)
+        self._interleaved_count += interval < 0 or not (2.0 * interval > usual or behind)
         if self._interleaved_count > 1:
             self._refuse_all(self.publisher_conflict)
 

@@ -651,16 +651,19 @@ def test_a_turn_between_two_rests_while_two_publishers_send_is_in_the_variance(t
 
 
 @pytest.mark.parametrize('names', [('/a', '/b'), ('/a', '/a')], ids=['two names', 'one name'])
-@pytest.mark.parametrize('offset', [1, 3, 5, 9], ids=lambda offset: f'{offset} ms apart')
+@pytest.mark.parametrize('offset', [1, 3, 5, 9, -300, 300],
+                         ids=lambda offset: f'{offset} ms apart')
 def test_two_publishers_that_both_send_are_found_by_their_stamps(tmp_path, offset, names):
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(100, 0.5))
     rig.publishers = list(names)
     rig.pipeline.update_publishers(rig.publishers)
-    for _ in range(3):
+    turned = rig.outputs[-1].heading
+    for _ in range(30):
         rig.pipeline.add_sample(rig.fed + offset * 10 ** 6, 0.0)
         rig.feed([0.5])
     assert '2 publishers send' in rig.pipeline.conflict
+    assert abs(rig.outputs[-1].heading - turned) < 0.5 * 30 * INTERVAL
 
 
 def test_no_published_stamp_is_outside_of_ros_time(tmp_path):
