@@ -24,9 +24,11 @@ from launch import LaunchDescription
 from launch.actions import (
     ExecuteProcess,
     IncludeLaunchDescription,
+    RegisterEventHandler,
     SetEnvironmentVariable,
     Shutdown,
 )
+from launch.event_handlers import OnProcessIO
 from launch.substitutions import EnvironmentVariable, PathJoinSubstitution
 from launch_ros.substitutions import ExecutableInPackage, FindPackageShare
 
@@ -49,7 +51,11 @@ def generate_launch_description():
         cmd=[program, 'emulate', '--protocol', PROTOCOL, '--model', model, '--motion', 'robot',
              '--link', port],
         name='emulator', output='screen', on_exit=_end)
-    return LaunchDescription([SetEnvironmentVariable(range_name, discovery), emulator, nodes])
+    waiting = [nodes]  # for the port, whose name the emulator prints once
+    begin = OnProcessIO(target_action=emulator,
+                        on_stdout=lambda _: waiting.pop() if waiting else None)
+    return LaunchDescription([SetEnvironmentVariable(range_name, discovery),
+                              RegisterEventHandler(begin), emulator])
 
 
 def _end(event, context):

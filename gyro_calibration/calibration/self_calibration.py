@@ -365,7 +365,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
         refuse_other_motion(run, motion, largest_offset, slip)
     if has_slipped:
         raise DataRefused(slip)
-    if abs(s) > limits.max_scale_factor_error + 3.0 * deviation:
+    if abs(s) > limits.max_scale_factor_error and deviation <= limits.max_scale_deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
                           f'and the unit of the {motion.name}')

@@ -85,6 +85,7 @@ def run(given: argparse.Namespace) -> None:
         print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json
               else to_printable(path), flush=True)
         emulator.run()
+        emulator.wait_for_end_of_reader()
     finally:
         emulator.close()
         # launch sends a second signal, which must not interrupt a program that is about to end

@@ -110,6 +110,12 @@ class Emulator:
                 os.read(self._master, 65536)
         return not events & select.POLLHUP
 
+    def wait_for_end_of_reader(self) -> None:
+        """Wait up to 0.5 s for a driver that ends too, and would report a lost port."""
+        deadline = time.monotonic() + 0.5
+        while self.has_reader() and time.monotonic() < deadline:
+            time.sleep(_POLL_INTERVAL)
+
     def stop(self) -> None:
         """Make `run` return soon; may be called from any thread and from a signal handler."""
         self._stop.set()

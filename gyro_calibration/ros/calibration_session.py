@@ -50,6 +50,7 @@ import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
+MIN_ODOMETRY_DURATION = 5.0  # s; of a run by odometry, whose first and last second are not fitted
 #: Time without a sample after which a run without a drive ends, and longest wait for a node that
 #: receives the commands, s; discovery may take 3 s.
 SAMPLE_TIMEOUT = 5.0
@@ -416,6 +417,9 @@ class CalibrationSession:
         if not run.times:
             return False, ('no sample has come since the calibration began: check the gyro and '
                            'its driver')
+        if run.kind == ODOMETRY and run.elapsed < MIN_ODOMETRY_DURATION:
+            return False, (f'the run lasts {run.elapsed:.1f} s so far, and one by odometry '
+                           f'{MIN_ODOMETRY_DURATION:g} s at least: turn both ways, and call again')
         return True, run.finish()
 
     def cancel(self) -> tuple[bool, str]:
@@ -472,6 +476,41 @@ def describe_odometry_clock(late: float) -> str:
             'imu/data_raw: stamp both by one clock, or synchronize those of their computers')
 
 
+def _refuse_turn_at_rest(run: CalibrationRun) -> None:
+    """Refuse a rest in which odometry, if there is any, shows a turn."""
+    if len(run.odometry) < 2:
+        return
+    at, headings, rates, _ = np.array(run.odometry).T
+    turned = max(float(np.mean(rates) * np.ptp(at)),
+                 float(np.unwrap(headings)[-1] - headings[0]), key=abs)
+    if abs(turned) > MIN_TURN_ANGLE:
+        raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
+                          f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap odom '
+                          'to an odometry of the wheels')
+
+
+def _find_motion(run: CalibrationRun) -> tuple[float, Motion]:
+    """Return the begin of the motion by odometry, s, and the motion from then on."""
+    last = run.times[0] + run.duration
+    rows = np.array([each for each in run.odometry if each[0] <= last])
+    if len(rows) < 10:
+        raise DataRefused(
+            f'{len(rows)} messages came on odom with an orientation and a rate in '
+            f'{run.duration:.0f} s, but at least 10 are needed: check the topic, its '
+            'quaternions, which have the length 1, and its twist')
+    at, headings, rates, _ = rows.T
+    if not (np.diff(at) > 0.0).all():
+        raise DataRefused('the messages on odom do not have increasing stamps: check that one '
+                          'node publishes them')
+    if (covered := float(np.ptp(at))) < 0.8 * run.duration:
+        raise DataRefused(f'{len(rows)} messages came on odom, but in {covered:.0f} s of '
+                          f'{run.duration:.0f} s only: check that it does not stop')
+    headings = np.unwrap(headings)
+    motion = (motion_from_headings(at, headings) if np.ptp(headings) > MIN_TURN_ANGLE
+              else motion_from_rates(at - at[0], rates))
+    return float(at[0]), replace(motion, name='odometry')
+
+
 def fit_run(run: CalibrationRun, noise: Noise, date: str,
             prior: Array | None = None) -> tuple[SelfCalibration, str]:
     """Return the calibration by a run, and a remark; raise `DataRefused` as its methods do."""
@@ -484,15 +523,7 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
             raise DataRefused('the gyro reports zero only: either it sets its output to zero at '
                               'rest, and shows no bias, or it is dead; turn the robot to find out')
         bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
-        turned = 0.0  # rad; by the headings or the rates of odometry
-        if len(run.odometry) > 1:
-            at, headings, rates, _ = np.array(run.odometry).T
-            turned = max(float(np.mean(rates) * np.ptp(at)),
-                         float(np.unwrap(headings)[-1] - headings[0]), key=abs)
-        if abs(turned) > MIN_TURN_ANGLE:
-            raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
-                              f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
-                              'odom to an odometry of the wheels')
+        _refuse_turn_at_rest(run)
         return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date, temperature,
                                'rest'), ''
     if run.kind == TURNS:
@@ -501,31 +532,13 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
         return (to_model_record(found.fit, 'turns', date, temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
     by_odometry = run.motion is None
-    if run.motion is not None:
-        begin, motion = time[0], run.motion
-    else:
-        rows = np.array([each for each in run.odometry if each[0] <= time[0] + run.duration])
-        increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
-        if len(rows) < 10:
-            raise DataRefused(
-                f'{len(rows)} messages came on odom with an orientation and a rate in '
-                f'{run.duration:.0f} s, but at least 10 are needed: check the topic, its '
-                'quaternions, which have the length 1, and its twist')
-        if not increases:
-            raise DataRefused('the messages on odom do not have increasing stamps: check that '
-                              'one node publishes them')
-        if (covered := float(np.ptp(rows[:, 0]))) < 0.8 * run.duration:
-            raise DataRefused(f'{len(rows)} messages came on odom, but in {covered:.0f} s of '
-                              f'{run.duration:.0f} s only: check that it does not stop')
-        at, headings, rates, _ = rows.T
-        begin, headings = at[0], np.unwrap(headings)
-        motion = (motion_from_headings(at, headings) if np.ptp(headings) > MIN_TURN_ANGLE
-                  else motion_from_rates(at - begin, rates))
-        motion = replace(motion, name='odometry')
+    begin, motion = _find_motion(run) if run.motion is None else (time[0], run.motion)
     time = time - begin
     # before and after a profile the robot rests, but odometry may begin or end in a turn
     around = limits.max_time_offset * (-1.0 if by_odometry else 1.0)
     inside = (time >= -around) & (time <= motion.duration + around)
+    if not inside.any():
+        raise DataRefused('no sample has a stamp between those of odom')
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
                          reference=run.reference_errors if by_odometry else None,
                          output=output[inside], prior=prior)

@@ -65,20 +65,23 @@ class RepeatedOutputDetector:
     """
     Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
-    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
-    larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
-    a repeated zero counts only after a deceleration that no robot has, 20 rad/s², or if a whole
-    stretch at rest had the noise of the model before the first such zero. Two neighbouring codes,
-    as of a dead gyro whose last bit toggles, count if chance is excluded; zero as above. What
-    counts does so until the value changes.
+    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the
+    noise is larger than the steps of the output, or if chance is excluded. Some gyros report
+    zero at rest: a repeated zero counts only after a deceleration that no robot has, 20
+    rad/s², unless wheels stand then, or if a whole stretch at rest had the noise of the model
+    before the first such zero. Two neighbouring codes, as of a dead gyro whose last bit
+    toggles, count if chance is excluded; zero as above. What counts does so until the value
+    changes.
 
     A gyro with noise `is_suspected` while it repeats the value of its first sample, whose step is
     not known, or zero against chance for the first time: it is dead, or shows that at rest. Later
-    such zeros mean that it `is_zeroed`: it has neither noise nor bias now.
+    such zeros mean that it `is_zeroed`: it has neither noise nor bias now. Where what is suspected
+    ends with an acceleration that no robot has, it was dead, unless wheels stood until then.
 
     A value that was held for less time, but longer than usual and not by chance, leaves a possible
     error of the integrated rate, `unseen_turn`, rad, with the sample that ends it; a full turn
-    where the first value shows later, by step and noise, to have been that of a dead gyro.
+    where the first value shows later, by step and noise, to have been that of a dead gyro. Each
+    value is rounded to the steps of the output, by an error that lasts until the next one.
     """
 
     def __init__(self, noise: Noise):
@@ -89,97 +92,124 @@ class RepeatedOutputDetector:
         self._is_fault = self.is_suspected = self.is_zeroed = self._has_left_zero = False
         self._first = 0.0, 0  # value, rad/s, and number of samples before the first change
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
+        # of the values before, rad², and standard deviation by this value so far, rad
+        self._rounding_variance = self._rounded_turn = 0.0
         # Smallest and largest value since a time, s, and the number of samples after the first.
         self._band = math.nan, math.nan, 0.0, 0
 
     def add(self, time: float, output: float, odometry_rate: float,
-            has_noise_at_rest: bool = False) -> bool:
-        """Add a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
+            has_noise_at_rest: bool = False, stands: bool = False, rests: bool = False) -> bool:
+        """
+        Add a sample, s and rad/s, and tell if it is repeated.
+
+        The rate by odometry, rad/s, is 0 without any; `stands` is whether wheels show standstill,
+        `rests` whether they or the statistics of the rate do.
+        """
         step = abs(output - self._value)
         if step:
             self._step = min(step, self._step)
-
-        # two neighbouring codes for longer than noise allows
-        low, high, since, count = self._band
-        low, high, count = min(low, output), max(high, output), count + 1
-        if not high - low < 1.5 * self._step:
-            low, high, since, count = output, output, time, 0
-        self._band = low, high, since, count
-        lasts = time - since
-        sample = (self._noise.angle_random_walk / math.sqrt(lasts / count)
-                  if lasts > FAULT_DURATION else 0.0)
-        toggles = (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
-                   and self._changes > 100 and sample > 0.0
-                   and self._excludes_chance(2.0 * self._step, count, sample))
-
-        self.unseen_turn = 0.0
-        if output != self._value:
-            changed_after = abs(time - self._since)
-            if self._holds.add(changed_after) and self._changes > 100 and (
-                    self._value or has_noise_at_rest
-                    or self._acceleration > (_MAX_DECELERATION if self._has_left_zero
-                                             else MAX_ANGULAR_ACCELERATION)):
-                usual, held = self._holds.usual_interval, self._until - self._since
-                sample = self._noise.angle_random_walk / math.sqrt(usual)
-                # a chance of e^-20 is once in 50 days at 100 Hz
-                if sample and self._excludes_chance(self._step, held / usual, sample, 20.0):
-                    # the mean square of a rate that goes on linearly, or changes at once, and a
-                    # turn meanwhile
-                    self.unseen_turn = math.hypot(
-                        math.hypot(step, self._last_step) * (held + usual) / math.sqrt(3.0),
-                        0.25 * MAX_ANGULAR_ACCELERATION * (held + usual) ** 2)
-            if self._changes == 1:
-                self._first = self._value, self._count
-            elif self._first[1] >= 20 and self._changes > 100 and (
-                    self._first[0] or has_noise_at_rest):
-                sample = self._noise.angle_random_walk / math.sqrt(self._holds.usual_interval)
-                if sample and self._excludes_chance(self._step, self._first[1], sample):
-                    self.unseen_turn = math.tau
-                self._first = 0.0, 0
-            self._is_fault = self.is_suspected = self.is_zeroed = False
-            self._has_left_zero = self._reports_zero
-            self._last_step = step
-            self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
-                                  / max(changed_after, MIN_SAMPLE_INTERVAL))
-            self._value, self._since, self._until, self._count = output, time, time, 0
-            self._changes += 1
+        toggles, self.unseen_turn = self._is_toggling(time, output, has_noise_at_rest), 0.0
+        if step or not self._changes:
+            self._end_value(time, output, has_noise_at_rest, stands)
             return toggles
+        if not rests and self.has_changed:
+            self._rounded_turn += self._step / math.sqrt(12.0) * abs(time - self._until)
         self._count, self._until = self._count + 1, time
+        if stands:  # the robot has stopped
+            self._acceleration = 0.0
         lasts = time - self._since
         self._is_fault = self._is_fault or (
             lasts > _PART_DURATION and abs(odometry_rate) > MIN_ODOMETRY_TURN_RATE
             and abs(output - odometry_rate) > 0.5 * abs(odometry_rate))
         if toggles or self._is_fault or self._count < 20 or lasts < FAULT_DURATION:
             return toggles or self._is_fault
-        sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
         is_sudden = self._acceleration > _MAX_DECELERATION
         self._reports_zero = self._reports_zero or output == 0.0 and not (
             has_noise_at_rest or is_sudden)
         # the step of the output is known after 100 changes; the first sample is one
-        is_chance = self._changes <= 100 or not sample or not (
+        sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
+        is_no_chance = self._changes > 100 and (
             2.0 * _MAX_NOISE_REDUCTION * self._step < sample
-            or self._excludes_chance(self._step, self._count, sample))
+            or self._excludes_chance(self._step, self._count, lasts / self._count))
         if output == 0.0 and self._reports_zero and not is_sudden:
-            self.is_suspected = not (is_chance or self._has_left_zero)
-            self.is_zeroed = not is_chance and self._has_left_zero
+            self.is_suspected = is_no_chance and not self._has_left_zero
+            self.is_zeroed = is_no_chance and self._has_left_zero
         else:
-            self._is_fault = not is_chance
+            self._is_fault = is_no_chance
         self.is_suspected = self.is_suspected or sample > 0.0 and self._changes == 1
         return self._is_fault
+
+    def _is_toggling(self, time: float, output: float, has_noise_at_rest: bool) -> bool:
+        """Tell whether two neighbouring codes alternate for longer than noise allows."""
+        low, high, since, count = self._band
+        low, high, count = min(low, output), max(high, output), count + 1
+        if not high - low < 1.5 * self._step:
+            low, high, since, count = output, output, time, 0
+        self._band = low, high, since, count
+        lasts = time - since
+        return (low < high and (has_noise_at_rest or not low <= 0.0 <= high)
+                and self._changes > 100 and lasts > FAULT_DURATION
+                and self._excludes_chance(2.0 * self._step, count, lasts / count))
+
+    def _end_value(self, time: float, output: float, has_noise_at_rest: bool,
+                   stands: bool) -> None:
+        """Begin another value; the turn that the gyro may not have seen is `unseen_turn`."""
+        step, changed_after = abs(output - self._value), abs(time - self._since)
+        self._rounding_variance, self._rounded_turn = self.rounding_variance, 0.0
+        if self._holds.add(changed_after) and self._changes > 100 and (
+                self._value or has_noise_at_rest or self._acceleration > (
+                    _MAX_DECELERATION if self._has_left_zero else MAX_ANGULAR_ACCELERATION)):
+            usual, held = self._holds.usual_interval, self._until - self._since
+            # a chance of e^-20 is once in 50 days at 100 Hz
+            if self._excludes_chance(self._step, held / usual, usual, 20.0):
+                # the mean square of a rate that goes on linearly, or changes at once, and a turn
+                # meanwhile
+                self.unseen_turn = math.hypot(
+                    math.hypot(step, self._last_step) * (held + usual) / math.sqrt(3.0),
+                    0.25 * MAX_ANGULAR_ACCELERATION * (held + usual) ** 2)
+        if self._changes == 1:
+            self._first = self._value, self._count
+        elif self._first[1] >= 20 and self._changes > 100 and (
+                self._first[0] or has_noise_at_rest):
+            if self._excludes_chance(self._step, self._first[1], self._holds.usual_interval):
+                self.unseen_turn = math.tau
+            self._first = 0.0, 0
+        if self.is_suspected and not stands and (
+                step - MIN_ODOMETRY_TURN_RATE > _MAX_DECELERATION * (time - self._until)):
+            self.unseen_turn = math.tau
+        self._is_fault = self.is_suspected = self.is_zeroed = False
+        self._has_left_zero = self._reports_zero
+        self._last_step = step
+        self._acceleration = ((step - MIN_ODOMETRY_TURN_RATE)
+                              / max(changed_after, MIN_SAMPLE_INTERVAL))
+        self._value, self._since, self._until, self._count = output, time, time, 0
+        self._changes += 1
+
+    @property
+    def rounding_variance(self) -> float:
+        """Return the variance of the integrated rate by the steps of the output, rad²."""
+        return self._rounding_variance + self._rounded_turn ** 2
+
+    def reset_heading(self) -> None:
+        """Let the heading be exact now."""
+        self._rounding_variance = self._rounded_turn = 0.0
 
     @property
     def has_changed(self) -> bool:
         """Tell whether a second value came."""
         return self._changes > 1
 
-    def _excludes_chance(self, width: float, count: float, sample: float,
+    def _excludes_chance(self, width: float, count: float, interval: float,
                          level: float = 100.0) -> bool:
         """
         Tell whether a live gyro cannot have `count` samples within a width, rad/s.
 
-        The noise of a sample, rad/s, may be lower than that of the model. The probability must be
-        below e^-level: e^-100, since it is e^-25 for a gyro that sends each sample four times.
+        The noise of a sample, of an interval in s, may be lower than that of the model. The
+        probability must be below e^-level: e^-100, since it is e^-25 for a gyro that sends each
+        sample four times.
         """
+        if not (sample := self._noise.angle_random_walk / math.sqrt(interval)):
+            return False
         stays = math.erf(_MAX_NOISE_REDUCTION * width / (2.0 * math.sqrt(2.0) * sample))
         return -count * math.log(max(stays, 1e-9)) > level
 

@@ -26,6 +26,7 @@ from types import SimpleNamespace
 from typing import Protocol
 
 from gyro_calibration.calibration.self_calibration import RunLimits
+import numpy as np
 
 _TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
                                 str: 'text', list: 'a list of strings'}
@@ -201,6 +202,59 @@ class StampDelay:
         return ''
 
 
+#: Number of the last stamps that show their order: a burst of them may come in any order.
+_ORDERED_STAMPS = 24
+
+
+class ArrivalOrder:
+    """
+    Order of the stamps of one publisher, of which others may have overtaken some: late ones.
+
+    A late stamp fits in where the stamps around it leave half of their median spacing. Of two in a
+    row that do not, though they increase, the clock was set back. Late stamps at equal intervals,
+    up to a factor of two, have a clock of their own: that of a second gyro where others come in
+    between, else one that was set back.
+    """
+
+    def __init__(self) -> None:
+        self.has_two_clocks, self._in_time_count = False, 0
+        self._misfit = self._spacing = 0  # ns
+        self.missing_duration = 0  # by a clock that was set back by up to two spacings, ns
+        # the last ones that fit in, ns; the spacing is that before a burst
+        self._stamps = deque[int](maxlen=2 * _ORDERED_STAMPS)
+        # stamps of late ones, ns, and the number of those in time so far
+        self._late = deque[tuple[int, int]](maxlen=_ORDERED_STAMPS)
+
+    def is_late(self, stamp: int) -> bool:
+        """Add a stamp, ns, and tell whether it is late; not if its clock was set back."""
+        misfit, self._misfit, self.missing_duration = self._misfit, 0, 0
+        last = max(self._stamps, default=stamp)
+        if stamp >= last:
+            if misfit and stamp - last < 0.5 * self._spacing:
+                self.missing_duration = last + 2 * self._spacing - stamp
+            self._stamps.append(stamp)
+            self._in_time_count += 1
+            return False
+        self._late.append((stamp, self._in_time_count))
+        late, counts = np.array(self._late).T
+        apart = np.diff(late)
+        self._spacing = int(np.median(np.diff(np.sort(self._stamps)))) if len(
+            self._stamps) >= _ORDERED_STAMPS else 0
+        is_steady = len(late) == _ORDERED_STAMPS and 0 < apart.max() < 2 * apart.min()
+        self.has_two_clocks = is_steady and counts[0] < counts[-1]
+        fits = not self._spacing or min(self._stamps) < stamp and min(
+            abs(each - stamp) for each in self._stamps) > 0.5 * self._spacing
+        is_set_back = is_steady and not self.has_two_clocks or not fits and 0 < misfit < stamp
+        if is_set_back:
+            self._stamps.clear()
+            self._late.clear()
+        if fits or is_set_back:
+            self._stamps.append(stamp)
+        else:
+            self._misfit = stamp
+        return not is_set_back
+
+
 class RosTime:
     """Whether ROS time advances."""
 
@@ -262,7 +316,8 @@ class TurnComparison:
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
     wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Odometry that turns
+    further by that mean, and faster than as many rad/s, is in deg/s.
 
     The sensitivity of the gyro is wrong where it turns further than odometry from one standstill
     to the next, twice in a row and by more than the largest scale factor error that a calibration
@@ -270,13 +325,13 @@ class TurnComparison:
     """
 
     def __init__(self) -> None:
-        self.ratio, self.source = math.nan, ''  # of the last turns
-        self.is_contradictory = self.is_larger = self._was_larger = False
-        self.total_ratio = math.nan  # of the last turn from one standstill to the next
+        # found twice in a row, each a sentence or ''; and what the last turn shows
+        self.faults, self._last_faults = (dict.fromkeys(('turn', 'unit', 'scale'), '')
+                                          for _ in range(2))
+        self._source = ''
         self._stood_at, self._since_standstill = math.nan, 0.0  # by the gyro and wheels, rad
         self._last = math.nan, math.nan
         self._by_wheels = self._by_gyro = self._path = self._duration = 0.0  # rad, rad, rad, s
-        self._contradictions = 0
         self._at_rest: list[tuple[float, float]] = []  # as `_last`, a second apart, at standstill
         self._least_rate = math.inf  # by the gyro, in a second at standstill, rad/s
 
@@ -297,8 +352,8 @@ class TurnComparison:
             stands: bool = False) -> None:
         """Add time, s, and rate, rad/s, by a source, and the heading by the gyro, not reset."""
         (then, before), self._last = self._last, (time, heading)
-        is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self.source or source)
-        self.source = source
+        is_next = 0.0 < time - then <= MAX_VELOCITY_AGE and source == (self._source or source)
+        self._source = source
         if not (is_next and stands):
             self._at_rest.clear()
             self._least_rate = math.inf
@@ -319,23 +374,33 @@ class TurnComparison:
         self._path += abs(heading - before)
         self._duration += time - then
         if abs(self._by_wheels) > 1.0:  # rad
-            self.ratio = self._by_gyro / self._by_wheels
-            confused, rate = 180.0 / math.pi, self._path / self._duration
-            is_wrong = (self.ratio > math.sqrt(confused)
-                        and (source == ODOMETRY or self.ratio * rate > confused)
-                        or source == ODOMETRY and self.ratio < -0.5)
-            self._contradictions = is_wrong * (self._contradictions + 1)
-            self.is_contradictory = self._contradictions > 1
+            ratio, rate = self._by_gyro / self._by_wheels, self._path / self._duration
+            confused, is_odometry = 180.0 / math.pi, source == ODOMETRY
+            between, shown = math.sqrt(confused), f'{ratio:.2g} times what {source} shows'
+            is_wrong = (ratio > between and (is_odometry or ratio * rate > confused)
+                        or is_odometry and ratio < -0.5)
+            self._judge('turn', is_wrong * (f'{shown}: check the unit and the sense of rotation '
+                                            f'of the gyro, and those of {source}'))
+            is_smaller = is_odometry and abs(ratio) < 1.0 / between
+            if not is_smaller or abs(self._by_wheels) > between * self._duration:
+                self._judge('unit', is_smaller * (f'{shown}: check the unit of odom, as no robot '
+                                                  'turns so fast'))
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
+
+    def _judge(self, name: str, fault: str) -> None:
+        """Take what a turn shows of a fault, or ''."""
+        before, self._last_faults[name] = self._last_faults[name], fault
+        self.faults[name] = fault and before and f'the gyro turns by {fault}'
 
     def _compare_whole_turn(self, heading: float) -> None:
         """Compare the turn since the last standstill, of which late odometry misses nothing."""
         turned, by_wheels = heading - self._stood_at, self._since_standstill
         self._stood_at, self._since_standstill = heading, 0.0
-        if self.source == ODOMETRY and abs(by_wheels) > 1.0:  # rad
-            self.total_ratio = turned / by_wheels
-            is_larger = self.total_ratio > 1.0 + RunLimits.max_scale_factor_error
-            self.is_larger, self._was_larger = is_larger and self._was_larger, is_larger
+        if self._source == ODOMETRY and abs(by_wheels) > 1.0:  # rad
+            ratio = turned / by_wheels
+            self._judge('scale', (ratio > 1.0 + RunLimits.max_scale_factor_error) * (
+                f'{ratio:.2f} times what odom shows: check the sensitivity of the gyro, and '
+                'diameter and distance of the wheels'))
 
 
 class AlternateTurns:

@@ -17,9 +17,9 @@ the steady clock.
 
 Two publishers are detected by their stamps: a sample of a second one divides an interval so that
 one part is at most half of it. Two such intervals while the graph lists several publishers are the
-proof. The graph alone is not, since it lists a killed driver for up to 20 s. A stamp that jumps
-back is one of several gyros, of a clock that was set, or of a late sample, for which the stamps
-before it have left a gap of one and a half intervals or more.
+proof. The graph alone is not, since it lists a killed driver for up to 20 s. Of one publisher a
+stamp that jumps back is that of a late sample, of a second gyro, or of a clock that was set; see
+`ArrivalOrder`.
 """
 
 from __future__ import annotations
@@ -43,12 +43,14 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, describe_odometry_clock, MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
+    CalibrationSession, describe_odometry_clock, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION,
+    MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
-    AlternateTurns, Clock, COMMAND, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, MAX_VELOCITY_AGE,
-    NodeParameter, ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity, Wheels)
+    AlternateTurns, ArrivalOrder, Clock, COMMAND, FAULT_DURATION, MAX_ANGULAR_ACCELERATION,
+    MAX_VELOCITY_AGE, NodeParameter, ODOMETRY, RosTime, StampDelay, TurnComparison, Velocity,
+    Wheels)
 from gyro_calibration.ros.state_store import StateStore
 
 PARAMETERS = (
@@ -83,7 +85,7 @@ PARAMETERS = (
     NodeParameter('calibration.drive', False, 'Drive the motion profile on cmd_vel.',
                   dynamic=True),
     NodeParameter('calibration.duration', 20.0, 'Length of a calibration by odometry.', 's',
-                  (5.0, 600.0), True),
+                  (MIN_ODOMETRY_DURATION, FINISH_TIMEOUT), True),
     NodeParameter('calibration.turns', 0,
                   'Whole turns of a calibration by turns, counter-clockwise positive; 0 takes the '
                   'number that the gyro shows.', '', (-100, 100), True),
@@ -96,8 +98,7 @@ PARAMETERS = (
 _POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
 _TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
 _MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
-_INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several publishers
-_MAX_LATE_SAMPLES = 8  # samples after which one that was overtaken by them is not expected
+_INTERLEAVING_WINDOW = 1.0  # s; two changes of the frame in it show several publishers
 
 
 class CorrectedSample(NamedTuple):
@@ -164,7 +165,7 @@ class Pipeline:
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last_time, self._last_stamp = -math.inf, 0
         self._jump_times = deque[float](maxlen=2)
-        self._stamps = deque[int](maxlen=_MAX_LATE_SAMPLES)  # the last ones, in order of arrival
+        self._order = ArrivalOrder()
         self._intervals = Intervals()  # between all of them, so that they can end a conflict
         self._first_frame: str | None = None
         self._frame: str | None = None
@@ -183,8 +184,10 @@ class Pipeline:
         self.stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
         self._odometry_lateness = -math.inf, 0.0  # when it came, and its lateness, s
-        # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
-        self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
+        # Odometry heading when its rate became zero, rad, and times of the last odometry and of a
+        # contradiction, s.
+        self._heading_at_rest = self._odometry_time = math.nan
+        self._contradiction_time, self._is_motion_shown = -math.inf, False
         self._turns, self._alternate_turns = TurnComparison(), AlternateTurns()
         # Time until which gyro and odometry agreed at standstill, s, whether it stands, and the
         # possible error of the heading and the turn by the gyro since then, rad.
@@ -249,12 +252,18 @@ class Pipeline:
     def add_odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Add a heading, rad, and a velocity by the odometry."""
         now, rate, time = self._clock.steady(), velocity.angular[2], self._message_time(stamp)
+        # what a robot may turn between two messages of standstill, unless none shows motion
+        interval, self._odometry_time = time - self._odometry_time, time
+        self._is_motion_shown = self._is_motion_shown or velocity.is_moving
+        hidden = (0.25 * MAX_ANGULAR_ACCELERATION * interval ** 2
+                  if self._is_motion_shown or interval > MAX_VELOCITY_AGE else 0.0)
+        turned = abs(math.remainder(heading - self._heading_at_rest, math.tau))
         if velocity.is_moving:
             self._heading_at_rest = math.nan
-        elif abs(math.remainder(heading - self._heading_at_rest, math.tau)) > MIN_TURN_ANGLE:
+        elif turned > max(hidden, MIN_TURN_ANGLE):
             self._contradiction_time, self._heading_at_rest = now, heading
             self.estimator.tracker.add_unknown_turn(MIN_TURN_ANGLE)
-        elif math.isnan(self._heading_at_rest):
+        elif not turned + hidden <= MIN_TURN_ANGLE:
             self._heading_at_rest = heading
         # how late it is for the last sample, or ahead of one that would come now
         late = self._last_time - time if self._last_time > -math.inf else 0.0
@@ -294,8 +303,9 @@ class Pipeline:
 
     @property
     def heading_variance(self) -> float:
-        """Return the variance of the heading, rad², with a turn while the gyro may be dead."""
-        return self.estimator.tracker.variance + bool(self.repeat_suspicion) * math.tau ** 2
+        """Return the variance of the heading, rad², by codes and while the gyro may be dead."""
+        return (self.estimator.tracker.variance + self.repeat_detector.rounding_variance
+                + bool(self.repeat_suspicion) * math.tau ** 2)
 
     @property
     def _is_odometry_contradictory(self) -> bool:
@@ -304,39 +314,29 @@ class Pipeline:
     @property
     def faults(self) -> dict[str, str]:
         """Return the faults of clocks, frames and turns, each a sentence or '', by name."""
-        turned, turns = self.stamp_delay.unknown_turn, self._turns
-        came, late = self._odometry_lateness
-        found = {
-            'clock': (self.clock_fault, self.clock_fault),
-            'frame': (self._frame != self._first_frame, to_printable(
+        turned, (came, late) = self.stamp_delay.unknown_turn, self._odometry_lateness
+        return {
+            'clock': self.clock_fault,
+            'frame': (self._frame != self._first_frame) * to_printable(
                 f"the samples on imu/data_raw have the frame '{self._frame!s:.99}', and had "
                 f"'{self._first_frame!s:.99}': the calibration may be that of another gyro; "
-                'restart this node, and calibrate another gyro')),
-            'alternation': (self._alternate_turns.is_contradictory,
-                            'every other sample on imu/data_raw shows another turn, as with two '
-                            'gyros on one topic: give each gyro a topic of its own'),
-            'turn': (turns.is_contradictory,
-                     f'the gyro turns by {turns.ratio:.1f} times what {turns.source} shows: check '
-                     'the unit and the sense of rotation of the gyro, and those of '
-                     f'{turns.source}'),
-            'scale': (turns.is_larger,
-                      f'the gyro turns by {turns.total_ratio:.2f} times what odom shows: check '
-                      'the sensitivity of the gyro, and diameter and distance of the wheels'),
-            'stamp': (turned > MIN_TURN_ANGLE,
-                      f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
-                      'imu/data_raw advanced faster or slower for a time than before: check that '
-                      'the driver stamps by a clock and loses no samples, then reset the heading'),
-            'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came,
-                               describe_odometry_clock(late)),
-            'odometry': (self._is_odometry_contradictory,
-                         'odom turns by its headings while its rate is zero: check its twist, '
-                         'without which it does not show that the robot stands'),
-            'standstill': (self._false_turn[1],
-                           f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom '
-                           'shows that the robot stands: unless others turn it, call '
-                           'calibrate_bias, or check odom')}
-        return {name: sentence if is_present else ''
-                for name, (is_present, sentence) in found.items()}
+                'restart this node, and calibrate another gyro'),
+            'alternation': self._alternate_turns.is_contradictory * (
+                'every other sample on imu/data_raw shows another turn, as with two gyros on one '
+                'topic: give each gyro a topic of its own'),
+            **self._turns.faults,
+            'stamp': (turned > MIN_TURN_ANGLE) * (
+                f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
+                'imu/data_raw advanced faster or slower for a time than before: check that the '
+                'driver stamps by a clock and loses no samples, then reset the heading'),
+            'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came) * (
+                describe_odometry_clock(late)),
+            'odometry': self._is_odometry_contradictory * (
+                'odom turns by its headings while its rate is zero: check its twist, without '
+                'which it does not show that the robot stands'),
+            'standstill': (self._false_turn[1] > 0.0) * (
+                f'the gyro turned by {self._false_turn[1] / DEGREE:.1f} deg while odom shows that '
+                'the robot stands: unless others turn it, call calibrate_bias, or check odom')}
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel, also one of this node."""
@@ -364,10 +364,16 @@ class Pipeline:
                              'time; the sample is not used')
             return None
         silence = now - self._last_arrival
-        if self._is_late(stamp, frame):
+        if self.publisher_conflict:
+            self._order = ArrivalOrder()
+        elif self._order.is_late(stamp) and frame == self._frame:
             journal.event = ('a sample came after the next one and is not used: the connection to '
                              'the driver changes their order')
+            if self._order.has_two_clocks:
+                self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
             return None
+        if missing := self._order.missing_duration:
+            self.estimator.tracker.add_unknown_turn(1e-9 * missing * abs(self.estimator.rate))
         self._detect_several_gyros(stamp, frame, now, silence)
         if 0.0 < (interval := 1e-9 * (stamp - self._last_stamp)) <= self.values.maximum_gap:
             self._intervals.add(interval)
@@ -380,24 +386,9 @@ class Pipeline:
             self._update_host_clock()
             time = self._host_time.convert_sample(
                 time, self._last_time, self._intervals.usual_interval, silence)
-        if time == self._last_time:
+        if self._is_repeated_stamp(time, stamp, output, now):
             counts['repeated_stamps'] += 1
-            first, fastest = self._frozen_stamp or (now, 0.0)
-            self._frozen_stamp = first, max(fastest, abs(output))
-            journal.event = (
-                f'the stamp stands still at {stamp / NSEC_PER_SEC:.3f} s; the sample is not used: '
-                'check that the driver stamps its samples'
-                if now - first > FAULT_DURATION else
-                f'several samples have the stamp {stamp / NSEC_PER_SEC:.3f} s, as where a driver '
-                'stamps a queue on its arrival; only the first of them is used: stamp when the '
-                'gyro measures')
             return None
-        if self._frozen_stamp is not None:
-            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
-            if now - first > FAULT_DURATION:
-                self.estimator.tracker.add_unknown_turn(min(fastest * (now - first), math.tau))
-                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                 'came; turns in this time are not in the heading')
         interval = time - self._last_time
         # Perhaps a loss of power; after a mere delay the stamps continue.
         if (now - journal.last_received > _POWER_OFF_SILENCE and interval < math.inf
@@ -424,23 +415,27 @@ class Pipeline:
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
 
-    def _is_late(self, stamp: int, frame: str) -> bool:
-        """Tell whether a sample was overtaken by the last ones, whose stamps left a gap for it."""
-        stamps, usual = self._stamps, self._intervals.usual_interval
-        behind = 1e-9 * (max(stamps, default=stamp) - stamp)
-        # Before the usual interval is known, what is behind waits; a jump back of the clock shows
-        # when all of the last stamps are beyond it. Two gyros of the same rate leave no gap of one
-        # and a half intervals.
-        is_late = behind > 0.0 and frame == self._frame and not self.publisher_conflict and (
-            usual == math.inf or behind < _MAX_LATE_SAMPLES * usual and min(stamps) < stamp
-            and 1e-9 * min(abs(each - stamp) for each in stamps) > 0.75 * usual)
-        stamps.append(stamp)
-        return is_late
+    def _is_repeated_stamp(self, time: float, stamp: int, output: float, now: float) -> bool:
+        """Tell whether a sample has the time of the last one; add what turned meanwhile, after."""
+        first, fastest = self._frozen_stamp or (now, 0.0)
+        lasts, text = now - first, f'{stamp / NSEC_PER_SEC:.3f} s'
+        if time == self._last_time:
+            self._frozen_stamp = first, max(fastest, abs(output))
+            self.journal.event = (
+                f'the stamp stands still at {text}; the sample is not used: check that the driver '
+                'stamps its samples' if lasts > FAULT_DURATION else
+                f'several samples have the stamp {text}, as where a driver stamps a queue on its '
+                'arrival; only the first of them is used: stamp when the gyro measures')
+            return True
+        self._frozen_stamp = None
+        if lasts > FAULT_DURATION:
+            self.estimator.tracker.add_unknown_turn(min(fastest * lasts, math.tau))
+            self.journal.event = (f'the stamps stood still for {lasts:.1f} s while samples came; '
+                                  'turns in this time are not in the heading')
+        return False
 
     def _detect_several_gyros(self, stamp: int, frame: str, now: float, silence: float) -> None:
-        """Detect stamps that jump back, frames that alternate, and samples that interleave."""
-        if stamp < self._last_stamp:
-            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
+        """Detect frames that alternate, and samples of two publishers that interleave."""
         if frame != self._frame:
             before, self._frame = self._frame, frame
             if before is None:
@@ -451,14 +446,14 @@ class Pipeline:
                     'imu/data_raw'))
         if not self.publisher_conflict:
             return
-        # Samples that follow too soon are not of the same publisher. A restarted driver that sends
-        # twice as fast as before is refused while the middleware lists the killed one. Delayed
-        # samples also follow too soon, until they have caught up.
+        # Samples that follow too soon, or go back, are not of the same publisher. A restarted
+        # driver that sends twice as fast as before is refused while the middleware lists the
+        # killed one. Delayed samples also follow too soon, until they have caught up.
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
         interval, behind = stamp - self._last_stamp, self._backlog
         self._backlog = 0.0 if silence > FAULT_DURATION else min(
             max(behind + interval - usual, 0.0), NSEC_PER_SEC * FAULT_DURATION)
-        self._interleaved_count += not (2.0 * interval > usual or behind)
+        self._interleaved_count += interval < 0 or not (2.0 * interval > usual or behind)
         if self._interleaved_count > 1:
             self._refuse_all(self.publisher_conflict)
 
@@ -548,8 +543,10 @@ class Pipeline:
         """Detect repeated values and pulses, and add an unknown turn to the heading."""
         outliers, self._outlier_count = self._outlier_count, self.estimator.tracker.outlier_count
         pulse, size = self._pulse_detector.add(time, output)
-        is_repeated = self.repeat_detector.add(time, output, self.wheels.turn_rate(now),
-                                               self.monitor.has_noise_at_rest)
+        stands = self.wheels.is_moving(now) is False
+        is_repeated = self.repeat_detector.add(
+            time, output, self.wheels.turn_rate(now), self.monitor.has_noise_at_rest, stands,
+            stands or self.estimator.tracker.is_resting)
         self.repeat_suspicion = (
             f'the gyro repeats the rate {output:g} rad/s without the noise of its model: it is '
             'dead, or shows this at rest; turn the robot to find out'
@@ -655,6 +652,7 @@ class Pipeline:
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
+        self.repeat_detector.reset_heading()
         self.stamp_delay, self._trusted_heading = self._new_stamp_delay(), (0.0, 0.0)
         if self.conflict or self.repeat_fault:  # turns are not measured now
             self.estimator.set_heading(0.0, math.tau ** 2)

@@ -440,6 +440,14 @@ def test_odometry_is_a_reference(tmp_path, has_yaw):
     assert kept.standard_deviations[0] > 0.0099 * (1 + SCALE), 'no run is better than its odometry'
 
 
+@pytest.mark.parametrize('scale', [-0.31, -0.28, 0.28, 0.31])
+def test_a_scale_factor_error_by_odometry_has_one_limit_for_both_signs(tmp_path, scale):
+    rig = rested(tmp_path, robot=Robot(scale_factor_error=scale), calibration_reference=ODOMETRY)
+    turn_to_and_fro(rig, 13.5)
+    success, message = rig.session.conclude()
+    assert success == (abs(scale) < 0.3) != ('% is beyond 30 %' in message), message
+
+
 @pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
                                            (lambda given: given[:20],
                                             '20 messages came on odom, but in 0 s of 20 s only'),
@@ -488,6 +496,7 @@ def test_a_clock_or_gap_of_odometry_is_named_as_the_cause_of_a_refusal(
     assert ('odom is stamped' in rig.pipeline.faults['odometry_clock']) == bool(late)
     success, message = rig.session.conclude()
     assert reason in message and success != bool(reason), message
+    assert 'line and rate' not in message, 'of the gyro'
 
 
 @pytest.mark.parametrize('turns', [
@@ -536,7 +545,12 @@ def test_odometry_that_is_computed_from_the_gyro_is_no_reference(tmp_path):
 
 def test_odometry_may_be_finished_early(tmp_path):
     rig = rested(tmp_path, calibration_reference=ODOMETRY, calibration_duration=600.0)
-    turn_to_and_fro(rig, 3.0)
+    rig.begin(ODOMETRY)
+    rig.turn(0.6, 2.0)
+    success, message = rig.session.finish()
+    assert not success and 'and one by odometry 5 s at least' in message and not rig.ended
+    for rate, seconds in ((0.0, 3.0), (-0.6, 4.0), (0.0, 3.0)):
+        rig.turn(rate, seconds)
     assert rig.session.finish() == (True, 'leave the robot at rest for 4.0 s more')
     rig.go(1.0)
     assert rig.session.finish() == (True, 'leave the robot at rest for 3.0 s more')

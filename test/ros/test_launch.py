@@ -107,3 +107,8 @@ class TestEnd(unittest.TestCase):
     def test_all_end_with_code_0(self, proc_info):
         import launch_testing.asserts
         launch_testing.asserts.assertExitCodes(proc_info)
+
+    def test_the_demo_reports_no_error(self, proc_output):
+        lines = [line for output in proc_output for line in output.text.decode().splitlines()]
+        assert not [line for line in lines if '[ERROR]' in line and '[driver_node]' in line]
+        assert any('samples of kvh_dsp3000 come' in line for line in lines)
