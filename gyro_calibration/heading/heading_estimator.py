@@ -214,8 +214,8 @@ class HeadingEstimator:
         here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
         self._follows_temperature = here is not None
         if here is not None and coefficient and not self.table.entries:
-            # what a model explains of the temperature, it leaves no more of than that
-            explained = self._largest_bias_slope(here)
+            # what a model explains of the temperature, with whatever sign, it leaves at most twice
+            explained = 2.0 * self._largest_bias_slope(here)
             coefficient *= max(coefficient / explained, 1.0) if explained else 1.0
         self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
                             if here is not None and coefficient else None)

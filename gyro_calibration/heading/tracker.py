@@ -48,9 +48,9 @@ MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 _STEP_DURATION = MEAN_LAGS[0]
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
 _BIAS_MARGIN_SIGMAS = 4.0
-#: Change of the bias that is assumed from one stop of the wheels to the next, rad/s, and over the
-#: longest lag while they stand; largest delay of odometry after the begin of a turn, s.
-_WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
+#: Change of the bias that is assumed from one stop of the wheels to the next, rad/s; least time in
+#: which it may come while they stand, s; largest delay of odometry after the begin of a turn, s.
+_WHEEL_BIAS_CHANGE, _WHEEL_CHANGE_DURATION, _WHEEL_DELAY = 0.2 * DEGREE, 16.0, 4.0
 #: Share of sudden changes of the rate while the wheels stand that are changes of the bias. A floor
 #: that turns, or wheels that creep or are pushed, are assumed to be ten times more frequent.
 _CHANGE_SHARE = 0.1
@@ -146,11 +146,16 @@ class HeadingTracker:
                                     age if len(covariance) else None)
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
-        # Probability of another power-on, until rests that wheels show decide it.
-        self._turn_on_probability, self._has_rested = 0.5, False
+        # Probability of another power-on, by this rest and before it, until rests that wheels show
+        # decide it.
+        self._turn_on_probability = self._earlier_probability = 0.5
+        self._has_rested = False
         # Rates at which the wheels have stood since they moved last, s, and before, rad/s.
         self._standing_rates, self._standing_since = list[float](), math.nan
         self._earlier_rate, self._standing_ambiguity = math.nan, 0.0
+        # When a rate began suddenly after a rest of the standing wheels, until it is decided, and
+        # when such a rest was last known, s.
+        self._sudden_time = self._settled_time = -math.inf
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         # None with wheels, which tell of rests
         self._steady_rates: SteadyRates | None = SteadyRates(
@@ -259,8 +264,7 @@ class HeadingTracker:
     @property
     def _ambiguity_begin_time(self) -> float:
         """Return since when the heading contains `bias_ambiguity`, s."""
-        return (max(self._heading_begin_time, self._motion_start_time)
-                if self._steady_rates is None and self._has_rested else self._heading_begin_time)
+        return max(self._heading_begin_time, self._sudden_time)
 
     # Samples
 
@@ -557,6 +561,11 @@ class HeadingTracker:
                     self._begin_rest_again()
                 else:
                     self._compare_means(wheels)
+                    if (wheels is False and self._sudden_time > -math.inf and self.is_resting
+                            and self._rest_integral.duration >= _WHEEL_DELAY):
+                        # what turned may have been a change of the bias that has ended
+                        self._end_sudden_turn(self._standing_ambiguity * self._is_turned)
+                        self._enter_rest()
             return
         if not quiet or wheels:
             self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
@@ -583,10 +592,10 @@ class HeadingTracker:
         difference, variance = _rate_difference(self._state, still)
         is_expected = difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance
         repeats = wheels is False and self._repeats_standing(held, is_expected)
-        change = 0.0
-        if repeats and not self._has_rested:
+        change, stands = 0.0, wheels is False and not self._is_turned
+        if repeats:
             change = math.sqrt(TURN_ON_RATIOS[-1]) * turn_on
-        elif repeats or wheels is False and not self._stands_since_rest:
+        elif stands:
             change = _WHEEL_BIAS_CHANGE
         is_after_slow_turn = self._quiet_duration > WINDOW_DURATION
         sigmas = (0.5 if is_after_slow_turn else 1.0) * self._sigmas[self._quiet_duration]
@@ -595,9 +604,8 @@ class HeadingTracker:
                 self._enter_motion(self._quiet_duration)
             return
         self._advance_state(held)
-        # what turned while the wheels stood may have been a change of the bias that has ended
-        of_bias, of_heading = 0.0, self._standing_ambiguity if self._stands_since_rest else 0.0
-        lasts = (wheels is False and not is_expected and not self._stands_since_rest
+        change = 0.0
+        lasts = (stands and not is_expected
                  and self._last_time - self._wheel_motion_time >= _WHEEL_DELAY)
         if self._turn_on_probability > CHANGE_PROBABILITY or not self._has_rested and (
                 repeats or lasts and self._agrees_with(
@@ -605,20 +613,39 @@ class HeadingTracker:
             # the bias is that of another power-on
             self._change_bias(0.0, max(difference ** 2, turn_on ** 2), still)
             self._turn_on_probability, self._has_rested = 0.0, True
-        elif lasts or repeats:  # only the wheels explain it; it may have come since the last rest
-            of_bias = of_heading = difference
-        self._has_rested |= is_expected or bool(of_bias)
-        if self._has_rested:
-            self._standing_ambiguity = 0.0
-        self._state = self._state.with_added_variance(
-            HEADING_INDEX, (of_heading * (self._last_time - self._motion_start_time)) ** 2)
-        self._enter_rest(of_bias)
+        elif lasts or repeats:
+            change = difference  # that only the wheels explain
+        self._has_rested |= is_expected or bool(change)
+        if self._sudden_time > -math.inf:
+            if change:
+                self._end_sudden_turn(change)
+        else:
+            if self._has_rested:
+                self._standing_ambiguity = 0.0
+            # it may have come at any time since the last rest
+            self._state = self._state.with_added_variance(
+                HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
+        self._enter_rest(change)
         self._rest_blocks.extend([*self._recent_blocks][1:])
 
     @property
-    def _stands_since_rest(self) -> bool:
-        """Tell whether the wheels have not moved since the last rest, whose bias is known."""
-        return self._has_rested and self._wheel_motion_time < self._motion_start_time
+    def _is_turned(self) -> bool:
+        """Tell whether the wheels have not moved since a rate began suddenly."""
+        return self._wheel_motion_time < self._sudden_time
+
+    def _has_settled(self, snapshot: Snapshot) -> bool:
+        """Tell whether the bias in use was seen in this standstill, before a state at the last."""
+        return (self._wheel_motion_time < self._settled_time
+                or snapshot.rate_integral.duration >= _WHEEL_DELAY)
+
+    def _end_sudden_turn(self, rate: float) -> None:
+        """Add the variance of a turn at a rate, rad/s, since a rate began suddenly."""
+        begin, end = self._ambiguity_begin_time, self._last_time
+        if self.is_resting:
+            end -= self._rest_integral.duration
+        self._state = self._state.with_added_variance(HEADING_INDEX, (rate * (end - begin)) ** 2)
+        self._sudden_time, self._standing_ambiguity = -math.inf, 0.0
+        self._settled_time = self._last_time
 
     def _repeats_standing(self, turn: RateIntegral, is_expected: bool) -> bool:
         """Keep an unexpected rate while wheels stand; tell whether they stood so before."""
@@ -631,9 +658,12 @@ class HeadingTracker:
                 self._earlier_rate = float(np.median(self._standing_rates))
             self._standing_rates, self._standing_since = [], self._wheel_motion_time
         self._standing_rates.append(turn.angle / turn.duration)
-        if not self._has_rested or self._stands_since_rest:
-            self._standing_ambiguity = abs(float(np.median(self._standing_rates))) * (
-                math.sqrt(_CHANGE_SHARE) if self._has_rested else 1.0)
+        if not self._has_rested or self._is_turned:
+            rate = abs(float(np.median(self._standing_rates)))
+            if self._is_turned:  # a faster one is no bias
+                rate *= math.sqrt(_CHANGE_SHARE) * (
+                    rate < self._sigmas[WINDOW_DURATION] * _WHEEL_BIAS_CHANGE)
+            self._standing_ambiguity = rate
             self._state_version += 1
         return self._agrees_with(self._earlier_rate, turn)
 
@@ -644,14 +674,16 @@ class HeadingTracker:
 
     def _find_other_power_on(self) -> bool:
         """Tell whether the rate of a rest that wheels show is that of another power-on."""
-        if not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY:
+        if (not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY
+                or self._sudden_time > -math.inf):  # it changed since
             return False
         difference, variance = _rate_difference(
             self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))
         # of the calibration, and of other power-ons, which together are as probable
         variances = variance + self._settings.turn_on ** 2 * np.append(0.0, TURN_ON_RATIOS)
-        chances = softmax(-0.5 * (difference ** 2 / variances + np.log(variances))
-                          + np.log(np.append(1.0, TURN_ON_SHARES)))
+        chances = softmax(-0.5 * (difference ** 2 / variances + np.log(variances)) + np.log(
+            np.append(1.0 - self._earlier_probability,
+                      self._earlier_probability * TURN_ON_SHARES)))
         self._turn_on_probability = float(chances[1:].sum())
         if self._turn_on_probability < (1.0 - CHANGE_PROBABILITY) ** 2:
             self._turn_on_probability = 0.0
@@ -719,14 +751,16 @@ class HeadingTracker:
                              * before.state.noise.angle_random_walk ** 2)
             if abs(turn.angle - expected) > self._sigmas[lag] * math.sqrt(variance):
                 change = (turn.angle - expected) / turn.duration
-                # a bias changes slowly, a turn begins at once
-                is_sudden = self._has_rested and abs(change) > (
-                    _WHEEL_BIAS_CHANGE * max(lag, _WHEEL_DELAY) / MEAN_LAGS[-1])
+                # a bias changes slowly; of a standstill that began with it this is not known
+                is_sudden = self._has_settled(before) and abs(change) > (
+                    _WHEEL_BIAS_CHANGE * max(lag, _WHEEL_DELAY) / _WHEEL_CHANGE_DURATION)
                 if wheels is not False or is_sudden:
                     self._revert_to_motion(lag)
                 elif lag < _WHEEL_DELAY:
                     continue
                 else:
+                    if self._sudden_time > -math.inf:
+                        self._end_sudden_turn(change)
                     self._enter_rest(change)
                 return
 
@@ -759,6 +793,7 @@ class HeadingTracker:
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
         if self.is_resting and len(self._snapshots) > 1:
+            self._earlier_probability = self._turn_on_probability
             self._motion_start_time = self._last_time - self._open_integral.duration
         self.is_resting, self._quiet_duration = False, quiet_duration
         self._recent_blocks.clear()
@@ -785,7 +820,10 @@ class HeadingTracker:
         if self._steady_rates is not None:
             self._steady_rates.remove(turn)
         self._restore_steps(snapshot)
+        is_sudden = self._wheels_stand and self._has_settled(snapshot)
         self._enter_motion(max(lag, WINDOW_DURATION))
+        if is_sudden and not self._is_turned:
+            self._sudden_time = self._settled_time = self._motion_start_time
         self._advance_state()
 
     def _locate_motion_start(self, snapshot: Snapshot,
