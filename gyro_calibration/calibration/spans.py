@@ -654,7 +654,8 @@ def _find_code_changes(time: Array, output: Array, codes: Array) -> tuple[Array,
     middle = 0.5 * (time[begin] + time[end])
     bent = np.interp(middle, time, turned) - 0.5 * (turned[begin] + turned[end])
     apart = time[end] - time[begin]
-    passed = (codes[begin] != codes[end]) & (apart <= 1.5 * np.median(apart))
+    around = np.maximum(np.append(apart[1:], 0.0), np.append(0.0, apart[:-1]))
+    passed = (codes[begin] != codes[end]) & (apart <= 1.5 * around)
     at, reference = time.copy(), np.full(len(time), np.nan)
     at[begin] = middle
     reference[begin[passed]] = (0.5 * (codes[begin] + codes[end]) + bent)[passed]

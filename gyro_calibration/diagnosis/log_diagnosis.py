@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 import math
 
 from gyro_calibration.calibration.dwells import find_dwells, require_output
@@ -108,6 +109,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                 'or give the sample rate in Hz with --rate')
         found = replace(diagnose_table(logs[0], model, on_progress), logs=tuple(names))
         return _keep_unextended_model(found, given_model)
+    shown = names or [f'log {number}' for number in range(1, len(logs) + 1)]
+    _refuse_repeated_logs(logs, shown)
     on_progress(None, 'checks of the log')
     all_gates: list[Gate] = []
     for log in logs:
@@ -119,9 +122,11 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     given, remarks = logs, [remark for each in chosen for remark in each]
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
-        passed = examine_log(log, model, reference_kind == 'rate_command', given[place])
+        passed = _examine(log, model, reference_kind, given[place],
+                          shown[place] if len(logs) > 1 else '')
         if (mismatch := mismatch_diagnosis(passed, given_model)) is not None:
-            return replace(mismatch, logs=tuple(names[place:place + 1]))
+            return replace(mismatch, logs=tuple(names[place:place + 1]), remarks=(
+                *mismatch.remarks, *[f'This is of {shown[place]} alone.'] * (len(logs) > 1)))
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
     logs, slips = zip(*(_bridge_jumps(log, each.kind, remarks)
@@ -129,7 +134,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     limiting_logs = [place for place, log in enumerate(logs)
                      if not is_at_rest(log) and is_reference_limiting(log, references[place])]
     if limiting_logs:
-        _refuse_different_references(logs, references, names, limiting_logs[0])
+        _refuse_different_references(logs, references, shown, limiting_logs[0])
     try:
         found = (diagnose_by_noisy_reference(logs, references[0], model, on_progress, instants)
                  if limiting_logs else _diagnose_by_exact_reference(
@@ -145,19 +150,35 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         remarks=(*dict.fromkeys(remarks), *found.remarks)))
 
 
+def _refuse_repeated_logs(logs: Sequence[Log], names: Sequence[str]) -> None:
+    """Raise `DataRefused` if a log is given twice."""
+    for one, other in combinations(range(len(logs)), 2):
+        if np.array_equal(require_output(logs[one]), require_output(logs[other]), equal_nan=True):
+            raise DataRefused(f'{names[one]} and {names[other]} have the same output; give each '
+                              'log once')
+
+
+def _examine(log: Log, model: GyroModel | None, reference_kind: str | None, given: Log,
+             name: str) -> tuple[Gate, ...]:
+    """Return the gates of a log as `examine_log`; refusals begin with its name, if it has one."""
+    try:
+        return examine_log(log, model, reference_kind == 'rate_command', given)
+    except DataRefused as error:
+        raise DataRefused(f'{name}: {error}' if name else str(error)) from None
+
+
 def _refuse_different_references(logs: Sequence[Log], references: Sequence[Reference],
                                  names: Sequence[str], place: int) -> None:
     """Raise `DataRefused` if logs have references whose errors cannot be compared."""
     for other, log in enumerate(logs):
         if (references[other].kind != references[place].kind
                 or (log.reference_heading is None) != (logs[place].reference_heading is None)):
-            of_one, of_other = ([*names] or [f'log {number + 1}' for number in range(len(logs))]
-                                )[place], references[other].kind.replace('_', ' ')
+            one, another = (references[each].kind.replace('_', ' ') for each in (place, other))
             raise DataRefused(
-                f'the errors of the reference of {of_one} are larger than those of the gyro, and '
-                f'beside {references[place].kind.replace("_", " ")} a log with {of_other} cannot '
-                'be diagnosed together with it: give logs with one kind of reference (state it '
-                'with --reference-kind if it is the same), or diagnose each alone')
+                f'the errors of the reference of {names[place]} ({one}) are larger than those of '
+                f'the gyro, and {names[other]} ({another}) cannot be diagnosed together with it: '
+                'give logs with one kind of reference (state it with --reference-kind if it is '
+                'the same), or diagnose each alone')
 
 
 def _keep_unextended_model(found: Diagnosis, model: GyroModel | None) -> Diagnosis:

@@ -169,9 +169,17 @@ def _fit_joined(logs: Sequence[Log], kind: str, prior: Array | None,
                 instants: Sequence[OwnInstants | None], each_alone: Sequence[SpanFit]) -> SpanFit:
     """Fit scale factor error, bias and delay to logs with the same quantity as the reference."""
     delays = [float(fit.values[2]) for fit in each_alone]
-    has_one_clock = kind in _SAME_CLOCK
+    has_one_clock = kind in _SAME_CLOCK and not _differ(
+        np.array(delays), np.array([fit.normal_covariance[2, 2] for fit in each_alone]))
     spans = lay_out_spans(join_logs(logs, instants, () if has_one_clock else delays), kind, prior)
     return fit_spans(replace(spans, delay=float(np.mean(delays))) if has_one_clock else spans)
+
+
+def _differ(values: Array, variances: Array) -> bool:
+    """Tell whether values of logs, shape (k,), differ beyond chance."""
+    mean = np.average(values, weights=1.0 / variances)
+    return bool(chi2.sf(np.sum((values - mean) ** 2 / variances),
+                        max(len(values) - 1, 1)) < FALSE_ALARM_RATE)
 
 
 def _withdraw_differing_causes(fit: SpanFit, found: list[SelectedCause],
@@ -186,12 +194,10 @@ def _withdraw_differing_causes(fit: SpanFit, found: list[SelectedCause],
             if len(alone.spans.time) > design_matrix(alone.spans, lasting).shape[1] + 1]
     differing = set[CauseTerm]()
     for term in lasting:
-        values = np.array([each.values[each.value_slice(term)] for each in fits])
-        weights = 1.0 / np.array([np.diag(each.normal_covariance)[each.value_slice(term)]
-                                  for each in fits])
-        mean = (weights * values).sum(axis=0) / weights.sum(axis=0)
-        square = float(np.sum(weights * (values - mean) ** 2))
-        if chi2.sf(square, max((len(fits) - 1) * values.shape[1], 1)) < FALSE_ALARM_RATE:
+        values, variances = np.moveaxis(np.array([
+            (each.values[own], np.diag(each.normal_covariance)[own])
+            for each in fits for own in [each.value_slice(term)]]), 1, 0)
+        if any(map(_differ, values.T, variances.T)):
             differing.add(term)
     if not differing:
         return fit, found
@@ -208,22 +214,35 @@ def _own_biases(fit: SpanFit) -> Array:
     return np.append(-others.sum(), others) + fit.values[1]
 
 
+def _power_on_variance(fit: SpanFit) -> float:
+    """Return by how much the bias of one more power-on differs from the mean of several."""
+    biases = _own_biases(fit)
+    count = len(biases)
+    return float(np.var(biases, ddof=1)) * (1.0 + 1.0 / count) if count > 1 else 0.0
+
+
 def _differences_of_logs(fit: SpanFit, each_alone: Sequence[SpanFit]) -> Iterator[str]:
     """Give what differs between logs, in words."""
     joined = fit.spans.joined
     if joined is None:
         return
     biases = ', '.join(f'{bias / DEGREE:.4g}' for bias in _own_biases(fit).tolist())
-    yield (f'Each log has a bias of its own: {biases} deg/s in turn; the model has their mean.')
+    yield (f'Each log has a bias of its own: {biases} deg/s in turn; the model has their mean, '
+           'and their scatter in its covariance.')
     if len(joined.delays):
         yield ('Each log has a delay by its own clock: '
                f'{", ".join(f"{1000.0 * delay:.4g}" for delay in joined.delays.tolist())} ms in '
                'turn, which is corrected.')
-    scales, deviations = (np.array([each[place] for each in (
-        (one.values[0], one.deviations[0]) for one in each_alone)]) for place in (0, 1))
-    weights = 1.0 / deviations ** 2
-    square = float(np.sum(weights * (scales - np.average(scales, weights=weights)) ** 2))
-    if chi2.sf(square, len(scales) - 1) < FALSE_ALARM_RATE:
+    missing = [name for name in MIN_CHANNEL_RANGE if getattr(fit.spans.log, name) is None
+               and any(getattr(each.spans.log, name) is not None for each in each_alone)]
+    if missing:
+        yield (f'Not every log has a {" and a ".join(missing).replace("_", " ")}, which is not '
+               'used; what it causes may be taken for a drift or a warm-up: give logs that have '
+               'it.')
+    scales, variances = np.array([(each.values[0], each.normal_covariance[0, 0])
+                                  for each in each_alone]).T
+    # another cause may differ between the motions of the logs
+    if _differ(scales, variances) and not any(each.cause in CAUSES for each in fit.causes):
         shown = ', '.join(f'{100.0 * scale:.3g} +- {100.0 * one.half_width(0):.2g}'
                           for scale, one in zip(scales.tolist(), each_alone))
         yield (f'The scale factor errors of the logs alone, {shown} %, differ beyond chance; the '
@@ -240,15 +259,18 @@ def _value_findings(fit: SpanFit, model: GyroModel | None,
         effective = float(fit.effective_stretches[place])
         if name != 'time_offset' and model is None or effective < MIN_STRETCHES:
             continue
+        if name == 'time_offset' and fit.spans.joined is not None and len(
+                fit.spans.joined.delays):  # each log has its own
+            continue
         value, variance = float(fit.values[place]), float(fit.covariance[place, place])
         if name == 'bias' and model is not None:
             # the mean bias of a log differs from that of the model by bias wander; beside a
             # course, the variance contains that of the log
             duration = float(fit.spans.time[-1] - fit.spans.time[0])
             shown = [_gyro_noise(fit)] if fit.spans.treatment.is_fine else []
-            variance += max(2.0 / math.pi * each.bias_instability ** 2
-                            + each.rate_random_walk ** 2 * duration / 3.0
-                            for each in (*shown, model.noise))
+            variance += _power_on_variance(fit) + max(
+                2.0 / math.pi * each.bias_instability ** 2
+                + each.rate_random_walk ** 2 * duration / 3.0 for each in (*shown, model.noise))
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         # a delay between two clocks is usual
         is_usual = name == 'time_offset' and own_clock
@@ -384,7 +406,9 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, logs: Sequence[Log],
             terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
             indices += of_term
     outputs = [log.output for log in logs if log.output is not None]
-    new = add_terms(base_model, terms, indices, fit.normal_covariance * np.outer(slopes, slopes),
+    covariance = fit.normal_covariance.copy()
+    covariance[1, 1] += _power_on_variance(fit)
+    new = add_terms(base_model, terms, indices, covariance * np.outer(slopes, slopes),
                     [each[np.isfinite(each)] for each in outputs],
                     [log.temperature for log in logs if log.temperature is not None])
     return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
@@ -463,7 +487,8 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
         if not len(of_part['given'][1]):
             return None
         errors.append(of_part)
-    which = 'the log' if spans.joined is None else 'the logs'
+    which = ('the log' if spans.joined is None
+             else 'the logs, each with its own bias,')
     return gain_from_errors(f'each of {parts} parts of {which} in turn, the others being fitted',
                             errors, 'given', window)
 

@@ -379,15 +379,15 @@ class TurnComparison:
             between, shown = math.sqrt(confused), f'{ratio:.2g} times what {source} shows'
             is_wrong = (ratio > between and (is_odometry or ratio * rate > confused)
                         or is_odometry and ratio < -0.5)
-            self._take('turn', is_wrong * (f'{shown}: check the unit and the sense of rotation '
+            self._check('turn', is_wrong * (f'{shown}: check the unit and the sense of rotation '
                                             f'of the gyro, and those of {source}'))
             is_smaller = is_odometry and abs(ratio) < 1.0 / between
             if not is_smaller or abs(self._by_wheels) > between * self._duration:
-                self._take('unit', is_smaller * (f'{shown}: check the unit of odom, as no robot '
+                self._check('unit', is_smaller * (f'{shown}: check the unit of odom, as no robot '
                                                   'turns so fast'))
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
-    def _take(self, name: str, fault: str) -> None:
+    def _check(self, name: str, fault: str) -> None:
         """Take what a turn shows of a fault, or ''."""
         before, self._last_faults[name] = self._last_faults[name], fault
         self.faults[name] = fault and before and f'the gyro turns by {fault}'
@@ -398,7 +398,7 @@ class TurnComparison:
         self._stood_at, self._since_standstill = heading, 0.0
         if self._source == ODOMETRY and abs(by_wheels) > 1.0:  # rad
             ratio = turned / by_wheels
-            self._take('scale', (ratio > 1.0 + RunLimits.max_scale_factor_error) * (
+            self._check('scale', (ratio > 1.0 + RunLimits.max_scale_factor_error) * (
                 f'{ratio:.2f} times what odom shows: check the sensitivity of the gyro, and '
                 'diameter and distance of the wheels'))
 

@@ -11,6 +11,7 @@
 """The diagnosis by a course over ground: gaps, side slip, fixes and another clock."""
 
 from dataclasses import replace
+import math
 
 from chance import evidence, rms_bounds, seeds
 from diagnosed import established, judge_findings, log_of
@@ -492,7 +493,8 @@ def test_logs_have_a_bias_and_a_delay_of_their_own_and_share_the_rest(seed):
     estimates = {each[0]: each[2:4] for each in found.model.estimates()}
     for name, truth in (('bias', biases.mean()), ('scale_factor_error', SCALE)):
         assert abs(estimates[name][0] - truth) < 3.5 * estimates[name][1], name
-    assert estimates['bias'][1] < 0.02 * DEGREE
+    assert estimates['bias'][1] == pytest.approx(  # of one more power-on
+        math.sqrt(4.0 / 3.0) * biases.std(ddof=1), abs=0.03 * DEGREE)
     (remark,) = (each for each in found.remarks if 'bias of its own' in each)
     stated = [float(each) for each in remark.split(': ')[1].split(' deg/s')[0].split(', ')]
     assert stated == pytest.approx(biases / DEGREE, abs=0.05)
@@ -523,8 +525,27 @@ def test_several_logs_with_a_reference_that_errs_are_not_taken_for_exact():
     logs = [swing(seed, lambda time: 0.5 * np.sin(time), 1e-4, duration=30.0) for seed in (1, 2)]
     found = diagnose(logs, np.random.default_rng(0))
     assert not established(found), terminal_lines(found)
-    with pytest.raises(DataRefused, match='reference of log 1 are .* one kind of reference'):
+    with pytest.raises(DataRefused, match='reference of log 1 .* one kind of reference'):
         diagnose([logs[0], drive(1)], np.random.default_rng(0))
+    with pytest.raises(DataRefused, match='log 1 and log 2 have the same output'):
+        diagnose([logs[0], logs[0]], np.random.default_rng(0))
+
+
+def test_logs_of_an_encoder_at_other_sample_rates_have_delays_of_their_own():
+    generator, logs = np.random.default_rng(3), []
+    for hertz, late, bias in ((100.0, 0.002, 0.1), (25.0, 0.02, 0.4)):
+        time = np.arange(0.0, 120.0, 1.0 / hertz)
+        heading = 2.0 * np.sin(0.5 * time) + 3.0 * np.sin(0.17 * time)
+        rate = np.cos(0.5 * (time - late)) + 0.51 * np.cos(0.17 * (time - late))
+        logs.append(Log(time=time, reference_heading=0.5 * DEGREE * np.rint(
+            heading / (0.5 * DEGREE)), output=(1.0 + SCALE) * rate + bias * DEGREE
+            + 1e-4 * math.sqrt(hertz) * generator.standard_normal(len(time))))
+    found = diagnose(logs, np.random.default_rng(0), reference_kind='encoder')
+    (delays,) = (each for each in found.remarks if 'delay by its own clock' in each)
+    stated = [float(each) for each in delays.split(': ')[1].split(' ms')[0].split(', ')]
+    assert stated == pytest.approx([2.0, 20.0], abs=1.0)
+    assert value(found.model, 'bias') == pytest.approx(0.25 * DEGREE, abs=0.01 * DEGREE)
+    assert value(found.model, 'scale_factor_error') == pytest.approx(SCALE, abs=1e-3)
 
 
 @pytest.mark.parametrize('seed', seeds(3))
