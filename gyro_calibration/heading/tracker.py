@@ -675,7 +675,8 @@ class HeadingTracker:
     def _find_other_power_on(self) -> bool:
         """Tell whether the rate of a rest that wheels show is that of another power-on."""
         if (not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY
-                or self._sudden_time > -math.inf):  # it changed since
+                or self._settled_time > self._wheel_motion_time
+                or self._sudden_time > -math.inf):  # the bias in use was seen before
             return False
         difference, variance = _rate_difference(
             self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))
