@@ -193,7 +193,8 @@ def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
                                         stands=spans.stands[spans.stands]), causes,
                                 point_variances)
     rates = np.array([spans.output[first:last].mean() for first, last in spans.rests])
-    agree = spans.stands | (np.abs(rates - by_course.values[1]) < by_course.half_width(1))
+    biases = spans.biases(by_course.values, causes)[spans.rests[:, 0]]
+    agree = spans.stands | (np.abs(rates - biases) < by_course.half_width(1))
     return replace(spans, rests=spans.rests[agree], stands=spans.stands[agree])
 
 

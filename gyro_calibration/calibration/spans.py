@@ -424,6 +424,12 @@ class Spans:
             turned *= self.joined.find(of_rows)[:, None] == self.joined.find(times)
         return np.asarray(-turned * self.is_measured[:, None])
 
+    def biases(self, values: Array, causes: Sequence[CauseTerm]) -> Array:
+        """Return the bias in each sample, which is that of its log, rad/s, shape (m,)."""
+        return values[1] + sum((values[self.value_slice(causes, each)] * self._of_log(each)
+                                for each in causes if each.cause == OWN_BIAS),
+                               np.zeros(len(self.stamps)))
+
     def with_corrected_rate(self, values: Array, causes: Sequence[CauseTerm] = ()) -> Spans:
         """
         Return the spans with the rate corrected for scale factor error, bias, delay and causes.
@@ -431,13 +437,11 @@ class Spans:
         These are the causes that depend on the rate. Delay and clock rate are added to those of
         spans.
         """
-        errors, clock_rate = values[1], self.clock_rate
+        errors, clock_rate = self.biases(values, causes), self.clock_rate
         for cause in causes:
             own = values[self.value_slice(causes, cause)]
             if cause == _CLOCK_TERM:
                 clock_rate += float(own[0])
-            elif cause.cause == OWN_BIAS:
-                errors = errors + own * self._of_log(cause)
             elif (cause.cause in CATALOGUE.keys() - {'bandwidth'}
                     and 'rate' in CATALOGUE[cause.cause].inputs):
                 errors = errors + sum(size * column for size, column in zip(
