@@ -228,7 +228,7 @@ def _differences_of_logs(fit: SpanFit, each_alone: Sequence[SpanFit]) -> Iterato
         return
     biases = ', '.join(f'{bias / DEGREE:.4g}' for bias in _own_biases(fit).tolist())
     yield (f'Each log has a bias of its own: {biases} deg/s in turn; the model has their mean, '
-           'and their scatter in its covariance.')
+           'and their scatter in its covariance. Curves over time are those of the first log.')
     if len(joined.delays):
         yield ('Each log has a delay by its own clock: '
                f'{", ".join(f"{1000.0 * delay:.4g}" for delay in joined.delays.tolist())} ms in '
