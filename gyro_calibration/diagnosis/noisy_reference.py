@@ -122,8 +122,7 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
         # causes that do not improve the prediction are not added to the model
         model_fit = plain
         if not plain.spans.treatment.is_fine:
-            found = [replace(each, is_established=each.is_established
-                             and _term_of(each.cause).is_single_event) for each in found]
+            found = _suspect(found, lasting_terms)
             extended = fit_spans(plain.spans, events) if events else plain
         gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
@@ -201,10 +200,14 @@ def _withdraw_differing_causes(fit: SpanFit, found: list[SelectedCause],
             differing.add(term)
     if not differing:
         return fit, found
-    left = [each for each in established if each not in differing]
-    return fit_spans(fit.spans, left), [
-        replace(each, is_established=each.is_established and _term_of(each.cause) in left)
-        for each in found]
+    return (fit_spans(fit.spans, [each for each in established if each not in differing]),
+            _suspect(found, differing))
+
+
+def _suspect(found: Sequence[SelectedCause], terms: Collection[CauseTerm]) -> list[SelectedCause]:
+    """Return causes, of which some are no longer established."""
+    return [replace(each, is_established=each.is_established
+                    and _term_of(each.cause) not in terms) for each in found]
 
 
 def _own_biases(fit: SpanFit) -> Array:
@@ -775,8 +778,7 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
                     key=lambda each: _implausibility(extended, each, false_alarm_rate))
         if _implausibility(extended, worst, false_alarm_rate) < 1.0:
             return extended, found
-        found = [replace(each, is_established=each.is_established
-                         and _term_of(each.cause) != worst) for each in found]
+        found = _suspect(found, [worst])
     return fit, found
 
 

@@ -561,7 +561,7 @@ class HeadingTracker:
                     self._begin_rest_again()
                 else:
                     self._compare_means(wheels)
-                    if (wheels is False and self._sudden_time > -math.inf and self.is_resting
+                    if (wheels is False and self._is_undecided and self.is_resting
                             and self._rest_integral.duration >= _WHEEL_DELAY):
                         # what turned may have been a change of the bias that has ended
                         self._end_sudden_turn(self._standing_ambiguity * self._is_turned)
@@ -616,7 +616,7 @@ class HeadingTracker:
         elif lasts or repeats:
             change = difference  # that only the wheels explain
         self._has_rested |= is_expected or bool(change)
-        if self._sudden_time > -math.inf:
+        if self._is_undecided:
             if change:
                 self._end_sudden_turn(change)
         else:
@@ -627,6 +627,11 @@ class HeadingTracker:
                 HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
         self._enter_rest(change)
         self._rest_blocks.extend([*self._recent_blocks][1:])
+
+    @property
+    def _is_undecided(self) -> bool:
+        """Tell whether it is open if a rate that began suddenly was a turn or a bias."""
+        return self._sudden_time > -math.inf
 
     @property
     def _is_turned(self) -> bool:
@@ -675,8 +680,8 @@ class HeadingTracker:
     def _find_other_power_on(self) -> bool:
         """Tell whether the rate of a rest that wheels show is that of another power-on."""
         if (not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY
-                or self._settled_time > self._wheel_motion_time
-                or self._sudden_time > -math.inf):  # the bias in use was seen before
+                or self._wheel_motion_time < self._settled_time
+                or self._is_undecided):  # the bias in use was seen before
             return False
         difference, variance = _rate_difference(
             self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))
@@ -760,7 +765,7 @@ class HeadingTracker:
                 elif lag < _WHEEL_DELAY:
                     continue
                 else:
-                    if self._sudden_time > -math.inf:
+                    if self._is_undecided:
                         self._end_sudden_turn(change)
                     self._enter_rest(change)
                 return
