@@ -11,6 +11,6 @@
 """
 Rates to heading: gaps, integration, standstill, bias, and the uncertainty of the result.
 
-Reading order: `integration`, `kalman`, `stationary`, `steady_rates`, `tracker`,
-`bias_table`, `heading_estimator`, `log_compensation`.
+Reading order: `integration`, `kalman`, `stationary`, `steady_rates`, `standing_wheels`,
+`tracker`, `bias_table`, `heading_estimator`, `log_compensation`.
 """

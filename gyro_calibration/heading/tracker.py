@@ -29,17 +29,17 @@ from gyro_calibration.heading.integration import (
     TIME_TOLERANCE, varied_variance)
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, STANDSTILL, TrackStep, WALK_INDEX)
+from gyro_calibration.heading.standing_wheels import StandingWheels, WHEEL_DELAY
 from gyro_calibration.heading.stationary import (
     Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES, EnergyDetector, Epoch,
     EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SlowTurn,
     Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
-from gyro_calibration.heading.steady_rates import (
-    CHANGE_PROBABILITY, SteadyRates, TURN_ON_RATIOS, TURN_ON_SHARES)
+from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
-    Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, NORMAL_QUANTILE_975, Number)
+    Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, Number)
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.special import ndtri, softmax
+from scipy.special import ndtri
 
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
@@ -48,12 +48,6 @@ MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 _STEP_DURATION = MEAN_LAGS[0]
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
 _BIAS_MARGIN_SIGMAS = 4.0
-#: Change of the bias that is assumed from one stop of the wheels to the next, rad/s; least time in
-#: which it may come while they stand, s; largest delay of odometry after the begin of a turn, s.
-_WHEEL_BIAS_CHANGE, _WHEEL_CHANGE_DURATION, _WHEEL_DELAY = 0.2 * DEGREE, 16.0, 4.0
-#: Share of sudden changes of the rate while the wheels stand that are changes of the bias. A floor
-#: that turns, or wheels that creep or are pushed, are assumed to be ten times more frequent.
-_CHANGE_SHARE = 0.1
 #: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
 #: which on it is used, and factor of the thresholds of means.
 NOISE_TOLERANCE = 1.25
@@ -109,8 +103,8 @@ class HeadingTracker:
         self.recalibrations = list[tuple[int, HeadingState]]()
         self._interval, self.intervals = math.inf, Intervals()
         self._last_time = 0.0
-        # Begin of the motion since the last rest, and last time when the wheels did not stand, s.
-        self._motion_start_time = self._wheel_motion_time = 0.0
+        self._motion_start_time = 0.0  # of the motion since the last rest, s
+        self._standing = StandingWheels(settings.turn_on)
         self._last_sample: tuple[float, float, float, Array] | None = None
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
         # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump, and turn
@@ -146,16 +140,7 @@ class HeadingTracker:
                                     age if len(covariance) else None)
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
-        # Probability of another power-on, by this rest and before it, until rests that wheels show
-        # decide it.
-        self._turn_on_probability = self._earlier_probability = 0.5
-        self._has_rested = False
-        # Rates at which the wheels have stood since they moved last, s, and before, rad/s.
-        self._standing_rates, self._standing_since = list[float](), math.nan
-        self._earlier_rate, self._standing_ambiguity = math.nan, 0.0
-        # When a rate began suddenly after a rest of the standing wheels, until it is decided, and
-        # when such a rest was last known, s.
-        self._sudden_time = self._settled_time = -math.inf
+        self._standing.reset()
         self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         # None with wheels, which tell of rests
         self._steady_rates: SteadyRates | None = SteadyRates(
@@ -254,7 +239,7 @@ class HeadingTracker:
     @property
     def bias_ambiguity(self) -> float:
         """Return the deviation, rad/s, of the bias if another steady rate was that of a rest."""
-        return (self._standing_ambiguity if self._steady_rates is None
+        return (self._standing.ambiguity if self._steady_rates is None
                 else math.sqrt(self._steady_rates.variance))
 
     def ambiguity_variance(self, time: Number) -> Number:
@@ -264,7 +249,7 @@ class HeadingTracker:
     @property
     def _ambiguity_begin_time(self) -> float:
         """Return since when the heading contains `bias_ambiguity`, s."""
-        return max(self._heading_begin_time, self._sudden_time)
+        return max(self._heading_begin_time, self._standing.sudden_time)
 
     # Samples
 
@@ -314,7 +299,7 @@ class HeadingTracker:
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
             self._remember([time], [rate])
-            self._last_time = self._motion_start_time = self._wheel_motion_time = time
+            self._last_time = self._motion_start_time = self._standing.motion_time = time
             self._heading_begin_time = time
             self.rate = rate - self._rate_error(sensitivity)
             return ''
@@ -543,7 +528,7 @@ class HeadingTracker:
         self._block, self._wheels_moved = Block(), False
         part = self._close_block()
         if wheels is not False:
-            self._wheel_motion_time = self._last_time
+            self._standing.motion_time = self._last_time
         if wheels is not None and self._steady_rates is not None:
             self._steady_rates = None
             if self.is_resting:  # with what the wheels show
@@ -561,10 +546,11 @@ class HeadingTracker:
                     self._begin_rest_again()
                 else:
                     self._compare_means(wheels)
-                    if (wheels is False and self._is_undecided and self.is_resting
-                            and self._rest_integral.duration >= _WHEEL_DELAY):
+                    standing = self._standing
+                    if (wheels is False and standing.is_undecided and self.is_resting
+                            and self._rest_integral.duration >= WHEEL_DELAY):
                         # what turned may have been a change of the bias that has ended
-                        self._end_sudden_turn(self._standing_ambiguity * self._is_turned)
+                        self._end_sudden_rate(standing.ambiguity * standing.is_turned)
                         self._enter_rest()
             return
         if not quiet or wheels:
@@ -588,15 +574,16 @@ class HeadingTracker:
     def _decide_on_rest(self, wheels: bool | None) -> None:
         """Begin a rest with the last blocks if their mean is that of a rest."""
         held = self._held_integral - self._recent_blocks[0]  # in which the robot may still move
-        still, turn_on = self._with_still_sensitivity(held), self._settings.turn_on
+        still = self._with_still_sensitivity(held)
         difference, variance = _rate_difference(self._state, still)
         is_expected = difference ** 2 < self._sigmas[WINDOW_DURATION] ** 2 * variance
-        repeats = wheels is False and self._repeats_standing(held, is_expected)
-        change, stands = 0.0, wheels is False and not self._is_turned
-        if repeats:
-            change = math.sqrt(TURN_ON_RATIOS[-1]) * turn_on
-        elif stands:
-            change = _WHEEL_BIAS_CHANGE
+        standing, repeats, change = self._standing, False, 0.0
+        if wheels is False:
+            ambiguity = standing.ambiguity
+            repeats = standing.add_rate(held, is_expected, self._state.noise,
+                                        self._sigmas[WINDOW_DURATION])
+            self._state_version += standing.ambiguity != ambiguity
+            change = standing.largest_change(repeats)
         is_after_slow_turn = self._quiet_duration > WINDOW_DURATION
         sigmas = (0.5 if is_after_slow_turn else 1.0) * self._sigmas[self._quiet_duration]
         if not difference ** 2 < sigmas ** 2 * (variance + change ** 2):
@@ -604,96 +591,38 @@ class HeadingTracker:
                 self._enter_motion(self._quiet_duration)
             return
         self._advance_state(held)
-        change = 0.0
-        lasts = (stands and not is_expected
-                 and self._last_time - self._wheel_motion_time >= _WHEEL_DELAY)
-        if self._turn_on_probability > CHANGE_PROBABILITY or not self._has_rested and (
-                repeats or lasts and self._agrees_with(
-                    float(np.median(self._standing_rates)), held)):
-            # the bias is that of another power-on
-            self._change_bias(0.0, max(difference ** 2, turn_on ** 2), still)
-            self._turn_on_probability, self._has_rested = 0.0, True
+        change, lasts = 0.0, (
+            wheels is False and not is_expected and standing.lasts(self._last_time))
+        if standing.is_first_bias(repeats, lasts, held, self._state.noise):
+            self._change_bias(0.0, standing.adopt_power_on(difference), still)
         elif lasts or repeats:
             change = difference  # that only the wheels explain
-        self._has_rested |= is_expected or bool(change)
-        if self._is_undecided:
+        standing.has_rested |= is_expected or bool(change)
+        if standing.is_undecided:
             if change:
-                self._end_sudden_turn(change)
+                self._end_sudden_rate(change)
         else:
-            if self._has_rested:
-                self._standing_ambiguity = 0.0
+            if standing.has_rested:
+                standing.ambiguity = 0.0
             # it may have come at any time since the last rest
             self._state = self._state.with_added_variance(
                 HEADING_INDEX, (change * (self._last_time - self._motion_start_time)) ** 2)
         self._enter_rest(change)
         self._rest_blocks.extend([*self._recent_blocks][1:])
 
-    @property
-    def _is_undecided(self) -> bool:
-        """Tell whether it is open if a rate that began suddenly was a turn or a bias."""
-        return self._sudden_time > -math.inf
-
-    @property
-    def _is_turned(self) -> bool:
-        """Tell whether the wheels have not moved since a rate began suddenly."""
-        return self._wheel_motion_time < self._sudden_time
-
-    def _has_settled(self, snapshot: Snapshot) -> bool:
-        """Tell whether the bias in use was seen in this standstill, before a state at the last."""
-        return (self._wheel_motion_time < self._settled_time
-                or snapshot.rate_integral.duration >= _WHEEL_DELAY)
-
-    def _end_sudden_turn(self, rate: float) -> None:
+    def _end_sudden_rate(self, rate: float) -> None:
         """Add the variance of a turn at a rate, rad/s, since a rate began suddenly."""
         begin, end = self._ambiguity_begin_time, self._last_time
         if self.is_resting:
             end -= self._rest_integral.duration
         self._state = self._state.with_added_variance(HEADING_INDEX, (rate * (end - begin)) ** 2)
-        self._sudden_time, self._standing_ambiguity = -math.inf, 0.0
-        self._settled_time = self._last_time
-
-    def _repeats_standing(self, turn: RateIntegral, is_expected: bool) -> bool:
-        """Keep an unexpected rate while wheels stand; tell whether they stood so before."""
-        # after wheels have stopped a body may creep on for a second, or be pushed
-        if is_expected:
-            self._standing_rates, self._earlier_rate = [], math.nan
-            return False
-        if self._standing_since != self._wheel_motion_time:
-            if self._standing_rates:
-                self._earlier_rate = float(np.median(self._standing_rates))
-            self._standing_rates, self._standing_since = [], self._wheel_motion_time
-        self._standing_rates.append(turn.angle / turn.duration)
-        if not self._has_rested or self._is_turned:
-            rate = abs(float(np.median(self._standing_rates)))
-            if self._is_turned:  # a faster one is no bias
-                rate *= math.sqrt(_CHANGE_SHARE) * (
-                    rate < self._sigmas[WINDOW_DURATION] * _WHEEL_BIAS_CHANGE)
-            self._standing_ambiguity = rate
-            self._state_version += 1
-        return self._agrees_with(self._earlier_rate, turn)
-
-    def _agrees_with(self, rate: float, turn: RateIntegral) -> bool:
-        """Tell whether a rate, rad/s, is that of an integral, as far as white noise shows."""
-        return (turn.angle / turn.duration - rate) ** 2 < (
-            2.0 * NORMAL_QUANTILE_975 ** 2 * self._state.noise.rate_variance(turn.duration))
+        self._standing.end_sudden_rate(self._last_time)
 
     def _find_other_power_on(self) -> bool:
         """Tell whether the rate of a rest that wheels show is that of another power-on."""
-        if (not self._turn_on_probability or self._rest_integral.duration < _WHEEL_DELAY
-                or self._wheel_motion_time < self._settled_time
-                or self._is_undecided):  # the bias in use was seen before
-            return False
-        difference, variance = _rate_difference(
-            self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))
-        # of the calibration, and of other power-ons, which together are as probable
-        variances = variance + self._settings.turn_on ** 2 * np.append(0.0, TURN_ON_RATIOS)
-        chances = softmax(-0.5 * (difference ** 2 / variances + np.log(variances)) + np.log(
-            np.append(1.0 - self._earlier_probability,
-                      self._earlier_probability * TURN_ON_SHARES)))
-        self._turn_on_probability = float(chances[1:].sum())
-        if self._turn_on_probability < (1.0 - CHANGE_PROBABILITY) ** 2:
-            self._turn_on_probability = 0.0
-        return self._turn_on_probability > CHANGE_PROBABILITY
+        return (self._standing.is_power_on_open(self._rest_integral.duration)
+                and self._standing.is_other_power_on(*_rate_difference(
+                    self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))))
 
     @property
     def _held_integral(self) -> RateIntegral:
@@ -757,16 +686,14 @@ class HeadingTracker:
                              * before.state.noise.angle_random_walk ** 2)
             if abs(turn.angle - expected) > self._sigmas[lag] * math.sqrt(variance):
                 change = (turn.angle - expected) / turn.duration
-                # a bias changes slowly; of a standstill that began with it this is not known
-                is_sudden = self._has_settled(before) and abs(change) > (
-                    _WHEEL_BIAS_CHANGE * max(lag, _WHEEL_DELAY) / _WHEEL_CHANGE_DURATION)
-                if wheels is not False or is_sudden:
+                if wheels is not False or self._standing.is_sudden(
+                        change, lag, before.rate_integral.duration):
                     self._revert_to_motion(lag)
-                elif lag < _WHEEL_DELAY:
+                elif lag < WHEEL_DELAY:
                     continue
                 else:
-                    if self._is_undecided:
-                        self._end_sudden_turn(change)
+                    if self._standing.is_undecided:
+                        self._end_sudden_rate(change)
                     self._enter_rest(change)
                 return
 
@@ -799,7 +726,7 @@ class HeadingTracker:
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
         if self.is_resting and len(self._snapshots) > 1:
-            self._earlier_probability = self._turn_on_probability
+            self._standing.end_rest()
             self._motion_start_time = self._last_time - self._open_integral.duration
         self.is_resting, self._quiet_duration = False, quiet_duration
         self._recent_blocks.clear()
@@ -826,10 +753,11 @@ class HeadingTracker:
         if self._steady_rates is not None:
             self._steady_rates.remove(turn)
         self._restore_steps(snapshot)
-        is_sudden = self._wheels_stand and self._has_settled(snapshot)
+        is_sudden = self._wheels_stand and self._standing.has_settled(
+            snapshot.rate_integral.duration)
         self._enter_motion(max(lag, WINDOW_DURATION))
-        if is_sudden and not self._is_turned:
-            self._sudden_time = self._settled_time = self._motion_start_time
+        if is_sudden:
+            self._standing.begin_sudden_rate(self._motion_start_time)
         self._advance_state()
 
     def _locate_motion_start(self, snapshot: Snapshot,
