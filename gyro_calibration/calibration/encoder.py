@@ -478,9 +478,11 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> Array:
     covered = (motion.time >= time[0]) & (motion.time <= time[-1])
     error = np.interp(motion.time, motion.time[covered], error[covered])
     for begin, end in _find_holes(time):  # the gyro's heading begins anew after it
-        after = motion.time >= 0.5 * (begin + end)
-        if after.any() and not after.all():  # by medians, as single references may be wrong
-            error[after] -= np.median(error[after][:15]) - np.median(error[~after][-15:])
+        before, after = motion.time <= begin, motion.time >= end
+        if before.any() and after.any():  # by medians, as single references may be wrong
+            last = np.median(error[before][-15:])
+            error[after] -= np.median(error[after][:15]) - last
+            error[~(before | after)] = last
     return np.asarray(error - error.mean())
 
 

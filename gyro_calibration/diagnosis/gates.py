@@ -34,7 +34,7 @@ from gyro_calibration.calibration.reference_noise import (
 from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gate, Reference
-from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.integration import integrate, MAX_GAP
 from gyro_calibration.logs.log import (
     Array, DataRefused, DEGREE, Log, MAX_PLAUSIBLE_FACTOR, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
@@ -632,11 +632,16 @@ def compare_headings(log: Log, reference: Array) -> list[_Agreement]:
     # near zero agrees, one half a period later does, in the opposite sense
     most, best = _MAX_LAG_SPANS / _LAG_STEP, []
     lags = _LAG_STEP * span * np.arange(-most, most + 1.0)
+    # what the gyro turned in a gap of its samples is not known
+    sampled = log.time[np.isfinite(log.output)]
+    gaps = np.flatnonzero(np.diff(sampled) > max(span, MAX_GAP))
     for together in (1, 4, 16):  # longer ones reduce the noise of the reference
         points, change = at[::together], np.diff(heading[::together])
-        if len(points) > _MIN_SPANS:
-            found = [_regress_changes(np.diff(np.interp(points - lag, log.time, turned)),
-                                      np.diff(points), change, white) for lag in lags]
+        used = np.searchsorted(sampled[gaps], points[1:]) == np.searchsorted(
+            sampled[gaps + 1], points[:-1], side='right')
+        if used.sum() >= _MIN_SPANS:
+            found = [_regress_changes(np.diff(np.interp(points - lag, log.time, turned))[used],
+                                      np.diff(points)[used], change[used], white) for lag in lags]
             highest = max(each.coherence for each in found)
             # a periodic motion agrees again a period later
             best.append(min((each._replace(lag=lag, span=span)

@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.gates import (
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import (
-    DataRefused, DEGREE, Log, log_from_table, refuse_wrapped, unwrap_heading)
+    DataRefused, DEGREE, Log, log_from_table, refuse_wrapped, select_rows, unwrap_heading)
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -341,6 +341,19 @@ def test_a_full_turn_in_a_gap_that_the_gyro_does_not_show_is_refused(use):
         use(log)
     restored, _ = unwrap_heading(TIME, heading, TIME, log.output)
     refuse_wrapped(replace(log, reference_heading=restored))
+
+
+@pytest.mark.parametrize('rows_are_missing', [False, True])
+def test_turns_while_the_gyro_has_no_samples_are_no_other_motion(rows_are_missing):
+    """Interpolated over these 40 s, it would turn by 775 deg."""
+    lost = (TIME > 17.0) & (TIME < 57.0)
+    log = replace(drive(heading_noise=0.002), output=np.where(lost, np.nan, drive().output))
+    if rows_are_missing:
+        log = select_rows(log, ~lost)
+    assert all(each.passed for each in check_gates(log))
+    found = calibrate_encoder(log)
+    assert found.fit.scale_factor_error == pytest.approx(0.01, abs=1e-3)
+    assert np.sqrt(np.mean(found.residual_after ** 2)) < 0.2 * DEGREE
 
 
 def test_turns_in_gaps_or_between_slow_samples_are_no_wrapped_heading():
