@@ -61,7 +61,7 @@ def format_quantity(estimate: Estimate, parameter: str = '') -> str:
     power = _display_power(largest * factor)
     value, low, high = (factor * number / 10.0 ** power for number in given)
     # two digits of the half-width of the interval
-    digits = '.4g'
+    digits = '.4g' if largest * factor < 1e4 else '.0f'  # of counts
     if 0.0 < high - low < math.inf:
         digits = f'.{min(max(0, 1 - math.floor(math.log10(0.5 * (high - low)))), 8)}f'
     interval = (f'({_format_fixed(low, digits)} to {_format_fixed(high, digits)})' if high > low
