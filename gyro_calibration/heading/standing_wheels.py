@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 
 from gyro_calibration.heading.kalman import RateIntegral
+from gyro_calibration.heading.stationary import chi_squared_quantile
 from gyro_calibration.heading.steady_rates import (
     CHANGE_PROBABILITY, TURN_ON_RATIOS, TURN_ON_SHARES)
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
@@ -57,8 +58,10 @@ class StandingWheels:
         #: When a rate began suddenly after a rest, until it is decided, s.
         self.sudden_time = -math.inf
         self._settled_time = -math.inf  # when the bias in use was last seen, or decided, s
-        # Rates since the wheels moved last, at this time, s, and before, rad/s.
-        self._rates, self._since, self._earlier_rate = list[float](), math.nan, math.nan
+        # Unexpected rates since the wheels moved last, rad/s, at this time, s; integral of the
+        # longest rest since then, and of that of the standstill before.
+        self._rates, self._since = list[float](), math.nan
+        self._present = self._earlier = RateIntegral(0.0, 0.0, np.zeros(0))
         # Probability of another power-on, with this rest and before it; 0 once it is excluded.
         self._turn_on_probability = self._earlier_probability = 0.5
 
@@ -92,20 +95,35 @@ class StandingWheels:
         An unexpected one is open until the bias is known, as is one that began suddenly, up to so
         many standard deviations of a usual change of the bias.
         """
+        if self._since != self.motion_time:
+            if self._present.duration:
+                self._earlier = self._present
+            self._rates, self._since = [], self.motion_time
+            self._present = RateIntegral(0.0, 0.0, np.zeros(0))
+        self._keep(turn)
         if is_expected:
-            self._rates, self._earlier_rate = [], math.nan
+            self._rates = []
             return False
         # after wheels have stopped a body may creep on for a second, or be pushed
-        if self._since != self.motion_time:
-            if self._rates:
-                self._earlier_rate = float(np.median(self._rates))
-            self._rates, self._since = [], self.motion_time
         self._rates.append(turn.angle / turn.duration)
         if not self.has_rested or self.is_turned:
             rate = abs(float(np.median(self._rates)))
             self.ambiguity = rate if not self.is_turned else (
                 math.sqrt(_CHANGE_SHARE) * rate * (rate < sigmas * _BIAS_CHANGE))
-        return _are_equal(self._earlier_rate, turn, noise)
+        return self._repeats(turn, noise)
+
+    def _keep(self, turn: RateIntegral) -> None:
+        """Keep an integral at rest as that of this standstill, if none is longer."""
+        if turn.duration >= self._present.duration:
+            self._present = turn
+
+    def _repeats(self, turn: RateIntegral, noise: Noise) -> bool:
+        """Tell whether the last standstill had the same rate, as far as white noise shows."""
+        one, other = self._earlier, turn
+        return one.duration > 0.0 and _is_steady(one, noise) and _is_steady(other, noise) and (
+            one.angle / one.duration - other.angle / other.duration) ** 2 < (
+                NORMAL_QUANTILE_975 ** 2 * (noise.rate_variance(one.duration)
+                                            + noise.rate_variance(other.duration)))
 
     def largest_change(self, repeats: bool) -> float:
         """Return the change of the bias, rad/s, that a rate may show that repeats, or does not."""
@@ -126,25 +144,35 @@ class StandingWheels:
     def is_first_bias(self, repeats: bool, lasts: bool, turn: RateIntegral, noise: Noise) -> bool:
         """Tell whether a rate is the bias of another power-on, as none was known before."""
         return self._turn_on_probability > CHANGE_PROBABILITY or not self.has_rested and (
-            repeats or lasts and _are_equal(float(np.median(self._rates)), turn, noise))
+            repeats or lasts and (turn.angle / turn.duration - float(np.median(self._rates))) ** 2
+            < 2.0 * NORMAL_QUANTILE_975 ** 2 * noise.rate_variance(turn.duration))
 
-    def adopt_power_on(self, difference: float) -> float:
-        """Exclude further power-ons; return the variance of a bias off by rad/s, (rad/s)²."""
-        self._turn_on_probability, self.has_rested = 0.0, True
+    def adopt_power_on(self, difference: float, time: float) -> float:
+        """Expect no further power-on, now, s; return the variance of a bias off by rad/s."""
+        # short rests may have been turns
+        self._turn_on_probability = (
+            0.0 if time - self.motion_time >= WHEEL_DELAY else 1.0 - CHANGE_PROBABILITY)
+        self.has_rested = True
         return max(difference ** 2, self._turn_on ** 2)
 
-    def end_rest(self) -> None:
-        """Keep what was known of the power-on at the end of a rest."""
+    def end_rest(self, turn: RateIntegral) -> None:
+        """Keep the integral of a rest, and what was known of the power-on at its end."""
         self._earlier_probability = self._turn_on_probability
+        self._keep(turn)
 
-    def is_power_on_open(self, duration: float) -> bool:
-        """Tell whether a rest of so many s may show another power-on."""
-        # else the bias in use was seen before
-        return (self._turn_on_probability > 0.0 and duration >= WHEEL_DELAY
-                and self.motion_time >= self._settled_time and not self.is_undecided)
+    def shows_other_power_on(self, turn: RateIntegral, noise: Noise, difference: float,
+                             variance: float) -> bool:
+        """
+        Tell whether a rest, off by rad/s with a variance, shows the bias of another power-on.
 
-    def is_other_power_on(self, difference: float, variance: float) -> bool:
-        """Tell whether a rate, off by rad/s with a variance, is that of another power-on."""
+        One of `WHEEL_DELAY` does alone; shorter ones, in which a body may creep on, if two in
+        succession have the same rate.
+        """
+        # it is excluded, or the bias in use was seen before
+        if (not self._turn_on_probability or self.motion_time < self._settled_time
+                or self.is_undecided
+                or turn.duration < WHEEL_DELAY and not self._repeats(turn, noise)):
+            return False
         # of the calibration, and of other power-ons, which together are as probable
         variances = variance + self._turn_on ** 2 * np.append(0.0, TURN_ON_RATIOS)
         chances = softmax(-0.5 * (difference ** 2 / variances + np.log(variances)) + np.log(
@@ -156,7 +184,9 @@ class StandingWheels:
         return self._turn_on_probability > CHANGE_PROBABILITY
 
 
-def _are_equal(rate: float, turn: RateIntegral, noise: Noise) -> bool:
-    """Tell whether a rate, rad/s, is that of an integral, as far as white noise shows."""
-    return (turn.angle / turn.duration - rate) ** 2 < (
-        2.0 * NORMAL_QUANTILE_975 ** 2 * noise.rate_variance(turn.duration))
+def _is_steady(turn: RateIntegral, noise: Noise) -> bool:
+    """Tell whether the blocks of an integral scatter as white noise, and no body sways."""
+    scatter = turn.block_square_sum - turn.angle ** 2 / turn.duration
+    freedom = turn.block_count - 1
+    return freedom < 1 or scatter < noise.angle_random_walk ** 2 * chi_squared_quantile(
+        freedom, 1.0 - CHANGE_PROBABILITY)

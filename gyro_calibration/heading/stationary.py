@@ -39,7 +39,7 @@ MEAN_LAGS = tuple((2.0 ** np.arange(7)).tolist())
 #: Least number of samples in a window.
 _MIN_WINDOW_SAMPLES = 8
 #: Windows in the memory of the noise, least number for its use, and largest ratio to the noise of
-#: the model.
+#: the model, unless wheels show that it is that of rests.
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
 #: to it, correlations of neighbours, and variances of blocks about these means: first those of a
@@ -124,18 +124,22 @@ class EnergyDetector:
         self._blocks = self._blocks[:, :0]
         self._results.clear()
 
-    def add(self, block: Block) -> bool | None:
-        """Add a block; tell whether the window contains only noise; None until it is full."""
+    def add(self, block: Block, stands: bool | None) -> bool | None:
+        """
+        Add a block; tell whether the window contains only noise; None until it is full.
+
+        Given is whether the wheels stand, None where unknown.
+        """
         if not self._results:
-            self.look_ahead(np.array([astuple(block)]).T)
+            self.look_ahead(np.array([astuple(block)]).T, [stands])
         quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
         return quiet
 
-    def _next_noise_factor(self, factor: float, duration: float, count: float, energy: float,
-                           differences: float) -> float:
+    def _next_noise_factor(self, factor: float, stands: bool | None, duration: float,
+                           count: float, energy: float, differences: float) -> float:
         """Return the noise of the samples by the quietest tenth of the windows, after a block."""
         # Vibration in a straight drive is not noise; it contributes less to differences of
-        # neighbours.
+        # neighbours. The noise of standing wheels may be that of a fan.
         self._since_last_window += duration
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return factor
@@ -145,7 +149,7 @@ class EnergyDetector:
             return factor
         quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
         quietest *= (count - 1) / chi_squared_quantile(round(count) - 1, 0.9)
-        return math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
+        return math.sqrt(min(max(quietest, 1.0), math.inf if stands else _MAX_NOISE_FACTOR ** 2))
 
     def _sample_limit(self, interval: float, variance: float) -> float:
         """Return the largest deviation of a single sample at rest, rad/s."""
@@ -153,8 +157,8 @@ class EnergyDetector:
         return (mean_threshold_sigmas(round(interval, 9), self._sample_false_alarms)
                 * math.sqrt(variance))
 
-    def look_ahead(self, blocks: Array) -> None:
-        """Compute the results of the next k blocks, given as rows of `Block`, shape (5, k)."""
+    def look_ahead(self, blocks: Array, stands: Sequence[bool | None]) -> None:
+        """Compute the results of the next k blocks, as for `add`, given as `Block`, (5, k)."""
         sums, kept = np.hstack([self._blocks, blocks]), self._blocks.shape[1]
         sums = np.vstack([sums, sums[2] ** 2 / sums[1]])
         until = np.cumsum(np.pad(sums[:2], ((0, 0), (1, 0))), axis=1)
@@ -170,10 +174,11 @@ class EnergyDetector:
         energy = (squares - total * total / count) / np.maximum(freedom, 1.0)
         variance = self._noise.rate_variance(1.0) / interval
         factors, factor = [], self.noise_factor
-        for is_full, *values in zip(*(each.tolist() for each in (
+        for stand, is_full, *values in zip(stands, *(each.tolist() for each in (
                 full, blocks[0], count, energy / variance,
                 0.5 * differences / count / variance))):
-            factor = self._next_noise_factor(factor, *values) if is_full else factor
+            if is_full and stand is not False:
+                factor = self._next_noise_factor(factor, stand, *values)
             factors.append(factor)
         variance *= np.square(factors)
         # motion is slower than the samples, so that means over blocks show it far better
@@ -351,6 +356,13 @@ class EvenSamples:
         self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
 
+    def wheels_of(self, number: int) -> tuple[bool, bool | None]:
+        """Return whether wheels moved in a block, and whether they move at its last sample."""
+        if self.wheels is None:
+            return False, None
+        moved = self.wheels[self.block_starts[number]:self.block_stops[number]]
+        return True in moved, moved[-1]
+
     def _integrate_sensitivity(self, rows: Array) -> Array:
         before = np.concatenate([self.used_sensitivity[:1], rows[:-1]])
         return self._sum_by_blocks(self.half_intervals[:, None] * (rows + before))
@@ -420,3 +432,8 @@ class EvenSamples:
         block = np.searchsorted(places, rows, side='right') - 1
         found[rows, 1] += (variances[block]
                            + white[block] * (until[rows] - until[places[block]]))
+
+
+def are_standing(driven: bool, wheels: bool | None) -> bool | None:
+    """Tell whether wheels stand in a block, by whether they moved in it, and move at its end."""
+    return False if driven else None if wheels is None else not wheels

@@ -31,9 +31,9 @@ from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, STANDSTILL, TrackStep, WALK_INDEX)
 from gyro_calibration.heading.standing_wheels import StandingWheels, WHEEL_DELAY
 from gyro_calibration.heading.stationary import (
-    Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES, EnergyDetector, Epoch,
-    EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio, RestScatter, Samples, SlowTurn,
-    Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
+    are_standing, Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES,
+    EnergyDetector, Epoch, EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio,
+    RestScatter, Samples, SlowTurn, Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
 from gyro_calibration.heading.steady_rates import SteadyRates
 from gyro_calibration.logs.log import (
     Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL, Number)
@@ -411,7 +411,9 @@ class HeadingTracker:
             piece.epochs.append(self._new_epoch(-1))
         for number, until in enumerate(piece.block_stops):
             if number == piece.whole_blocks.start and piece.whole_blocks:
-                self._energy.look_ahead(piece.block_sums[:, number:piece.whole_blocks.stop])
+                here = range(number, piece.whole_blocks.stop)
+                self._energy.look_ahead(piece.block_sums[:, number:here.stop],
+                                        [are_standing(*piece.wheels_of(each)) for each in here])
             if number in piece.whole_blocks and self._take_block(piece, number):
                 if self._state_version != piece.epochs[-1].state_version:
                     piece.close_epoch(until - 1)
@@ -449,8 +451,7 @@ class HeadingTracker:
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
         begin, end = piece.block_starts[number], piece.block_stops[number]
-        moved = () if piece.wheels is None else piece.wheels[begin:end]
-        driven = True in moved
+        driven, wheels = piece.wheels_of(number)
         rows = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
         if self.is_resting:
             rates = (piece.rate[begin:end] - self._wander_rate
@@ -479,7 +480,7 @@ class HeadingTracker:
         self._last_sample = time, rate, rate, rows[end - 1]
         self._interval, self._last_time = float(piece.intervals[end - 1]), time
         self._still_sensitivity = None if piece.still is None else piece.still[end - 1]
-        self._end_block(driven, moved[-1] if moved else None)
+        self._end_block(driven, wheels)
         if not -math.inf < self.heading < math.inf:
             self._rebuild_state()
         return True
@@ -522,7 +523,7 @@ class HeadingTracker:
 
     def _end_block(self, driven: bool, wheels: bool | None) -> None:
         """Decide on rest or motion; whether wheels moved in the block, and at its last sample."""
-        quiet = self._energy.add(self._block)
+        quiet = self._energy.add(self._block, are_standing(driven, wheels))
         if driven:
             quiet, wheels = False, True
         self._block, self._wheels_moved = Block(), False
@@ -593,8 +594,11 @@ class HeadingTracker:
         self._advance_state(held)
         change, lasts = 0.0, (
             wheels is False and not is_expected and standing.lasts(self._last_time))
+        if wheels is False:
+            standing.shows_other_power_on(held, self._state.noise, difference, variance)
         if standing.is_first_bias(repeats, lasts, held, self._state.noise):
-            self._change_bias(0.0, standing.adopt_power_on(difference), still)
+            self._change_bias(0.0, standing.adopt_power_on(
+                difference, self._last_time), still)
         elif lasts or repeats:
             change = difference  # that only the wheels explain
         standing.has_rested |= is_expected or bool(change)
@@ -620,9 +624,9 @@ class HeadingTracker:
 
     def _find_other_power_on(self) -> bool:
         """Tell whether the rate of a rest that wheels show is that of another power-on."""
-        return (self._standing.is_power_on_open(self._rest_integral.duration)
-                and self._standing.is_other_power_on(*_rate_difference(
-                    self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral))))
+        return self._standing.shows_other_power_on(
+            self._rest_integral, self._state.noise, *_rate_difference(
+                self._snapshots[0].state, self._with_still_sensitivity(self._rest_integral)))
 
     @property
     def _held_integral(self) -> RateIntegral:
@@ -726,7 +730,7 @@ class HeadingTracker:
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
         if self.is_resting and len(self._snapshots) > 1:
-            self._standing.end_rest()
+            self._standing.end_rest(self._rest_integral)
             self._motion_start_time = self._last_time - self._open_integral.duration
         self.is_resting, self._quiet_duration = False, quiet_duration
         self._recent_blocks.clear()
@@ -753,6 +757,7 @@ class HeadingTracker:
         if self._steady_rates is not None:
             self._steady_rates.remove(turn)
         self._restore_steps(snapshot)
+        self._rest_integral = snapshot.rate_integral
         is_sudden = self._wheels_stand and self._standing.has_settled(
             snapshot.rate_integral.duration)
         self._enter_motion(max(lag, WINDOW_DURATION))
