@@ -517,24 +517,19 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     is_excluded = is_implausible_factor(math.copysign(
         min(max(1.0, abs(scale) * (1.0 - half)), abs(scale) * (1.0 + half) / best.coherence),
         scale))
-    unit_gates = [*_unit_gates(*unit, log)]
-    is_other_axis = (is_excluded and not is_certain and unit_gates[-1].name == 'unit'
-                     and identify_unit_factor(*unit) is None)
-    yield _motion_gate(best, by_length, float(np.ptp(reference)), log,
-                       is_other_axis * f', where the output is {1.0 / scale:.2g} times the '
-                       'reference')
-    if is_certain or is_excluded and not is_other_axis:
-        yield from unit_gates
+    yield _motion_gate(best, by_length, float(np.ptp(reference)), log)
+    if is_certain or is_excluded:
+        yield from _unit_gates(*unit, log)
 
 
 def _motion_gate(best: _Agreement, by_length: Sequence[_Agreement], turned_angle: float,
-                 log: Log, other_axis: str = '') -> Gate:
+                 log: Log) -> Gate:
     evidence = (f'{100.0 * best.coherence:.3g} % of the variance of the heading over spans is '
-                f'common to gyro and reference{other_axis}')
+                'common to gyro and reference')
     longest = by_length[-1]
     if best.coherence - longest.coherence > 0.5 * _MIN_MOTION_COHERENCE:
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
-    elif best.coherence >= _MIN_MOTION_COHERENCE and not other_axis:
+    elif best.coherence >= _MIN_MOTION_COHERENCE:
         return Gate('motion', True, evidence)
     # errors of a reference leave the factor as it is: it may have made half the turns of the gyro
     if turned_angle < 30.0 * DEGREE or longest.residual < 10.0 * DEGREE and all(
@@ -552,7 +547,6 @@ def _motion_gate(best: _Agreement, by_length: Sequence[_Agreement], turned_angle
 
 def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
-    assert log.output is not None
     evidence = f'the output is {factor:.4g} times the reference'
     if not is_implausible_factor(factor):
         yield Gate('sense', True, f'{evidence}: the same sense')
@@ -564,8 +558,8 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     power = round(math.log10(abs(factor)))
     interval = 0.0 if log.time is None else float(np.median(np.diff(log.time)))
     slower = 10.0 ** power
-    correct_gyro = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
-                    '--sensitivity)')
+    correct_units = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
+                     '--sensitivity), or the unit of the reference (deg or rad)')
     if name == '-1' or name is None and not is_implausible_factor(-factor):
         yield Gate('sense', False, evidence,
                    'give or omit --invert, or change the sign of the column of the gyro', known)
@@ -575,24 +569,16 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
                    f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '
                    'agree',
-                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
-                   + ' (the stamps are in ms)' * (slower == 1e3)
-                   # units of time differ by powers of 1000
-                   + f'; or, if they are right, {correct_gyro}' * (power % 3 != 0), known)
-    elif name is not None and '180' in name:
-        fastest = float(np.nanquantile(np.abs(log.output), 0.99)) / DEGREE
-        either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
+                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}; or, if '
+                   f'the stamps are right, {correct_units}', known)
+    elif name is not None:
         yield Gate('unit', False, f'{evidence}, and {name} is {UNIT_FACTORS[name]:.5g}',
-                   'correct the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
-                   + ', or that of the reference heading (deg or rad)' * either, known)
+                   correct_units, known)
     else:
-        meaning = (', which is not plausible for a gyro' if name is None
-                   else f', and {name} is {UNIT_FACTORS[name]:.5g}')
-        yield Gate('unit', False, evidence + meaning,
-                   f'{correct_gyro}, or that of the reference'
-                   # a mean over time shows less of a fast motion, as does a line between values
-                   + ', or give one that is not smoothed or interpolated' * (
-                       name is None and factor > 1.0), known)
+        # a mean over time shows less of a fast motion, as does a line between values
+        yield Gate('unit', False, f'{evidence}, which is not plausible for a gyro',
+                   f'{correct_units}, or give a reference that is not smoothed or interpolated, '
+                   'or take another axis of the gyro', known)
 
 
 def reference_angle(log: Log) -> Array:

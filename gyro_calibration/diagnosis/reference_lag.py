@@ -71,15 +71,14 @@ def follows_rate(replays: Sequence[Replay]) -> bool:
                for each in replays)
 
 
-def follow_reference(replays: Sequence[Replay],
-                     is_command: bool) -> tuple[tuple[Replay, ...], list[Finding]]:
+def follow_reference(replays: Sequence[Replay]) -> tuple[tuple[Replay, ...], list[Finding]]:
     """
     Return logs with the motion that follows their reference rate, and the finding of its lag.
 
-    There is none if the lag may be 0. Raises `DataRefused` where the rate is a command and no
-    scale factor error can be known beside the response.
+    There is none if the lag may be 0. Raises `DataRefused` where no scale factor error can be
+    known beside the response.
     """
-    followed, lags, deviations, limits = zip(*(_follow(each, is_command) for each in replays))
+    followed, lags, deviations, limits = zip(*map(_follow, replays))
     weights = np.array(deviations) ** -2
     mean, deviation = float(np.average(lags, weights=weights)), float(weights.sum() ** -0.5)
     away, towards = np.median(limits, axis=0).tolist()
@@ -93,7 +92,7 @@ def follow_reference(replays: Sequence[Replay],
     return followed, [] if found is None else [found]
 
 
-def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Array]:
+def _follow(replay: Replay) -> tuple[Replay, float, float, Array]:
     """
     Return a log with the motion that follows, its mean delay, s, its deviation, and two limits.
 
@@ -142,7 +141,7 @@ def _follow(replay: Replay, is_command: bool) -> tuple[Replay, float, float, Arr
         own = [rate, *(each - motion * (motion @ each) / (motion @ motion) for each in others)]
     most = 0.5 * HEADING_TREATMENT.prior[0]
     # on average no motion is ahead of its command
-    if is_command and (fitted.scale_deviation > most or response @ lags < -LEAD):
+    if fitted.scale_deviation > most or response @ lags < -LEAD:
         raise DataRefused(
             'the motion follows its command late, and what it does then has the same effect as a '
             'scale factor error, as in a swing that repeats: turn at several rates for several '

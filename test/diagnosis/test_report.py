@@ -290,18 +290,6 @@ def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_u
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
 
 
-def test_causes_are_named_by_their_share_of_the_heading_error_and_faults_of_samples_last():
-    whole = several()
-    *causes, lost = whole.findings
-    found = (lost, *(replace(each, share_of_heading_error=0.1 * place)
-                     for place, each in enumerate(causes)))
-    assert headline(replace(whole, findings=found))[0].startswith(
-        'Simulation and measurement differ because of 5 causes: warm up, cubic nonlinearity, '
-        'time offset (or bandwidth) and 2 more')
-    assert headline(replace(whole, findings=(lost,), unexplained=()))[0] == (
-        'No error of the gyro is established; the record has dropped samples: 123.')
-
-
 @pytest.mark.parametrize('shares, cancel', [((0.6, 0.4), False), ((0.7, 0.6), True)])
 def test_shares_that_add_up_to_more_than_the_whole_are_said_to_cancel(shares, cancel):
     found = replace(extended(), heading_shares=dict(zip(('bias', 'warm_up'), shares)))
