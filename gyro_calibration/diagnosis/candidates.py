@@ -207,6 +207,7 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     temperature = np.concatenate([np.atleast_1d(each.channels.temperature) for each in replays])
     yield from (effect_candidate(name, *shapes)
                 for name, shapes in lasting_shapes(has, duration, temperature, moves))
+    # under all noises; the scan, under the likeliest one, finds them at each time
     per_log = max(MAX_STEP_TIMES // len(replays), 1)
     for run, each in enumerate(replays):
         begin, spacing = float(each.channels.time[each.valid][0]), each.duration / (per_log + 1)

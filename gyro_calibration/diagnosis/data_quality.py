@@ -193,20 +193,27 @@ def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
         member = _chance_within(np.nan_to_num(due - value), half_width + 2.0 * deviation,
                                 deviation)
         chance = np.where(within[:-1], np.maximum(chance, member), chance)
+        width = np.where(within[:-1], 2.0 * half_width, width)
     rare = (chance < _COARSE_REPEAT_CHANCE) & known
     excess, expected_count = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
     by_number = float(stats.poisson.sf(excess - 1, expected_count))
     if by_number < FALSE_ALARM_CHANCE and excess > 1.5 * expected_count:
         repeats[1:], p_value = same & (chance < 0.02), by_number
-    product = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(chance, 1e-12)))])
+    product, travel = (np.concatenate([[0.0], np.cumsum(each)])
+                       for each in (np.log(np.maximum(chance, 1e-12)), expected))
     for run in runs:
-        # repeats of a coarse code depend on each other
-        if run.stop - run.start < 2 or chance[run].max() >= _COARSE_REPEAT_CHANCE:
+        if run.stop - run.start < 2:
             continue
-        unlikely = math.exp(max(product[run.stop] - product[run.start], -700.0)) * len(valid)
-        if unlikely < FALSE_ALARM_CHANCE:
+        if chance[run].max() < _COARSE_REPEAT_CHANCE:
+            unlikely = math.exp(max(product[run.stop] - product[run.start], -700.0))
+        else:
+            # Repeats of a coarse code depend on each other: a fault only if it should have left.
+            left = abs(travel[run.stop] - travel[run.start]) - width[run.start]
+            unlikely = float(2.0 * stats.norm.sf(
+                left / (math.sqrt(2.0) * comparison.deviation))) if left > 0.0 else 1.0
+        if unlikely * len(valid) < FALSE_ALARM_CHANCE:
             repeats[run.start + 1:run.stop + 1] = True
-            by_run = min(by_run, unlikely)
+            by_run = min(by_run, unlikely * len(valid))
     return repeats, min(by_run, p_value)
 
 

@@ -260,9 +260,9 @@ def search_causes(search: Search) -> Causes:
         return everything
     named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates))))
     return max((everything, named),
-               key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
+               key=lambda causes: fit_causes(search.problem, causes).log_likelihood - sum(
                    complexity_penalty(each)
-                   + (0.0 if is_named(each) else _UNNAMED_PENALTY) for each in named))
+                   + (0.0 if is_named(each) else _UNNAMED_PENALTY) for each in causes))
 
 
 def _select_forward(search: Search) -> Causes:
