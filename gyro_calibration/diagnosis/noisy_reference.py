@@ -754,23 +754,16 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[SelectedCause]]:
     """Search for causes, and fit again with those that are established."""
     terms = _propose_terms(fit)
+    candidates = tuple(span_candidate(each.cause, *each.shapes) for each in terms)
     # noise given one column of each cause, so that it does not absorb their contributions
     rich = [*{each.cause: each for each in terms if each.cause != SINE_RESPONSE.name}.values()]
     # of a log with fewer spans than columns, the noise is that without them
     noise_fit = (fit_spans(fit.spans, rich)
                  if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
-    candidates, at = tuple(span_candidate(each.cause, *each.shapes) for each in terms), fit
-    for _ in range(2):
-        search = Search(SpanProblem.of(at, noise_fit), candidates,
-                        false_alarm_rate / (1 + len(indices_by_cause(candidates))),
-                        {'bias_step': find_span_steps}, on_progress=on_progress)
-        causes = search_causes(search)
-        # once more, at the rate without these causes: similar ones differ in higher order
-        of_rate = [_term_of(each) for each in causes
-                   if _follows_the_rate(each.cause) and each.cause != 'clock_rate']
-        if not of_rate:
-            break
-        at = fit_spans(fit.spans, of_rate)
+    search = Search(SpanProblem.of(fit, noise_fit), candidates,
+                    false_alarm_rate / (1 + len(indices_by_cause(candidates))),
+                    {'bias_step': find_span_steps}, on_progress=on_progress)
+    causes = search_causes(search)
     found = [*explain_selection(search, confirm_causes(search, causes))]
     while established := [_term_of(each.cause) for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)
