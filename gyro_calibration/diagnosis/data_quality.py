@@ -11,10 +11,7 @@
 """
 Checks of a record for faults that are not errors of the gyro.
 
-Codes are the values of a digital output, with their step, the dead band about zero, and the limit.
-Repeated samples have the value of the sample before, more often than coarse codes explain.
-Outliers are samples far from their neighbours that motion does not explain. Faults are reported,
-and the samples concerned are not used; no fault is fitted.
+Faults are reported, and the samples concerned are not used; no fault is fitted.
 
 The false-alarm rate for a log without faults is at most 1e-3: each of the five tests (lost
 samples, repeated samples, outliers, a limit on either side) has a level of 2e-4. Quantization and
@@ -105,11 +102,6 @@ def _find_dead_band(codes: QuantizationCodes,
 def _rest_rate_limit(output: Array) -> float:
     """Return the largest output of a rest, a tenth of the largest one but for outliers."""
     return 0.1 * float(np.quantile(np.abs(output), 0.99))
-
-
-def _is_beyond(output: Array, low: float, high: float) -> Mask:
-    rounded = 1.0 - 1e-9
-    return (output >= rounded * high) | (output <= rounded * low)
 
 
 def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[float, float, float]:
@@ -223,7 +215,7 @@ def _chance_within(expected: Array, half_width: Array | float, deviation: Array 
 
 
 def _motion_classes(motion: Array) -> NDArray[np.intp]:
-    """Return the class of each sample, with an eighth of the samples each, by its motion."""
+    """Return the class of each sample: eight by motion, with as many samples each."""
     edges = np.quantile(motion, np.linspace(0.0, 1.0, 9)[1:-1])
     return np.searchsorted(np.unique(edges), motion, side='left')
 
@@ -237,11 +229,7 @@ def _robust_quantile(off: Array) -> float:
 
 def _find_outliers(comparison: _Comparison, valid: Mask,
                    min_scatter: float) -> tuple[Mask, float, float]:
-    """
-    Mark outliers among valid samples; and return their p-value and the largest one's sigmas.
-
-    `min_scatter` is half a code.
-    """
+    """Mark outliers among valid samples; return their p-value and the largest one's sigmas."""
     measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     count = len(output)
     # more for very long logs
@@ -387,7 +375,8 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
     has_output, output, noise = quality.usable, comparison.output, comparison.noise_deviation
     codes = find_codes(output[has_output])
     (low, high, p_limit), band = _find_limit(codes, comparison), _find_dead_band(codes, output)
-    at_limit = _is_beyond(output, low, high)
+    rounded = 1.0 - 1e-9
+    at_limit = (output >= rounded * high) | (output <= rounded * low)
     repeated, p_repeated = _find_repeated_samples(comparison, codes, band, has_output & ~at_limit)
     valid = has_output & ~at_limit & ~repeated
     # Samples next to a dead band are the tail of the noise outside it.

@@ -11,12 +11,10 @@
 """
 Conditions for a diagnosis: usable logs and models, and a reference of the motion of the gyro.
 
-The gates check whether gyro and reference show the same motion, in the same units, time and sense.
 Over spans, the change of the reference heading is regressed on the integral of the output and on
 time, at the lag of the best agreement. A factor far from 1 indicates a unit, a sign or a unit of
-time; a low coherence over all lengths of span, or over long ones, indicates another motion, or an
-axis that tilts. A gate that fails is the only finding. The kind of the reference, and whether its
-errors exceed those of the gyro, decide how a log is diagnosed.
+time; a low coherence over all lengths of span, or over long ones, another motion, or an axis that
+tilts. A gate that fails is the only finding.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -101,11 +99,11 @@ def is_sample_offset(estimate: float, deviation: float, interval: float) -> bool
 
 
 class _LineFit(NamedTuple):
-    """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
+    """Output = factor * rate + offset."""
 
     factor: float
     offset: float
-    deviation: float
+    deviation: float  # standard deviation of the factor
 
 
 def reference_rate(log: Log) -> Array | None:
@@ -208,7 +206,8 @@ def refuse_unusable(log: Log) -> None:
     log, _ = select_reference(log)
     if log.reference_rate is None:
         refuse_wrapped(log)
-    known, reference = np.isfinite(output), _used_reference(log)
+    known = np.isfinite(output)
+    reference = log.reference_heading if log.reference_rate is None else log.reference_rate
     has_reference = (np.zeros(len(known), dtype=bool) if reference is None
                      else np.isfinite(reference))
     both = int(np.count_nonzero(known & has_reference))
@@ -257,12 +256,7 @@ def refuse_unusable(log: Log) -> None:
 
 
 def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """
-    Return a log with the reference that is used, and remarks on it.
-
-    Of a heading and a rate it is that of `choose_reference`. A rate that consists of noise alone
-    is replaced by that of a rest.
-    """
+    """Return a log with the reference of `choose_reference`, 0 where it is noise, and remarks."""
     if log.time is None:
         return log, ()
     log, notes = choose_reference(log, prefer_rate=True)
@@ -310,11 +304,6 @@ def is_at_rest(log: Log) -> bool:
     return line is None or abs(line.factor) < 4.0 * line.deviation
 
 
-def _used_reference(log: Log) -> Array | None:
-    """Return the rate or the heading of the reference that is used; None without one."""
-    return log.reference_heading if log.reference_rate is None else log.reference_rate
-
-
 def _refuse_copy(log: Log, output: Array) -> None:
     """Refuse a reference computed from the output, or an output computed from the reference."""
     rates = [] if log.reference_rate is None else [log.reference_rate]
@@ -351,7 +340,6 @@ def _unit_problem(log: Log, model: GyroModel) -> str:
     if not 0.1 < abs(scale) < 10.0:
         return (f'the scale factor of the model is {scale:.4g}, which is not plausible: it has '
                 'other units; write it in rad/s, or fit it again')
-    # By the reference, as the unit of the output may be wrong, which is a finding.
     fastest = float(np.nanquantile(np.abs(output if rate is None else rate), 0.99))
     widest = max(abs(limit) for limit in model.rate_range)
     if fastest > 20.0 * widest:
@@ -531,7 +519,7 @@ def _motion_gate(best: _Agreement, by_length: Sequence[_Agreement], turned_angle
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
     elif best.coherence >= _MIN_MOTION_COHERENCE:
         return Gate('motion', True, evidence)
-    # errors of a reference leave the factor as it is: it may have made half the turns of the gyro
+    # errors leave the factor as it is: the reference may have made half the turns of the gyro
     if turned_angle < 30.0 * DEGREE or longest.residual < 10.0 * DEGREE and all(
             each.factor + NORMAL_QUANTILE_975 * each.deviation > 0.5 * (1.0 - each.noise_share)
             for each in by_length):
@@ -583,9 +571,8 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
 
 def reference_angle(log: Log) -> Array:
     """Return the heading of the reference at each sample, gaps interpolated, rad."""
-    assert log.time is not None
-    values = _used_reference(log)
-    assert values is not None
+    values = log.reference_heading if log.reference_rate is None else log.reference_rate
+    assert log.time is not None and values is not None
     if not np.isfinite(values).any():
         return np.zeros(len(values))
     return (bridge_gaps(values) if log.reference_rate is None
@@ -598,7 +585,7 @@ def compare_headings(log: Log, reference: Array) -> list[_Agreement]:
 
     Each is compared at the best lag, up to 25 of the shortest spans.
     """
-    values = _used_reference(log)
+    values = log.reference_heading if log.reference_rate is None else log.reference_rate
     assert log.time is not None and log.output is not None and values is not None
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _MIN_SPANS or np.isfinite(log.output).sum() < 2 * _MIN_SPANS:

@@ -194,7 +194,7 @@ def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding
 
 
 def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | None]:
-    """Return a log with what its reference measured alone, when; add remarks on the rest."""
+    """Return a log with the values that its reference measured, and when; add remarks."""
     log, instants = keep_own_instants(log)
     if instants is not None:
         remarks.append('The reference has a value of its own every '
@@ -343,9 +343,8 @@ def _find_settled(fit: RegressionFit) -> Mask | None:
     """
     Return the samples in dwells of a motion if the residual is larger between them, or None.
 
-    The motion then has more of its own than a response to its command. The mean squares of the
-    residual are compared stretch by stretch (Mann and Whitney). Dwells of less than half the range
-    of rates, such as rests alone, do not show what the motion does.
+    The mean squares of the residual are compared stretch by stretch (Mann and Whitney). Dwells of
+    less than half the range of rates, such as rests alone, do not show what the motion does.
     """
     replay, = fit.problem.replays
     time, rate = replay.channels.time, np.asarray(replay.channels.rate)

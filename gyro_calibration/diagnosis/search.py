@@ -240,7 +240,7 @@ def _is_lasting(candidate: Candidate) -> bool:
     """
     Tell whether a cause acts in all logs and has a free size: only such causes are suspected.
 
-    A limit or a delay has no size apart from its shape, and its refinement would fit single peaks.
+    The refinement of a limit or a delay would fit single peaks.
     """
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
@@ -480,12 +480,10 @@ def _remove_unconfirmed(search: Search, causes: Causes,
 
 def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """Return the gain of each cause on held-out stretches in standard deviations."""
-    full, found = fit_causes(search.problem, causes), []
-    for place, known in enumerate(causes):
-        rest = fit_causes(search.problem, _without(causes, place))
-        gains = search.problem.held_out_gains(full, rest, known)
-        found.append(math.inf if gains is None else prediction_sigmas(gains))
-    return found
+    full = fit_causes(search.problem, causes)
+    gains = [search.problem.held_out_gains(full, fit_causes(
+        search.problem, _without(causes, place)), known) for place, known in enumerate(causes)]
+    return [math.inf if each is None else prediction_sigmas(each) for each in gains]
 
 
 def _choose_simplest(search: Search, named: Causes,
