@@ -321,11 +321,7 @@ def _refuse_copy(log: Log, output: Array) -> None:
         # or no more than the rounding of both in the file
         printed = math.hypot(find_codes(output[known]).step,
                              slope * find_codes(rate[known]).step) / spread
-        # means with few decimals, in deg/s, may be on a line by chance
-        shown = output[known] / DEGREE
-        decimals = math.floor(-math.log10(2e-5 * spread / DEGREE))
-        is_coarse = np.abs(shown - np.round(shown, decimals)).max() < 1e-9 * spread
-        if off < 1e-6 and not is_coarse or off < 0.5 * printed < 1e-5:
+        if off < max(1e-6, 0.5 * printed * (printed < 2e-5)):
             raise DataRefused(
                 f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} '
                 'deg/s, to the last digit: one was computed from the other, without noise; '

@@ -113,18 +113,16 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
         extended, found = _withdraw_differing_causes(extended, found, each_alone)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
-    lasting_terms = [each for each in extended.causes if not each.is_single_event]
-    lasting = (extended if not events else plain if not lasting_terms
-               else fit_spans(plain.spans, lasting_terms))
-    gain = None if time_is_up else _cross_validated_gain(plain, lasting)
-    model_fit = lasting
+    lasting = [each for each in extended.causes if not each.is_single_event]
+    model_fit = (extended if not events else plain if not lasting
+                 else fit_spans(plain.spans, lasting))
+    gain = None if time_is_up else _cross_validated_gain(plain, model_fit)
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
-        model_fit = plain
+        model_fit, gain = plain, _cross_validated_gain(plain, plain)
         if not plain.spans.treatment.is_fine:
-            found = _suspect(found, lasting_terms)
+            found = _suspect(found, lasting)
             extended = fit_spans(plain.spans, events) if events else plain
-        gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
     of_logs, of_record = _heading_contributions(extended), strongest_findings(records)
     # between two clocks neither a delay nor a clock rate is a property of the gyro

@@ -351,18 +351,6 @@ def test_a_log_that_allows_a_diagnosis_is_accepted():
     refuse_unusable(replace(GOOD, output=GOOD.output / DEGREE))
 
 
-@pytest.mark.parametrize('decimals', [2, 7])
-def test_coarse_dwells_may_be_on_a_line_by_chance(decimals):
-    """As means in deg/s with two decimals, of a gyro with less noise and a round scale factor."""
-    rate = np.repeat(np.arange(-50.0, 51.0, 10.0), 3)
-    noise = 5e-4 * np.random.default_rng(3).standard_normal(len(rate))
-    log = Log(output=DEGREE * np.round(0.996 * rate - 0.09 + noise, decimals),
-              reference_rate=DEGREE * rate)
-    refuse_unusable(log)
-    with pytest.raises(DataRefused, match='to the last digit'):
-        refuse_unusable(replace(log, output=DEGREE * np.round(0.996123 * rate - 0.09, 7)))
-
-
 RECORDINGS = {
     'mems_encoder_turntable/yaw_slow.csv.gz': ['sense', 'dropped_samples',
                                                'reference_quantization'],
