@@ -181,6 +181,14 @@ def test_samples_that_quantization_repeats_are_no_repeated_samples(step, generat
     assert list(found(coarse(swing(generator), step * SIGMA))) == ['quantization']
 
 
+@pytest.mark.parametrize('digits', [3, 4])
+def test_codes_that_grow_with_their_values_are_no_repeated_samples(digits, generator):
+    log = swing(generator, scale=4.0)
+    written = np.array([float(f'{each:.{digits}g}') for each in (log.output / DEGREE).tolist()])
+    assert 'stuck_samples' not in found(replace(
+        log, output=written * DEGREE, reference_rate=4.0 * log.reference_rate))
+
+
 def robot(generator, step=0.0):
     """Return a log without a reference of a robot that turns and rests, 20 samples a second."""
     rate = np.repeat(np.where(np.arange(160) % 2, generator.normal(0.0, 0.6, 160), 0.0), 30)

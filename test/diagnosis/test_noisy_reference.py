@@ -20,6 +20,7 @@ from gyro_calibration.calibration.heading_regression import fit_spans
 from gyro_calibration.calibration.reference_kind import find_drift
 from gyro_calibration.calibration.reference_noise import heading_noise_share
 from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
+from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.noisy_reference import select_causes
@@ -235,6 +236,15 @@ def test_a_time_constant_has_the_interval_of_the_profile_of_its_likelihood(seed)
     low, high = warming.parameters['time_constant'].interval
     assert low < warming.parameters['time_constant'].estimate < high
     assert 15.0 < low < 40.0 < high < 100.0
+
+
+def test_a_cause_that_its_own_fit_does_not_show_at_the_level_is_implausible():
+    log, rate = turning_log(2, lambda time, _: 0.003), CauseTerm('clock_rate')
+    log = replace(log, output=np.interp(log.time * (1.0 + 3e-5), log.time, log.output))
+    fit = fit_spans(lay_out_spans(log, 'motion_capture'), [rate])
+    chance = fit.p_value(fit.value_slice(rate).start)
+    assert noisy_reference._implausibility(fit, rate, 2.0 * chance) < 1.0
+    assert noisy_reference._implausibility(fit, rate, 0.5 * chance) == math.inf
 
 
 @pytest.mark.parametrize('name, size, step', [
