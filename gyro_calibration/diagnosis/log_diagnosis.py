@@ -25,8 +25,8 @@ from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, keep_own_instants, OwnInstants)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, common_channels, constant_channels, is_named, observed_range, PART_OF_LOG,
-    RESPONSE, unnamed_variable)
+    Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
+    PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
     Cause, CAUSES, make_finding, NOISE_NAMES, REFERENCES, slip_times,
     untestable_causes, value_finding)
@@ -52,7 +52,7 @@ from gyro_calibration.diagnosis.residuals import (
     allan_curves, find_changed_figures, fit_noise_parameters, model_residuals, residual_curves)
 from gyro_calibration.diagnosis.search import (
     confirm_causes, evidence_for, evidence_threshold, explain_selection, forget_searches, p_value,
-    Search, search_causes, Selection, start_search)
+    refine_shape, Search, search_causes, Selection, start_search)
 from gyro_calibration.diagnosis.table_diagnosis import diagnose_table
 from gyro_calibration.diagnosis.words import is_model_extended
 from gyro_calibration.logs.log import DataRefused, Log, Mask, NORMAL_QUANTILE_975
@@ -318,13 +318,30 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], on_progress: On
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
     if not (follows_rate(replays) and (is_command or is_late(plain))):
-        return _search_replays(replays, on_progress)
+        return _search_replays(_drop_unknown_ends(plain), on_progress)
     followed, lag = follow_reference(replays)
     within = (_find_settled(fit_causes(build_problem(followed), [])) if len(logs) == 1 else None)
     replays = followed if within is None else [drop_samples(followed[0], ~within)]
     return replace(_search_replays(replays, on_progress, {RESPONSE, *HIDDEN_CAUSES}),
                    findings=lag, followed=followed[0],
                    remarks=[] if within is None else [_SETTLED_REMARK])
+
+
+def _drop_unknown_ends(plain: RegressionFit) -> Sequence[Replay]:
+    """Return the logs of a fit without samples of which a delay or lag hides the motion."""
+    replays = plain.problem.replays
+    delays = {0.1, -0.1, *filter(None, (each.delay for each in replays))}
+    late, likelihood = max((refine_shape(plain, effect_candidate(name, first)) for name, first in (
+        *(('time_offset', each) for each in delays), ('bandwidth', 0.1))),
+        key=lambda each: each[1])
+    size = late.shapes[0]
+    if p_value(late.cause, likelihood - plain.log_likelihood) > FALSE_ALARM_RATE:
+        return replays
+    # a lag that begins with the log has decayed to less than 1 % after five time constants
+    first, last = max(size, 0.0) * (5.0 if late.cause == 'bandwidth' else 1.0), max(-size, 0.0)
+    times = [each.channels.time for each in replays]
+    return [drop_samples(each, (time < time[0] + first) | (time > time[-1] - last))
+            for each, time in zip(replays, times)]
 
 
 def _search_replays(replays: Sequence[Replay], on_progress: OnProgress,
