@@ -207,6 +207,7 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     temperature = np.concatenate([np.atleast_1d(each.channels.temperature) for each in replays])
     yield from (effect_candidate(name, *shapes)
                 for name, shapes in lasting_shapes(has, duration, temperature, moves))
+    # under all noises; the scan, under the likeliest one, finds them at each time
     per_log = max(MAX_STEP_TIMES // len(replays), 1)
     for run, each in enumerate(replays):
         begin, spacing = float(each.channels.time[each.valid][0]), each.duration / (per_log + 1)
@@ -263,10 +264,10 @@ def unnamed_variable(candidate: Candidate) -> str:
 
 def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give the generic terms that these logs may show."""
-    def unnamed(name: str, columns: Callable[..., Sequence[Array]], *variables: _Variable,
-                shapes: tuple[float, ...] = (), log_index: int | None = None) -> Candidate:
-        return Candidate(_UNNAMED_PREFIX + name, shapes, lambda each, *_: columns(
-            *(of(each) for of in variables)), log_index)
+    def unnamed(name: str, columns: Callable[..., Sequence[Array]],
+                *variables: _Variable) -> Candidate:
+        return Candidate(_UNNAMED_PREFIX + name, (), lambda each: columns(
+            *(of(each) for of in variables)))
 
     def heading(each: Replay) -> Array:
         return each.channels.heading
@@ -316,11 +317,16 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             yield unnamed(f'{first} and {second}', lambda *values: (values[0] * values[1],), one,
                           other)
-    # a scale factor that differs in a part of a log; so many ends have `MAX_STEP_TIMES` pairs
+    yield from _terms_in_time(replays, 'rate' in variables)
+
+
+def _terms_in_time(replays: Sequence[Replay], moves: bool) -> Iterator[Candidate]:
+    """Give scale factors that differ in a part of a log, and bumps."""
+    # so many ends have `MAX_STEP_TIMES` pairs
     ends_count = math.isqrt(2 * MAX_STEP_TIMES // len(replays)) + 1
     for run, each in enumerate(replays):
         begin, duration = float(each.channels.time[each.valid][0]), each.duration
-        if 'rate' in variables:
+        if moves:
             for part in combinations(begin + duration * np.linspace(0.0, 1.0, ends_count), 2):
                 if part[1] - part[0] < 0.99 * duration:
                     yield Candidate(PART_OF_LOG, part, _part_of_log, run,
@@ -328,8 +334,8 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
         for width in _BUMP_WIDTHS:
             number = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + duration * np.linspace(0.0, 1.0, number)[1:-1]:
-                yield unnamed('time', partial(_bump, moment, width * duration),
-                              lambda each: each.channels.time, shapes=(moment,), log_index=run)
+                yield Candidate(f'{_UNNAMED_PREFIX}time', (moment,), partial(
+                    _bump, width * duration), run)
 
 
 def _scaled(of: _Variable, low: float, high: float, each: Replay) -> Array:
@@ -340,8 +346,8 @@ def _waves(number: float, phase: Array, size: Array | float = 1.0) -> Sequence[A
     return size * np.sin(number * phase), size * np.cos(number * phase)
 
 
-def _bump(middle: float, width: float, time: Array) -> Sequence[Array]:
-    return (np.exp(-0.5 * ((time - middle) / width) ** 2),)
+def _bump(width: float, each: Replay, middle: float) -> Sequence[Array]:
+    return (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)
 
 
 def _part_of_log(each: Replay, first: float, last: float) -> Sequence[Array]:

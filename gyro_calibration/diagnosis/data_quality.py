@@ -11,10 +11,7 @@
 """
 Checks of a record for faults that are not errors of the gyro.
 
-Codes are the values of a digital output, with their step, the dead band about zero, and the limit.
-Repeated samples have the value of the sample before, more often than coarse codes explain.
-Outliers are samples far from their neighbours that motion does not explain. Faults are reported,
-and the samples concerned are not used; no fault is fitted.
+Faults are reported, and the samples concerned are not used; no fault is fitted.
 
 The false-alarm rate for a log without faults is at most 1e-3: each of the five tests (lost
 samples, repeated samples, outliers, a limit on either side) has a level of 2e-4. Quantization and
@@ -50,10 +47,8 @@ FALSE_ALARM_CHANCE = 2e-4
 _MIN_STEP_NOISE_RATIO = 0.2
 #: Probability of a repeat from which on single repeats of a coarse output are not tested.
 _COARSE_REPEAT_CHANCE = 0.3
-#: A deviation that noise reaches rarely, in standard deviations: from there to that of outliers
-#: there are at most half as many samples as outliers, as more are a tail of the noise, and samples
-#: whose expected output is as near to a limit are not used, as noise determines whether they are
-#: clipped.
+#: A deviation that noise reaches rarely, in standard deviations: samples whose expected output is
+#: as near to a limit are not used, as noise determines whether they are clipped.
 _RARE_SIGMAS = 4.5
 #: Number of neighbours on each side with which a sample is compared.
 _NEIGHBOURS_PER_SIDE = 3
@@ -79,21 +74,16 @@ def _local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
     Steps grow with the values of 32-bit floats and of decimals with a number of significant
     digits.
     """
-    steps = np.full(len(output), max(
-        codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0))
-    sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0])
-             for sign in (1.0, -1.0)}
-    finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf))
-                 for sizes in sides.values())
-    for sign, sizes in sides.items():
-        if len(sizes) > 1:
-            side = sign * output >= 0.0
-            closest = np.minimum.accumulate(np.diff(sizes)[::-1])[::-1]
-            place = np.minimum(np.searchsorted(sizes, sign * output[side]), len(closest) - 1)
-            steps[side] = np.maximum(
-                steps[side],
-                np.minimum(closest[place], 10.0 * finest * np.abs(output[side])))
-    return steps
+    step = max(codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0)
+    sizes = np.unique(np.abs(codes.values))
+    sizes = sizes[np.diff(sizes, prepend=-1.0) > 1e-9 * sizes]
+    if len(sizes) < 2:
+        return np.full(len(output), step)
+    # among larger codes, and by the finest relative step, of one to ten times which all are
+    closest = np.minimum.accumulate(np.diff(sizes)[::-1])[::-1]
+    place = np.minimum(np.searchsorted(sizes, np.abs(output)), len(closest) - 1)
+    finest = float((np.diff(sizes) / sizes[1:]).min())
+    return np.maximum(step, np.minimum(closest[place], 10.0 * finest * np.abs(output)))
 
 
 def _find_dead_band(codes: QuantizationCodes,
@@ -114,11 +104,6 @@ def _rest_rate_limit(output: Array) -> float:
     return 0.1 * float(np.quantile(np.abs(output), 0.99))
 
 
-def _is_beyond(output: Array, low: float, high: float) -> Mask:
-    rounded = 1.0 - 1e-9
-    return (output >= rounded * high) | (output <= rounded * low)
-
-
 def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[float, float, float]:
     """
     Return the low and high limit of an output, infinite without one, and the p-value of a test.
@@ -127,8 +112,7 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
     its neighbours, which are more frequent without a limit; and if the expected output is beyond
     it, which is not so for a coarse code at a constant rate.
     """
-    (low, high), found = codes.values[[0, -1]].tolist(), {1.0: math.inf, -1.0: math.inf}
-    p_value = 1.0
+    found, p_value = {1.0: math.inf, -1.0: math.inf}, 1.0
     deviation, noise = comparison.deviation, comparison.noise_deviation
     # a repetition fault begins at one of two extreme samples as seldom as at any other
     by_fault = 2.0 * len(find_runs(np.diff(comparison.output) == 0.0)) / codes.counts.sum()
@@ -136,7 +120,7 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
     for sign in (1.0, -1.0):
         values, counts = ((codes.values, codes.counts) if sign > 0.0
                           else (-codes.values[::-1], codes.counts[::-1]))
-        extreme, step = values[-1], float(_local_code_steps(codes, sign * values[-1:])[0])
+        extreme, step = values[-1], float(_local_code_steps(codes, values[-1:])[0])
         # the chance of as many samples at the last code, if the density falls towards it
         reach = max(4.0 * step, 0.05 * noise)
         near = int(counts[:-1][values[:-1] > extreme - reach - 0.5 * step].sum())
@@ -145,9 +129,6 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
         if chance >= FALSE_ALARM_CHANCE or extreme <= _rest_rate_limit(comparison.output):
             continue
         at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
-        # a limit on either side counts the runs of both
-        both = (_is_beyond(comparison.output, low, high) if abs(low + high) < 1.5 * step
-                else at_extreme)
         expected = (np.array([]) if comparison.expected is None
                     else sign * comparison.expected[at_extreme])
         beyond = (float(np.nanmedian(expected)) - extreme if np.isfinite(expected).any()
@@ -155,7 +136,7 @@ def _find_limit(codes: QuantizationCodes, comparison: _Comparison) -> tuple[floa
         # The expected output errs by bias wander and nonlinearity, which these samples share.
         if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
                 or fine and stats.poisson.sf(
-                    len(find_runs(both)) - 1, by_fault) < FALSE_ALARM_CHANCE):
+                    len(find_runs(at_extreme)) - 1, by_fault) < FALSE_ALARM_CHANCE):
             found[sign], p_value = float(extreme), min(p_value, chance)
     return -found[-1.0], found[1.0], p_value
 
@@ -173,8 +154,7 @@ def _find_repeated_samples(comparison: _Comparison, codes: QuantizationCodes,
     repeats, p_value, by_run = np.zeros(len(valid), dtype=bool), 1.0, 1.0
     if not same.any():
         return repeats, p_value
-    width = _local_code_steps(codes, comparison.output[:-1])
-    runs = find_runs(same)
+    width, runs = _local_code_steps(codes, comparison.output[:-1]), find_runs(same)
     if comparison.may_move:
         # Codes that stand between changes of one or two are those of a steady rate, which steps
         # coarser than the noise repeat; those of a rest between two fast turns look like a fault.
@@ -235,7 +215,7 @@ def _chance_within(expected: Array, half_width: Array | float, deviation: Array 
 
 
 def _motion_classes(motion: Array) -> NDArray[np.intp]:
-    """Return the class of each sample, with an eighth of the samples each, by its motion."""
+    """Return the class of each sample: eight by motion, with as many samples each."""
     edges = np.quantile(motion, np.linspace(0.0, 1.0, 9)[1:-1])
     return np.searchsorted(np.unique(edges), motion, side='left')
 
@@ -249,11 +229,7 @@ def _robust_quantile(off: Array) -> float:
 
 def _find_outliers(comparison: _Comparison, valid: Mask,
                    min_scatter: float) -> tuple[Mask, float, float]:
-    """
-    Mark outliers among valid samples; and return their p-value and the largest one's sigmas.
-
-    `min_scatter` is half a code.
-    """
+    """Mark outliers among valid samples; return their p-value and the largest one's sigmas."""
     measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     count = len(output)
     # more for very long logs
@@ -293,12 +269,7 @@ def _find_outliers(comparison: _Comparison, valid: Mask,
     # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
     outside = np.maximum(output - near.max(axis=1), near.min(axis=1) - output)
     sigmas = np.where(outside > 0.5 * off, off / np.maximum(scale, max(min_scatter, 1e-300)), 0.0)
-    # an outlier is one among samples of the same rate too, and in the output itself
-    order = np.argsort(expected, kind='stable')
-    ordered, off_ordered = output[order], np.empty(count)
-    off_ordered[order] = np.abs(ordered - np.median(ordered[neighbours], axis=1))
-    sigmas *= np.minimum(off_ordered / np.maximum(off, 1e-300), 1.0)
-    # and off the parabola through its neighbours
+    # an outlier of the output itself is off the parabola through its neighbours
     powers, weights = np.vander(np.arange(size), 3), np.eye(size)
     for place, row in enumerate(weights):
         others = np.arange(size) != place
@@ -311,10 +282,8 @@ def _find_outliers(comparison: _Comparison, valid: Mask,
     for run in find_runs(outlying):
         outlying[run] = run.stop - run.start <= 2
     found = int(np.count_nonzero(outlying))
-    rare = int(np.count_nonzero((sigmas > _RARE_SIGMAS) & (sigmas <= limit) & tested))
-    usual = stats.poisson.isf(0.01, 2.0 * count * stats.norm.sf(_RARE_SIGMAS))
     p_value = float(stats.poisson.sf(found - 1, 4.0 * count * stats.norm.sf(limit)))
-    if rare > 0.5 * found + usual or p_value >= FALSE_ALARM_CHANCE:
+    if p_value >= FALSE_ALARM_CHANCE:
         outlying[:] = False
     return outlying, p_value, float(sigmas[outlying].max(initial=0.0))
 
@@ -406,13 +375,9 @@ def _check_samples(quality: DataQuality, comparison: _Comparison, model: GyroMod
     has_output, output, noise = quality.usable, comparison.output, comparison.noise_deviation
     codes = find_codes(output[has_output])
     (low, high, p_limit), band = _find_limit(codes, comparison), _find_dead_band(codes, output)
-    at_limit = _is_beyond(output, low, high)
+    rounded = 1.0 - 1e-9
+    at_limit = (output >= rounded * high) | (output <= rounded * low)
     repeated, p_repeated = _find_repeated_samples(comparison, codes, band, has_output & ~at_limit)
-    if repeated.any() and len(find_runs(at_limit)) == 1 and np.count_nonzero(
-            at_limit) - 1 <= 2 * max(run.stop - run.start for run in find_runs(repeated)):
-        # one run at a limit that is like the others is one of repeats
-        low, high, at_limit = -math.inf, math.inf, np.zeros_like(at_limit)
-        repeated, p_repeated = _find_repeated_samples(comparison, codes, band, has_output)
     valid = has_output & ~at_limit & ~repeated
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(

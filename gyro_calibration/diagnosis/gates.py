@@ -11,12 +11,10 @@
 """
 Conditions for a diagnosis: usable logs and models, and a reference of the motion of the gyro.
 
-The gates check whether gyro and reference show the same motion, in the same units, time and sense.
 Over spans, the change of the reference heading is regressed on the integral of the output and on
 time, at the lag of the best agreement. A factor far from 1 indicates a unit, a sign or a unit of
-time; a low coherence over all lengths of span, or over long ones, indicates another motion, or an
-axis that tilts. A gate that fails is the only finding. The kind of the reference, and whether its
-errors exceed those of the gyro, decide how a log is diagnosed.
+time; a low coherence over all lengths of span, or over long ones, another motion, or an axis that
+tilts. A gate that fails is the only finding.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -101,11 +99,11 @@ def is_sample_offset(estimate: float, deviation: float, interval: float) -> bool
 
 
 class _LineFit(NamedTuple):
-    """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
+    """Output = factor * rate + offset."""
 
     factor: float
     offset: float
-    deviation: float
+    deviation: float  # standard deviation of the factor
 
 
 def reference_rate(log: Log) -> Array | None:
@@ -208,7 +206,8 @@ def refuse_unusable(log: Log) -> None:
     log, _ = select_reference(log)
     if log.reference_rate is None:
         refuse_wrapped(log)
-    known, reference = np.isfinite(output), _used_reference(log)
+    known = np.isfinite(output)
+    reference = log.reference_heading if log.reference_rate is None else log.reference_rate
     has_reference = (np.zeros(len(known), dtype=bool) if reference is None
                      else np.isfinite(reference))
     both = int(np.count_nonzero(known & has_reference))
@@ -257,12 +256,7 @@ def refuse_unusable(log: Log) -> None:
 
 
 def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """
-    Return a log with the reference that is used, and remarks on it.
-
-    Of a heading and a rate it is that of `choose_reference`. A rate that consists of noise alone
-    is replaced by that of a rest.
-    """
+    """Return a log with the reference of `choose_reference`, 0 where it is noise, and remarks."""
     if log.time is None:
         return log, ()
     log, notes = choose_reference(log, prefer_rate=True)
@@ -310,11 +304,6 @@ def is_at_rest(log: Log) -> bool:
     return line is None or abs(line.factor) < 4.0 * line.deviation
 
 
-def _used_reference(log: Log) -> Array | None:
-    """Return the rate or the heading of the reference that is used; None without one."""
-    return log.reference_heading if log.reference_rate is None else log.reference_rate
-
-
 def _refuse_copy(log: Log, output: Array) -> None:
     """Refuse a reference computed from the output, or an output computed from the reference."""
     rates = [] if log.reference_rate is None else [log.reference_rate]
@@ -332,11 +321,7 @@ def _refuse_copy(log: Log, output: Array) -> None:
         # or no more than the rounding of both in the file
         printed = math.hypot(find_codes(output[known]).step,
                              slope * find_codes(rate[known]).step) / spread
-        # means with few decimals, in deg/s, may be on a line by chance
-        shown = output[known] / DEGREE
-        decimals = math.floor(-math.log10(2e-5 * spread / DEGREE))
-        is_coarse = np.abs(shown - np.round(shown, decimals)).max() < 1e-9 * spread
-        if off < 1e-6 and not is_coarse or off < 0.5 * printed < 1e-5:
+        if off < max(1e-6, 0.5 * printed * (printed < 2e-5)):
             raise DataRefused(
                 f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} '
                 'deg/s, to the last digit: one was computed from the other, without noise; '
@@ -351,7 +336,6 @@ def _unit_problem(log: Log, model: GyroModel) -> str:
     if not 0.1 < abs(scale) < 10.0:
         return (f'the scale factor of the model is {scale:.4g}, which is not plausible: it has '
                 'other units; write it in rad/s, or fit it again')
-    # By the reference, as the unit of the output may be wrong, which is a finding.
     fastest = float(np.nanquantile(np.abs(output if rate is None else rate), 0.99))
     widest = max(abs(limit) for limit in model.rate_range)
     if fastest > 20.0 * widest:
@@ -517,26 +501,21 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     is_excluded = is_implausible_factor(math.copysign(
         min(max(1.0, abs(scale) * (1.0 - half)), abs(scale) * (1.0 + half) / best.coherence),
         scale))
-    unit_gates = [*_unit_gates(*unit, log)]
-    is_other_axis = (is_excluded and not is_certain and unit_gates[-1].name == 'unit'
-                     and identify_unit_factor(*unit) is None)
-    yield _motion_gate(best, by_length, float(np.ptp(reference)), log,
-                       is_other_axis * f', where the output is {1.0 / scale:.2g} times the '
-                       'reference')
-    if is_certain or is_excluded and not is_other_axis:
-        yield from unit_gates
+    yield _motion_gate(best, by_length, float(np.ptp(reference)), log)
+    if is_certain or is_excluded:
+        yield from _unit_gates(*unit, log)
 
 
 def _motion_gate(best: _Agreement, by_length: Sequence[_Agreement], turned_angle: float,
-                 log: Log, other_axis: str = '') -> Gate:
+                 log: Log) -> Gate:
     evidence = (f'{100.0 * best.coherence:.3g} % of the variance of the heading over spans is '
-                f'common to gyro and reference{other_axis}')
+                'common to gyro and reference')
     longest = by_length[-1]
     if best.coherence - longest.coherence > 0.5 * _MIN_MOTION_COHERENCE:
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
-    elif best.coherence >= _MIN_MOTION_COHERENCE and not other_axis:
+    elif best.coherence >= _MIN_MOTION_COHERENCE:
         return Gate('motion', True, evidence)
-    # errors of a reference leave the factor as it is: it may have made half the turns of the gyro
+    # errors leave the factor as it is: the reference may have made half the turns of the gyro
     if turned_angle < 30.0 * DEGREE or longest.residual < 10.0 * DEGREE and all(
             each.factor + NORMAL_QUANTILE_975 * each.deviation > 0.5 * (1.0 - each.noise_share)
             for each in by_length):
@@ -552,7 +531,6 @@ def _motion_gate(best: _Agreement, by_length: Sequence[_Agreement], turned_angle
 
 def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
-    assert log.output is not None
     evidence = f'the output is {factor:.4g} times the reference'
     if not is_implausible_factor(factor):
         yield Gate('sense', True, f'{evidence}: the same sense')
@@ -564,8 +542,8 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     power = round(math.log10(abs(factor)))
     interval = 0.0 if log.time is None else float(np.median(np.diff(log.time)))
     slower = 10.0 ** power
-    correct_gyro = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
-                    '--sensitivity)')
+    correct_units = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
+                     '--sensitivity), or the unit of the reference (deg or rad)')
     if name == '-1' or name is None and not is_implausible_factor(-factor):
         yield Gate('sense', False, evidence,
                    'give or omit --invert, or change the sign of the column of the gyro', known)
@@ -575,31 +553,22 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
                    f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '
                    'agree',
-                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
-                   + ' (the stamps are in ms)' * (slower == 1e3)
-                   # units of time differ by powers of 1000
-                   + f'; or, if they are right, {correct_gyro}' * (power % 3 != 0), known)
-    elif name is not None and '180' in name:
-        fastest = float(np.nanquantile(np.abs(log.output), 0.99)) / DEGREE
-        either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
+                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}; or, if '
+                   f'the stamps are right, {correct_units}', known)
+    elif name is not None:
         yield Gate('unit', False, f'{evidence}, and {name} is {UNIT_FACTORS[name]:.5g}',
-                   'correct the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
-                   + ', or that of the reference heading (deg or rad)' * either, known)
+                   correct_units, known)
     else:
-        meaning = (', which is not plausible for a gyro' if name is None
-                   else f', and {name} is {UNIT_FACTORS[name]:.5g}')
-        yield Gate('unit', False, evidence + meaning,
-                   f'{correct_gyro}, or that of the reference'
-                   # a mean over time shows less of a fast motion, as does a line between values
-                   + ', or give one that is not smoothed or interpolated' * (
-                       name is None and factor > 1.0), known)
+        # a mean over time shows less of a fast motion, as does a line between values
+        yield Gate('unit', False, f'{evidence}, which is not plausible for a gyro',
+                   f'{correct_units}, or give a reference that is not smoothed or interpolated, '
+                   'or take another axis of the gyro', known)
 
 
 def reference_angle(log: Log) -> Array:
     """Return the heading of the reference at each sample, gaps interpolated, rad."""
-    assert log.time is not None
-    values = _used_reference(log)
-    assert values is not None
+    values = log.reference_heading if log.reference_rate is None else log.reference_rate
+    assert log.time is not None and values is not None
     if not np.isfinite(values).any():
         return np.zeros(len(values))
     return (bridge_gaps(values) if log.reference_rate is None
@@ -612,7 +581,7 @@ def compare_headings(log: Log, reference: Array) -> list[_Agreement]:
 
     Each is compared at the best lag, up to 25 of the shortest spans.
     """
-    values = _used_reference(log)
+    values = log.reference_heading if log.reference_rate is None else log.reference_rate
     assert log.time is not None and log.output is not None and values is not None
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _MIN_SPANS or np.isfinite(log.output).sum() < 2 * _MIN_SPANS:

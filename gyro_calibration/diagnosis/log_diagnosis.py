@@ -28,7 +28,7 @@ from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
-    Cause, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES, REFERENCES, slip_times,
+    Cause, CAUSES, make_finding, NOISE_NAMES, REFERENCES, slip_times,
     untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, strongest_findings
 from gyro_calibration.diagnosis.extended_model import (
@@ -101,16 +101,28 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : a diagnosis of these logs is not possible
 
     """
-    given_model, model = model, None if model is None else merge_self_calibration(model)
-    if any(log.time is None for log in logs):
-        if len(logs) > 1:
-            raise DataRefused(
-                f'{len(logs)} logs were given, and one has no time_s; give a rate table alone, '
-                'or give the sample rate in Hz with --rate')
-        found = replace(diagnose_table(logs[0], model, on_progress), logs=tuple(names))
-        return _keep_unextended_model(found, given_model)
+    merged = None if model is None else merge_self_calibration(model)
+    if all(log.time is not None for log in logs):
+        found = _diagnose_in_time(logs, generator, merged, names, on_progress, reference_kind)
+    elif len(logs) == 1:
+        found = replace(diagnose_table(logs[0], merged, on_progress), logs=tuple(names))
+    else:
+        raise DataRefused(
+            f'{len(logs)} logs were given, and one has no time_s; give a rate table alone, '
+            'or give the sample rate in Hz with --rate')
+    return (found if model is None or is_model_extended(found)
+            else replace(found, before=model, model=model))
+
+
+def _diagnose_in_time(logs: Sequence[Log], generator: np.random.Generator,
+                      model: GyroModel | None, names: Sequence[str], on_progress: OnProgress,
+                      reference_kind: str | None) -> Diagnosis:
+    """Check logs with time, and diagnose them by their kind of reference."""
     shown = names or [f'log {number}' for number in range(1, len(logs) + 1)]
-    _refuse_repeated_logs(logs, shown)
+    for one, other in combinations(range(len(logs)), 2):
+        if np.array_equal(require_output(logs[one]), require_output(logs[other]), equal_nan=True):
+            raise DataRefused(f'{shown[one]} and {shown[other]} have the same output; give each '
+                              'log once')
     on_progress(None, 'checks of the log')
     all_gates: list[Gate] = []
     for log in logs:
@@ -122,9 +134,12 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     given, remarks = logs, [remark for each in chosen for remark in each]
     logs, instants = zip(*(_use_own_values(log, remarks) for log in logs))
     for place, log in enumerate(logs):
-        passed = _examine(log, model, reference_kind, given[place],
-                          shown[place] if len(logs) > 1 else '')
-        if (mismatch := mismatch_diagnosis(passed, given_model)) is not None:
+        try:
+            passed = examine_log(log, model, reference_kind == 'rate_command', given[place])
+        except DataRefused as error:
+            name = f'{shown[place]}: ' * (len(logs) > 1)
+            raise DataRefused(f'{name}{error}') from None
+        if (mismatch := mismatch_diagnosis(passed, model)) is not None:
             return replace(mismatch, logs=tuple(names[place:place + 1]), remarks=(
                 *mismatch.remarks, *[f'This is of {shown[place]} alone.'] * (len(logs) > 1)))
         all_gates += passed
@@ -142,29 +157,10 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                      reference_kind == 'rate_command'))
     finally:
         forget_searches()
-    found = _keep_unextended_model(found, given_model)
-    findings = found.findings if len(logs) > 1 else mark_parts_of_log(found.findings)
     return complete_diagnosis(replace(
         found, logs=tuple(names), gates=tuple(all_gates),
-        findings=(*findings, *(each for each in slips if each is not None)),
+        findings=(*found.findings, *(each for each in slips if each is not None)),
         remarks=(*dict.fromkeys(remarks), *found.remarks)))
-
-
-def _refuse_repeated_logs(logs: Sequence[Log], names: Sequence[str]) -> None:
-    """Raise `DataRefused` if a log is given twice."""
-    for one, other in combinations(range(len(logs)), 2):
-        if np.array_equal(require_output(logs[one]), require_output(logs[other]), equal_nan=True):
-            raise DataRefused(f'{names[one]} and {names[other]} have the same output; give each '
-                              'log once')
-
-
-def _examine(log: Log, model: GyroModel | None, reference_kind: str | None, given: Log,
-             name: str) -> tuple[Gate, ...]:
-    """Return the gates of a log as `examine_log`; refusals begin with its name, if it has one."""
-    try:
-        return examine_log(log, model, reference_kind == 'rate_command', given)
-    except DataRefused as error:
-        raise DataRefused(f'{name}: {error}' if name else str(error)) from None
 
 
 def _refuse_different_references(logs: Sequence[Log], references: Sequence[Reference],
@@ -179,12 +175,6 @@ def _refuse_different_references(logs: Sequence[Log], references: Sequence[Refer
                 f'the gyro, and {names[other]} ({another}) cannot be diagnosed together with it: '
                 'give logs with one kind of reference (state it with --reference-kind if it is '
                 'the same), or diagnose each alone')
-
-
-def _keep_unextended_model(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
-    """Return a diagnosis with the model as it was given, if it is not extended."""
-    return (found if model is None or is_model_extended(found)
-            else replace(found, before=model, model=model))
 
 
 def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding | None]:
@@ -204,7 +194,7 @@ def _bridge_jumps(log: Log, kind: str, remarks: list[str]) -> tuple[Log, Finding
 
 
 def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | None]:
-    """Return a log with what its reference measured alone, when; add remarks on the rest."""
+    """Return a log with the values that its reference measured, and when; add remarks."""
     log, instants = keep_own_instants(log)
     if instants is not None:
         remarks.append('The reference has a value of its own every '
@@ -254,8 +244,10 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
     on_progress(None, 'findings')
-    findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed),
-                *searched.findings]
+    of_record = strongest_findings(quality)
+    covered = {name for each in of_record for name in each.ambiguous_with}
+    findings = [*_cause_findings(search, found, selection), *of_record, *searched.findings,
+                *(each for each in changed if each.effect not in covered)]
     # a motion that follows has noise of its own
     if model is not None and not searched.hidden:
         findings += find_changed_figures(found, model, rounds).values()
@@ -276,8 +268,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
     return Diagnosis(tuple(findings),
-                     (*_unexplained_structures(search, found, selection.unnamed),
-                      *searched.unexplained), noise, simulated, gain, before, after,
+                     tuple(_unexplained_structures(search, found, selection.unnamed)), noise,
+                     simulated, gain, before, after,
                      _untestable_causes(search, logs, searched.hidden),
                      residual_curves(left, shown), heading_curve(
                          *heading_contributions(shown, 0, None if changed else plain)),
@@ -316,7 +308,6 @@ class _Searched:
     causes: tuple[Candidate, ...]
     hidden: Collection[str] = ()  # causes that cannot be known beside the response of the motion
     findings: Sequence[Finding] = ()
-    unexplained: Sequence[Unexplained] = ()
     remarks: Sequence[str] = ()
     followed: Replay | None = None  # the first log, with the motion that follows
 
@@ -326,23 +317,14 @@ def _search_logs(logs: Sequence[Log], replays: Sequence[Replay], on_progress: On
     """Search for causes, given the motion that follows where a log follows its reference."""
     plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
     replays = plain.problem.replays
-    follows = follows_rate(replays) and (is_command or is_late(plain))
-    if not follows:
-        found = _search_replays(_drop_unknown_ends(plain), on_progress)
-        replays = found.search.problem.replays
-        if RESPONSE not in {each.cause for each in found.causes}:
-            return found
-    followed, lag = follow_reference(replays, follows)
-    moved = fit_causes(build_problem(followed), [])
-    within = _find_settled(moved) if follows and len(logs) == 1 else None
+    if not (follows_rate(replays) and (is_command or is_late(plain))):
+        return _search_replays(_drop_unknown_ends(plain), on_progress)
+    followed, lag = follow_reference(replays)
+    within = (_find_settled(fit_causes(build_problem(followed), [])) if len(logs) == 1 else None)
     replays = followed if within is None else [drop_samples(followed[0], ~within)]
-    found = _search_replays(replays, on_progress, {RESPONSE, *HIDDEN_CAUSES})
-    if follows:
-        return replace(found, findings=lag, followed=followed[0],
-                       remarks=[] if within is None else [_SETTLED_REMARK])
-    before, after = map(_residual_variance, (plain, moved))
-    return replace(found, unexplained=[Unexplained(
-        'rate_change', max(1.0 - after / before, 0.0), MIN_PROBABILITY)])
+    return replace(_search_replays(replays, on_progress, {RESPONSE, *HIDDEN_CAUSES}),
+                   findings=lag, followed=followed[0],
+                   remarks=[] if within is None else [_SETTLED_REMARK])
 
 
 def _drop_unknown_ends(plain: RegressionFit) -> Sequence[Replay]:
@@ -378,9 +360,8 @@ def _find_settled(fit: RegressionFit) -> Mask | None:
     """
     Return the samples in dwells of a motion if the residual is larger between them, or None.
 
-    The motion then has more of its own than a response to its command. The mean squares of the
-    residual are compared stretch by stretch (Mann and Whitney). Dwells of less than half the range
-    of rates, such as rests alone, do not show what the motion does.
+    The mean squares of the residual are compared stretch by stretch (Mann and Whitney). Dwells of
+    less than half the range of rates, such as rests alone, do not show what the motion does.
     """
     replay, = fit.problem.replays
     time, rate = replay.channels.time, np.asarray(replay.channels.rate)
@@ -437,13 +418,6 @@ def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) ->
             float(replays[log_index or 0].channels.time[-1]), confounders)
         yield (found if log_index is None or len(replays) == 1 or not found.evidence else
                replace(found, evidence=f'in log {log_index + 1}, {found.evidence}'))
-
-
-def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
-    """Return the findings of records, and changed values that they do not explain."""
-    best = strongest_findings(quality)
-    covered = {name for each in best for name in each.ambiguous_with}
-    return [*best, *(each for each in changed if each.effect not in covered)]
 
 
 def _mean_bias_deviation(fit: RegressionFit, noise: Noise) -> float:

@@ -113,18 +113,16 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
         extended, found = _withdraw_differing_causes(extended, found, each_alone)
     time_is_up = on_progress(None, 'cross-validation')
     events = [each for each in extended.causes if each.is_single_event]
-    lasting_terms = [each for each in extended.causes if not each.is_single_event]
-    lasting = (extended if not events else plain if not lasting_terms
-               else fit_spans(plain.spans, lasting_terms))
-    gain = None if time_is_up else _cross_validated_gain(plain, lasting)
-    model_fit = lasting
+    lasting = [each for each in extended.causes if not each.is_single_event]
+    model_fit = (extended if not events else plain if not lasting
+                 else fit_spans(plain.spans, lasting))
+    gain = None if time_is_up else _cross_validated_gain(plain, model_fit)
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
-        model_fit = plain
+        model_fit, gain = plain, _cross_validated_gain(plain, plain)
         if not plain.spans.treatment.is_fine:
-            found = _suspect(found, lasting_terms)
+            found = _suspect(found, lasting)
             extended = fit_spans(plain.spans, events) if events else plain
-        gain = _cross_validated_gain(plain, plain)
     on_progress(None, 'findings')
     of_logs, of_record = _heading_contributions(extended), strongest_findings(records)
     # between two clocks neither a delay nor a clock rate is a property of the gyro
@@ -236,12 +234,6 @@ def _differences_of_logs(fit: SpanFit, each_alone: Sequence[SpanFit]) -> Iterato
         yield ('Each log has a delay by its own clock: '
                f'{", ".join(f"{1000.0 * delay:.4g}" for delay in joined.delays.tolist())} ms in '
                'turn, which is corrected.')
-    missing = [name for name in MIN_CHANNEL_RANGE if getattr(fit.spans.log, name) is None
-               and any(getattr(each.spans.log, name) is not None for each in each_alone)]
-    if missing:
-        yield (f'Not every log has a {" and a ".join(missing).replace("_", " ")}, which is not '
-               'used; what it causes may be taken for a drift or a warm-up: give logs that have '
-               'it.')
     scales, variances = np.array([(each.values[0], each.normal_covariance[0, 0])
                                   for each in each_alone]).T
     # another cause may differ between the motions of the logs
@@ -742,8 +734,7 @@ def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
-    return (cause == 'clock_rate' or effect is not None
-            and 'rate' in effect.inputs)
+    return cause == 'clock_rate' or effect is not None and 'rate' in effect.inputs
 
 
 def _term_of(cause: Candidate) -> CauseTerm:
@@ -754,23 +745,16 @@ def select_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[SelectedCause]]:
     """Search for causes, and fit again with those that are established."""
     terms = _propose_terms(fit)
+    candidates = tuple(span_candidate(each.cause, *each.shapes) for each in terms)
     # noise given one column of each cause, so that it does not absorb their contributions
     rich = [*{each.cause: each for each in terms if each.cause != SINE_RESPONSE.name}.values()]
     # of a log with fewer spans than columns, the noise is that without them
     noise_fit = (fit_spans(fit.spans, rich)
                  if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
-    candidates, at = tuple(span_candidate(each.cause, *each.shapes) for each in terms), fit
-    for _ in range(2):
-        search = Search(SpanProblem.of(at, noise_fit), candidates,
-                        false_alarm_rate / (1 + len(indices_by_cause(candidates))),
-                        {'bias_step': find_span_steps}, on_progress=on_progress)
-        causes = search_causes(search)
-        # once more, at the rate without these causes: similar ones differ in higher order
-        of_rate = [_term_of(each) for each in causes
-                   if _follows_the_rate(each.cause) and each.cause != 'clock_rate']
-        if not of_rate:
-            break
-        at = fit_spans(fit.spans, of_rate)
+    search = Search(SpanProblem.of(fit, noise_fit), candidates,
+                    false_alarm_rate / (1 + len(indices_by_cause(candidates))),
+                    {'bias_step': find_span_steps}, on_progress=on_progress)
+    causes = search_causes(search)
     found = [*explain_selection(search, confirm_causes(search, causes))]
     while established := [_term_of(each.cause) for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)

@@ -459,6 +459,8 @@ def is_single_event(cause: Candidate) -> bool:
     return cause.log_index is not None and cause.cause in CATALOGUE
 
 
+# columns, which many fits need
+
 @lru_cache(maxsize=16)
 def _with_distorted_rate(replay: Replay,
                          distortions: tuple[tuple[str, tuple[float, ...]], ...]) -> Replay:
@@ -470,8 +472,6 @@ def _with_distorted_rate(replay: Replay,
     assert distortion is not None
     return before.with_rate(distortion(before.channels.rate, before.channels.time, *shapes))
 
-
-# columns are needed in many fits, as in a search for a shape
 
 @lru_cache(maxsize=64)
 def columns_of(candidate: Candidate, log: Any) -> Array:

@@ -113,10 +113,9 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     Return a grid of noises that a residual may have.
 
     The random walk ranges from a small part of the white noise at the lowest frequency of the log
-    to as much as the white noise at its highest. A Gauss-Markov process, which flicker may
-    replace, has a correlation time between some samples and this duration. Combinations in which
-    one of them is small beside the other at all frequencies are left out. The variance of a walk
-    alone is known the better, the more coefficients it dominates.
+    to as much as the white noise at its highest; that of a walk alone is known the better, the
+    more coefficients it dominates. Combinations with a Gauss-Markov process, which flicker may
+    replace, are left out if one is small beside the other at all frequencies.
     """
     # a share of a variance that is small; and the largest logarithm of the ratio of neighbours
     small, lowest, step = 0.1, (math.pi / duration) ** 2, 0.9
@@ -421,7 +420,15 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     time = _even_time(log.time)
     prepared_log = resample_reference(replace(select_reference(log)[0], time=time))
     is_heading = prepared_log.reference_rate is None and prepared_log.reference_heading is not None
-    reference, smooth = _reference_rates(prepared_log, time)
+    # the reference rate for the comparison, and without gaps for delays and lags of effects
+    if is_heading:
+        assert prepared_log.reference_heading is not None
+        reference, smooth = _heading_rates(time, prepared_log.reference_heading)
+    else:
+        reference = (np.zeros(len(time)) if prepared_log.reference_rate is None
+                     else prepared_log.reference_rate)
+        known = np.isfinite(reference)
+        smooth = np.interp(time, time[known], reference[known])
     kept = usable & np.isfinite(reference) & np.isfinite(log.output)
     if log.reference_rate is None:
         kept &= (~_find_corners(reference, log.output, kept,
@@ -498,11 +505,11 @@ def _even_time(time: Array) -> Array:
     """Return the time since the first sample, s; that of the even grid for stamps in bursts."""
     try:
         stamps = fit_stamp_grid(time)
+        if stamps.has_bursts:
+            return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
     except DataRefused:
-        return time - time[0]
-    if not stamps.has_bursts:
-        return time - time[0]
-    return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
+        pass
+    return time - time[0]
 
 
 def _fit_rounded_output(output: Array, rate: Array, step: float, expected_at: Array) -> Array:
@@ -548,16 +555,6 @@ def _rounding_errors(output: Array, rate: Array, valid: Mask, step: float) -> tu
     size = size[size[:, 0] > 0.01 * noise] / math.sqrt(2.0)
     angle = order[:len(size)] * expected
     return np.concatenate([size * np.cos(angle), size * np.sin(angle)]) / noise, noise
-
-
-def _reference_rates(log: Log, time: Array) -> tuple[Array, Array]:
-    """Return the reference rate for the comparison, and the one without gaps for effects."""
-    if log.reference_rate is not None:
-        known = np.isfinite(log.reference_rate)  # delays and lags of effects need all
-        return log.reference_rate, np.interp(time, time[known], log.reference_rate[known])
-    if log.reference_heading is not None:
-        return _heading_rates(time, log.reference_heading)
-    return np.zeros(len(time)), np.zeros(len(time))
 
 
 @cache
@@ -683,9 +680,8 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     Return where the rate of a heading has corners that its samples do not resolve, shape (n,).
 
     At a corner, a spline through the heading and the trapezoidal integral of the output differ by
-    a 72nd of the sixth difference, which passes for a dead zone or a slip. That of a smooth
-    motion is small at any acceleration; that of a noisy reference, or of a motion that jitters, is
-    everywhere, and a corner differs from it by more than chance.
+    a 72nd of the sixth difference, which passes for a dead zone or a slip. That of a noisy
+    reference, or of a motion that jitters, is everywhere, and a corner exceeds it.
     """
     bend = np.abs(np.diff(np.pad(rate, 3, mode='edge'), 6)) / 72.0
     white = white_noise_deviation((output - rate)[valid])

@@ -20,14 +20,13 @@ that are held out, and if the interval of its size excludes 0.
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations
 import math
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
+    Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import (
     cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, slip_times)
@@ -85,7 +84,6 @@ class Search:
     unidentifiable: frozenset[str] = frozenset()
     # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
-    finds_several: bool = True  # whether several steps are searched for at once
 
     def candidate_evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
@@ -242,7 +240,7 @@ def _is_lasting(candidate: Candidate) -> bool:
     """
     Tell whether a cause acts in all logs and has a free size: only such causes are suspected.
 
-    A limit or a delay has no size apart from its shape, and its refinement would fit single peaks.
+    The refinement of a limit or a delay would fit single peaks.
     """
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
@@ -260,13 +258,11 @@ def search_causes(search: Search) -> Causes:
     everything = _select_forward(search)
     if all(is_named(each) for each in everything):
         return everything
-    # without generic terms nothing tells a part from another structure in time
-    named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates)),
-                                    finds_several=False))
+    named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates))))
     return max((everything, named),
-               key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
+               key=lambda causes: fit_causes(search.problem, causes).log_likelihood - sum(
                    complexity_penalty(each)
-                   + (0.0 if is_named(each) else _UNNAMED_PENALTY) for each in named))
+                   + (0.0 if is_named(each) else _UNNAMED_PENALTY) for each in causes))
 
 
 def _select_forward(search: Search) -> Causes:
@@ -275,69 +271,10 @@ def _select_forward(search: Search) -> Causes:
         if search.on_progress(None, f'search for causes, {len(named)} found'):
             break
         one_more = _find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
-        more = _with_several(search, named) if one_more is None else (*named, one_more)
-        if not more:
+        if one_more is None:
             break
-        named = _eliminate_backward(search, refine_jointly(search, more))
+        named = _eliminate_backward(search, refine_jointly(search, (*named, one_more)))
     return named
-
-
-def _with_several(search: Search, causes: Causes) -> Causes:
-    """
-    Return causes with several more, steps of the bias among them; nothing without them.
-
-    A random walk explains several steps, or steps and a drift, about as well as any one of them:
-    they are looked for in white noise, and must be significant together. A drift replaces the
-    steps that follow it.
-    """
-    if 'bias_step' not in search.scans or not search.finds_several:
-        return ()
-    problem, grown, tried = search.problem, causes, []
-    white = replace(
-        search, scans={}, candidates=tuple(filter(_is_lasting, search.candidates)),
-        problem=problem.with_noises([0]))  # white
-    while len(grown) < MAX_CAUSES:
-        step, evidence = max(search.scans['bias_step'](fit_causes(white.problem, grown)),
-                             key=lambda each: each[1] - each[0].penalty)
-        # the first of a pair may not be significant alone
-        if len(grown) > len(causes) + 1 and p_value(
-                'bias_step', evidence - step.penalty) > search.rate:
-            break
-        grown = _refine_in_turn(white, (*grown, step), len(causes))
-        tried.append(grown)
-    for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
-                           key=lambda each: each[0].penalty - each[1])[:3]:
-        tried.append(_eliminate_backward(
-            white, _refine_in_turn(white, (*grown, drift), len(causes))))
-
-    def evidence_of(several: Causes) -> float:
-        """Return the evidence for several in place of the causes beyond that of noise alone."""
-        score, before = (fit_causes(problem, some).log_likelihood
-                         - sum(map(complexity_penalty, some)) for some in (several, causes))
-        more = max(len(several) - len(causes), 1)
-        return score - before - 0.5 * float(chi2.isf(search.rate / len(tried), more))
-
-    def are_apart(several: Causes) -> bool:
-        """Tell whether no steps of opposite signs are as near as the ends of a pulse, or a gap."""
-        steps = [each for each in several if each.cause == 'bias_step']
-        return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
-                   or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
-                   >= problem.durations[one.log_index or 0]
-                   for one, other in combinations(steps, 2))
-
-    best = max(filter(are_apart, tried), key=evidence_of, default=())
-    if not best or evidence_of(best) < 0.0:
-        return ()
-    best = _eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
-    return best if len(best) > len(causes) + 1 else ()
-
-
-def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
-    """Refine the shape of each cause from a first on, given the others, and then all together."""
-    for place in range(first, len(causes)):
-        fit = fit_causes(search.problem, _without(causes, place))
-        causes = (*causes[:place], refine_shape(fit, causes[place])[0], *causes[place + 1:])
-    return refine_jointly(search, causes)
 
 
 def _without(causes: Sequence[Candidate], place: int) -> Causes:
@@ -543,12 +480,10 @@ def _remove_unconfirmed(search: Search, causes: Causes,
 
 def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """Return the gain of each cause on held-out stretches in standard deviations."""
-    full, found = fit_causes(search.problem, causes), []
-    for place, known in enumerate(causes):
-        rest = fit_causes(search.problem, _without(causes, place))
-        gains = search.problem.held_out_gains(full, rest, known)
-        found.append(math.inf if gains is None else prediction_sigmas(gains))
-    return found
+    full = fit_causes(search.problem, causes)
+    gains = [search.problem.held_out_gains(full, fit_causes(
+        search.problem, _without(causes, place)), known) for place, known in enumerate(causes)]
+    return [math.inf if each is None else prediction_sigmas(each) for each in gains]
 
 
 def _choose_simplest(search: Search, named: Causes,

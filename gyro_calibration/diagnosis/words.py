@@ -19,7 +19,7 @@ from gyro_calibration.diagnosis.causes import CAUSES, NOISE_NAMES
 from gyro_calibration.diagnosis.findings import (
     DETECTION_POWER, Diagnosis, Estimate, Finding, MIN_PROBABILITY)
 from gyro_calibration.files import to_printable
-from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import have_same_effects
 
 #: SI unit -> displayed unit and the factor to it, except for degrees instead of radians.
@@ -154,18 +154,9 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         return (verdict + ' beyond the errors of the reference' * reference_errs
                 + f'; suspected: {suspected}' * bool(suspected) + '.', gain)
 
-    def is_fault_of_samples(found: Finding) -> bool:
-        """Tell whether a finding is of single samples of the record, not of all of its output."""
-        cause = CAUSES.get(found.effect)
-        return cause is not None and cause.origin == 'record' and cause.along == 'time'
-
     parts = []
     established = sorted((each for each in diagnosis.findings if each.status == 'established'),
-                         key=lambda each: (is_fault_of_samples(each),
-                                           -(each.share_of_heading_error or 0.0)))
-    if established and not diagnosis.unexplained and is_fault_of_samples(established[0]):
-        return ('No error of the gyro is established; the record has '
-                f'{_list_causes(established)}.', gain)
+                         key=lambda each: -(each.share_of_heading_error or 0.0))
     if established:
         parts.append('because of ' + f'{len(established)} causes: ' * (len(established) > 1)
                      + _list_causes(established))
@@ -236,12 +227,7 @@ def _gain_sentence(diagnosis: Diagnosis) -> str:
     if not diagnosis.model.terms:
         model = 'A model with the best bias and scale factor error is not offered: it'
     elif not is_extended:
-        values = []  # with their intervals of 95 %
-        for effect, parameter, value, deviation in diagnosis.model.estimates():
-            half = NORMAL_QUANTILE_975 * deviation if math.isfinite(deviation) else 0.0
-            size = Estimate.from_half_width(value, half, parameter.unit)
-            values.append(f'{readable_name(effect)} {format_quantity(size, effect)}')
-        model = f'The model, {" and ".join(values)} alone,'
+        model = 'The model, of bias and scale factor error alone,'
     what, change, unit = gain.rows()[0]
     does, note = 'changes', '; the 95 % interval of the reduction includes zero'
     if change.interval is None:

@@ -181,6 +181,14 @@ def test_samples_that_quantization_repeats_are_no_repeated_samples(step, generat
     assert list(found(coarse(swing(generator), step * SIGMA))) == ['quantization']
 
 
+@pytest.mark.parametrize('digits', [3, 4])
+def test_codes_that_grow_with_their_values_are_no_repeated_samples(digits, generator):
+    log = swing(generator, scale=4.0)
+    written = np.array([float(f'{each:.{digits}g}') for each in (log.output / DEGREE).tolist()])
+    assert 'stuck_samples' not in found(replace(
+        log, output=written * DEGREE, reference_rate=4.0 * log.reference_rate))
+
+
 def robot(generator, step=0.0):
     """Return a log without a reference of a robot that turns and rests, 20 samples a second."""
     rate = np.repeat(np.where(np.arange(160) % 2, generator.normal(0.0, 0.6, 160), 0.0), 30)
@@ -349,18 +357,6 @@ def test_a_log_that_allows_a_diagnosis_is_accepted():
     refuse_unusable(replace(GOOD, output=GOOD.output * half,
                             reference_rate=GOOD.reference_rate * half[::-1]))
     refuse_unusable(replace(GOOD, output=GOOD.output / DEGREE))
-
-
-@pytest.mark.parametrize('decimals', [2, 7])
-def test_coarse_dwells_may_be_on_a_line_by_chance(decimals):
-    """As means in deg/s with two decimals, of a gyro with less noise and a round scale factor."""
-    rate = np.repeat(np.arange(-50.0, 51.0, 10.0), 3)
-    noise = 5e-4 * np.random.default_rng(3).standard_normal(len(rate))
-    log = Log(output=DEGREE * np.round(0.996 * rate - 0.09 + noise, decimals),
-              reference_rate=DEGREE * rate)
-    refuse_unusable(log)
-    with pytest.raises(DataRefused, match='to the last digit'):
-        refuse_unusable(replace(log, output=DEGREE * np.round(0.996123 * rate - 0.09, 7)))
 
 
 RECORDINGS = {

@@ -128,20 +128,6 @@ def test_fixes_in_deg_that_are_named_rad_have_another_unit_and_are_not_wrapped(w
         assert failed.name == 'unit' and 'deg or rad' in failed.remedy, failed.evidence
 
 
-def tilted(seed, noise):
-    """Return a log of an axis that sees 15 % of the turns, and noise of its own."""
-    generator, log = np.random.default_rng(seed), drive(seed)
-    vibration = np.repeat(generator.standard_normal(len(TIME) // 10), 10)
-    return replace(log, output=0.15 * MOTION + noise * vibration)
-
-
-@pytest.mark.parametrize('seed', seeds(3))
-def test_an_axis_that_follows_in_part_by_another_factor_is_another_motion(seed):
-    # half of the variance is common, which alone passes as the noise of a reference
-    gate, = (each for each in check_gates(tilted(seed, 0.2)) if each.passed is False)
-    assert gate.name == 'motion' and 'the output is 0.' in gate.evidence, gate
-
-
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
 def test_a_gyro_that_follows_passes_all_gates(noise):
     assert all(gate.passed for gate in check_gates(drive(1, noise)))
