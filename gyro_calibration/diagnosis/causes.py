@@ -241,8 +241,35 @@ def slip_times(times: Iterable[float]) -> dict[str, Estimate]:
 
 def mark_suspected(found: Finding) -> Finding:
     """Return a finding as suspected, with the experiment that would establish it as remedy."""
-    return replace(found, status='suspected', remedy=CAUSES[found.effect].separate_by
-                   or 'record longer, and check that it is found again')
+    separate_by = CAUSES[found.effect].separate_by
+    if not separate_by:
+        remedy = 'record longer, and check that it is found again'
+    elif separate_by.startswith('record again'):
+        remedy = separate_by
+    else:
+        remedy = f'record again: {separate_by}'
+    return replace(found, status='suspected', remedy=remedy)
+
+
+def mark_parts_of_log(findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings of one log; steps of the bias that cancel are an effect of a part of it."""
+    marked = list(findings)
+    places = [place for place, each in enumerate(marked)
+              if each.effect == 'bias_step' and each.status == 'established']
+    places.sort(key=lambda place: marked[place].where or ())
+    while len(places) > 1:
+        first, second = places[0], places[1]
+        one, other = (marked[place].parameters['bias_step'] for place in (first, second))
+        begin, end = (marked[place].where for place in (first, second))
+        places = places[1:]
+        if begin and end and abs(one.estimate + other.estimate) < NORMAL_QUANTILE_975 * math.hypot(
+                one.deviation, other.deviation):
+            marked[first] = replace(marked[first], where=(begin[0], end[0]),
+                                    cause='The bias differs in a part of the log.')
+            marked[second] = replace(marked[second],
+                                     cause='The bias returns to its earlier value.')
+            places = places[1:]
+    return marked
 
 
 #: Remedy of an event that is not added to a model.

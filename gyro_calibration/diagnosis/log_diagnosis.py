@@ -28,7 +28,7 @@ from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
     PART_OF_LOG, RESPONSE, unnamed_variable)
 from gyro_calibration.diagnosis.causes import (
-    Cause, CAUSES, make_finding, NOISE_NAMES, REFERENCES, slip_times,
+    Cause, CAUSES, make_finding, mark_parts_of_log, NOISE_NAMES, REFERENCES, slip_times,
     untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, strongest_findings
 from gyro_calibration.diagnosis.extended_model import (
@@ -157,9 +157,10 @@ def _diagnose_in_time(logs: Sequence[Log], generator: np.random.Generator,
                      reference_kind == 'rate_command'))
     finally:
         forget_searches()
+    findings = found.findings if len(logs) > 1 else mark_parts_of_log(found.findings)
     return complete_diagnosis(replace(
         found, logs=tuple(names), gates=tuple(all_gates),
-        findings=(*found.findings, *(each for each in slips if each is not None)),
+        findings=(*findings, *(each for each in slips if each is not None)),
         remarks=(*dict.fromkeys(remarks), *found.remarks)))
 
 

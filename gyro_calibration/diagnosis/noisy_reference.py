@@ -234,6 +234,12 @@ def _differences_of_logs(fit: SpanFit, each_alone: Sequence[SpanFit]) -> Iterato
         yield ('Each log has a delay by its own clock: '
                f'{", ".join(f"{1000.0 * delay:.4g}" for delay in joined.delays.tolist())} ms in '
                'turn, which is corrected.')
+    missing = [name for name in MIN_CHANNEL_RANGE if getattr(fit.spans.log, name) is None
+               and any(getattr(each.spans.log, name) is not None for each in each_alone)]
+    if missing:
+        yield (f'Not every log has a {" and a ".join(missing).replace("_", " ")}, which is not '
+               'used; what it causes may be taken for a drift or a warm-up: give logs that have '
+               'it.')
     scales, variances = np.array([(each.values[0], each.normal_covariance[0, 0])
                                   for each in each_alone]).T
     # another cause may differ between the motions of the logs
@@ -734,7 +740,8 @@ def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
-    return cause == 'clock_rate' or effect is not None and 'rate' in effect.inputs
+    return (cause == 'clock_rate' or effect is not None
+            and 'rate' in effect.inputs)
 
 
 def _term_of(cause: Candidate) -> CauseTerm:

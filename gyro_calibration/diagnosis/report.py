@@ -204,6 +204,13 @@ def _rate_unit(values: Array) -> tuple[str, float]:
     return display_unit('rad/s', 'bias_instability' if 0.0 < largest < 2e-3 * DEGREE else '')
 
 
+def _time_unit(time: Array) -> tuple[str, float]:
+    """Return the unit in which people read times of a log, and the factor to it."""
+    duration = float(np.ptp(time)) if len(time) else 0.0
+    return (('s', 1.0) if duration <= 600.0 else ('min', 1.0 / 60.0) if duration <= 14400.0
+            else ('h', 1.0 / 3600.0))
+
+
 def _error_charts(curve: Curve, place: int) -> Iterator[Chart]:
     """Give the error of the gyro as simulated and as measured, where it is known."""
     if curve.simulated is None:
@@ -221,7 +228,7 @@ def _error_charts(curve: Curve, place: int) -> Iterator[Chart]:
 
 def _horizontal(curve: Curve) -> tuple[str, str, Array]:
     """Return label, unit and values of the horizontal axis."""
-    unit, factor = display_unit(curve.unit)
+    unit, factor = _time_unit(curve.at) if curve.along == 'time' else display_unit(curve.unit)
     return readable_name(curve.along), unit, factor * curve.at
 
 
@@ -242,8 +249,9 @@ def _residual_chart(curve: Curve, place: int) -> Chart:
 
 def _heading_chart(curve: Curve) -> Chart:
     time, before, after = _thin_points(curve.at, curve.before, curve.after)
+    unit, factor = _time_unit(time)
     return Chart('heading', 'Heading error over the log', 'Heading error of the simulation.',
-                 'time', 's', time, 'heading error', 'deg',
+                 'time', unit, factor * time, 'heading error', 'deg',
                  _before_and_after(before / DEGREE, after / DEGREE))
 
 

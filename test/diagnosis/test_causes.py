@@ -18,7 +18,8 @@ import zlib
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
 from gyro_calibration.diagnosis.causes import (
-    cause_finding, cause_parameters, CAUSES, next_experiment, value_finding)
+    cause_finding, cause_parameters, CAUSES, make_finding, mark_suspected, next_experiment,
+    value_finding)
 from gyro_calibration.diagnosis.findings import (
     detectable_sigmas, Estimate, MIN_PREDICTION_SIGMAS, prediction_sigmas, probabilities)
 from gyro_calibration.diagnosis.replay import replay
@@ -73,6 +74,12 @@ def test_a_set_that_is_found_has_its_experiment():
     assert all(CAUSES[name].separate_by for name in finding.ambiguous_with)
 
 
+@pytest.mark.parametrize('name', ['rate_ramp', 'bias_step', 'time_offset'])
+def test_the_remedy_of_a_suspected_cause_says_once_that_it_is_to_be_recorded_again(name):
+    remedy = mark_suspected(make_finding(name, {}, 0.01)).remedy
+    assert remedy.count('record again') == 1 and CAUSES[name].separate_by in remedy
+
+
 # The rules by which causes are named
 
 SIZE = {'warm_up': Estimate.from_half_width(1.0, 0.5, 'rad/s')}
@@ -108,7 +115,6 @@ def test_a_finding_holds_its_set_the_experiment_and_how_sure_it_is():
     assert {*found.probability} == {'warm_up', 'rate_ramp'} and found.p_value > 0.0
     assert found.minimum_detectable == pytest.approx(4.0 * SIZE['warm_up'].deviation)
     assert 'rest for 20 min' in found.separate_by and found.status == 'suspected'
-    assert found.remedy == CAUSES['warm_up'].separate_by
 
 
 def test_sine_and_cosine_are_amplitude_and_phase():

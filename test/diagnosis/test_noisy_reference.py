@@ -23,8 +23,9 @@ from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import select_causes
+from gyro_calibration.diagnosis.noisy_reference import select_causes, span_candidate
 from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.search import Selection
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, select_rows
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -35,6 +36,7 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
+from scipy.stats import t as student
 
 RATE, BIAS_TRUE, SCALE, DELAY = 25.0, 0.3 * DEGREE, 0.004, 0.4
 
@@ -287,20 +289,31 @@ def test_a_sine_response_and_a_cubic_nonlinearity_are_a_set_where_they_look_alik
 
 
 @pytest.mark.parametrize('seed', seeds(3))
-@pytest.mark.parametrize('size, walk, white, step', [
-    (0.0, 1e-4, 2e-4, 0.5), (0.0, 1e-4, 2e-4, 0.0), (0.017, 5e-5, 2e-4, 0.36),
-    (3e-4, 0.0, 2e-5, 0.0), (3e-4, 0.0, 2e-5, 0.2)])
-def test_a_step_of_the_bias_is_found_beside_a_random_walk_and_a_walk_is_no_step(
-        size, walk, white, step, seed):
-    """The smallest, of 0.017 deg/s, is not significant under a walk that is fitted without it."""
-    found = diagnosed(turning_log(seed, lambda time, generator: size * (time > 130.0) + walk
+@pytest.mark.parametrize('step', [0.5, 0.0])
+def test_a_random_walk_of_the_bias_is_no_step(step, seed):
+    found = diagnosed(turning_log(seed, lambda time, generator: 1e-4 * np.cumsum(
+        generator.standard_normal(len(time))) / np.sqrt(RATE), step))
+    assert not [each for each in found.findings if each.effect == 'bias_step']
+
+
+@pytest.mark.parametrize('seed', seeds(4))
+def test_a_step_is_found_beside_a_random_walk_after_which_few_stretches_show_it(seed):
+    found = diagnosed(turning_log(seed, lambda time, generator: 0.017 * (time > 130.0) + 5e-5
                                   * np.cumsum(generator.standard_normal(len(time))) / np.sqrt(
-                                      RATE), step, white))
-    steps = [each.parameters['bias_step'] for each in found.findings if each.effect == 'bias_step']
-    assert len(steps) == bool(size)
-    for each in steps:
-        low, high = each.interval
-        assert low < size < high and high - low < max(0.3 * size, 2e-4)
+                                      RATE), 0.36))
+    step, = (each for each in found.findings if each.effect == 'bias_step')
+    low, high = step.parameters['bias_step'].interval
+    assert low < 0.017 < high and high - low < 5e-3
+
+
+@pytest.mark.parametrize('seed', seeds(3))
+@pytest.mark.parametrize('step', [0.0, 0.2])
+def test_a_small_step_of_a_good_gyro_is_no_random_walk(step, seed):
+    """Of 0.017 deg/s; without a step the fit has a random walk under which none is significant."""
+    found = established(diagnosed(turning_log(
+        seed, lambda time, _: 3e-4 * (time > 130.0), step, 2e-5)))
+    low, high = found['bias_step'].parameters['bias_step'].interval
+    assert low < 3e-4 < high and high - low < 2e-4
 
 
 HIDDEN = {
@@ -323,15 +336,21 @@ def test_a_large_effect_is_established_by_a_course_and_its_model_predicts_the_he
             f'{1000.0 * errors["motion"]:.2g} ms times the rate') in ' '.join(found.remarks)
 
 
-def test_a_step_of_the_bias_beside_a_course_is_established_and_in_no_model():
+@pytest.mark.parametrize('ends', [(140.0,), (70.0, 150.0)], ids=str)
+def test_a_step_of_the_bias_beside_a_course_is_established_and_in_no_model(ends):
     found = diagnosed(drive(6, hidden=lambda time, rate, heading, temperature: 0.01 * (
-        time > 140.0)))
+        np.searchsorted(ends, time) == 1)))
     assert 'bias_step' not in {term.effect.name for term in found.model.terms}
-    step = established(found)['bias_step']
-    for name, true in (('bias_step', 0.01), ('step_time', 140.0)):
-        low, high = step.parameters[name].interval
-        assert low < true < high and high - low < (2e-3 if name == 'bias_step' else 10.0)
-    assert step.where[1] == pytest.approx(240.0, abs=5.0)
+    steps = sorted((each for each in found.findings if each.effect == 'bias_step'),
+                   key=lambda each: each.where)
+    assert [each.status for each in steps] == ['established'] * len(ends), terminal_lines(found)
+    for each, time, size in zip(steps, ends, (0.01, -0.01)):
+        for name, true in (('bias_step', size), ('step_time', time)):
+            low, high = each.parameters[name].interval
+            assert low < true < high and high - low < (2e-3 if name == 'bias_step' else 10.0)
+    assert ('part of the log' in steps[0].cause) == (len(ends) == 2)
+    assert ('bias step at ' in ' '.join(terminal_lines(found))) == (len(ends) == 2)
+    assert steps[0].where[1] == pytest.approx(ends[1] if len(ends) == 2 else 240.0, abs=5.0)
 
 
 def turning_once(seed):

@@ -343,17 +343,32 @@ def test_lines_for_a_terminal_are_not_too_long(made):
 # the page in a browser
 
 WIDTHS = {'watch': 320, 'phone': 390, 'desk': 1280}
-#: For each frame: its width, that of its content, its background, and elements that reach beyond
-#: its right edge except inside scrolling boxes.
+#: For each frame: its width, that of its content, elements that reach beyond its right edge except
+#: inside scrolling boxes, and the least contrast of texts, letters of charts, and strokes (WCAG 2,
+#: 1.4.3 and 1.4.11).
 MEASURE = """
+const light = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map(Number)
+  .map(each => each / 255).map(each => each > 0.04045 ? ((each + 0.055) / 1.055) ** 2.4
+                                                      : each / 12.92);
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+const behind = each => { const colour = getComputedStyle(each).backgroundColor;
+  return colour.startsWith('rgba') && each.parentElement ? behind(each.parentElement) : colour; };
+const contrast = (a, b) => { const [low, high] = [light(a), light(b)].sort((x, y) => x - y);
+  return (high + 0.05) / (low + 0.05); };
 window.onerror = message => { document.body.textContent = JSON.stringify(message); };
 onload = () => { document.body.textContent = JSON.stringify(
   [...document.querySelectorAll('iframe')].map(frame => { const page = frame.contentDocument;
+    const least = (selector, name) => Math.min(99, ...[...page.querySelectorAll(selector)]
+      .filter(each => getComputedStyle(each)[name] !== 'none')
+      .map(each => contrast(getComputedStyle(each)[name], behind(each))));
     return {width: frame.clientWidth, content: page.documentElement.scrollWidth,
       beyond: [...page.querySelectorAll('body *')].filter(each => !each.closest('.scroll, svg')
         && each.getBoundingClientRect().right > frame.clientWidth + 0.5).map(
         each => each.outerHTML.slice(0, 80)),
-      paper: getComputedStyle(page.body).backgroundColor}; })); };
+      paper: getComputedStyle(page.body).backgroundColor, contrasts: [
+        least('p, h1, h2, h3, li, td, th, summary, figcaption, pre', 'color'),
+        least('svg text', 'fill'), least('svg path[style*="var(--after)"]', 'stroke'),
+        least('svg path[style*="var(--before)"]', 'stroke')]}; })); };
 """
 
 
@@ -387,6 +402,8 @@ def test_the_page_fits_each_screen(tmp_path):
 
 
 @pytest.mark.parametrize('dark', [False, True], ids=['light', 'dark'])
-def test_the_page_is_dark_where_the_browser_is(tmp_path, dark):
+def test_everything_can_be_read_in_light_and_in_dark(tmp_path, dark):
     (found,) = measured(tmp_path, [render_report(extended())], [WIDTHS['phone']], dark)
     assert (found['paper'] == 'rgb(20, 24, 27)') == dark
+    text, letters, *strokes = found['contrasts']
+    assert text >= 4.5 and letters >= 4.5 and min(strokes) >= 3.0
