@@ -34,8 +34,11 @@ from gyro_calibration.diagnosis.regression import (
 from gyro_calibration.diagnosis.replay import (
     cosine_transform, kernel_lags, LEAD, LONGEST_LAG, Replay, response_kernels)
 from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.quality import white_noise_deviation
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
+from scipy.signal import oaconvolve
 
 #: Causes that cannot be told from the dynamics of a motion, which may also vibrate.
 HIDDEN_CAUSES = frozenset({
@@ -122,23 +125,32 @@ def _follow(replay: Replay) -> tuple[Replay, float, float, Array]:
     # are changes of the command: most errors are after these, and by their time between samples.
     share = min(1.0, np.count_nonzero(np.diff(command)) / len(command))
     chosen = int(share * (fits[0].criterion - fits[1].criterion) > 2.0 * math.log(len(command)))
-    late, (rate, *seen) = tried[chosen], transforms[chosen]
-    own, moved = [rate], late
+    moved, (rate, *seen) = tried[chosen], transforms[chosen]
+    late = moved
+    between: Array = np.zeros(len(time))
+    fitted, others = fits[chosen], list[Array]()
     for _ in range(2):
-        fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
-                               len(own), kernels @ lags)
+        if others:
+            motion, *own = (cosine_transform(late.resample(each)) for each in (
+                moved.channels.rate, *others))
+            # what an effect has in common with the motion would pass for a part of it
+            own = [rate, *(each - motion * (motion @ each) / (motion @ motion) for each in own)]
+            seen[-1] -= cosine_transform(late.resample(between))
+            fitted = _fit_response(np.array([*own, *seen]) / np.sqrt(moved.response_variance()),
+                                   len(own), kernels @ lags)
         response = fitted.values @ kernels
-        moved = replace(late.with_motion(next(late.delayed_commands(response[None]))),
-                        responses=fitted.independent @ kernels,
+        change = next(late.delayed_commands(response[None])) + between
+        # effects along this motion would otherwise pass for a longer response
+        moved = replace(late.with_motion(change), responses=fitted.independent @ kernels,
                         response_noise=moved.response_noise)
         fit = fit_causes(build_problem([moved]), [])
+        more = _changes_between_samples(moved, response, fit.unbiased_residuals[0] + between)
+        if more.any():
+            moved = moved.with_motion(more - between)
+            between, fit = more, fit_causes(build_problem([moved]), [])
         moved = replace(moved, response_noise=fit.problem.noise_shapes[fit.best_noise])
-        # effects along this motion would otherwise pass for a longer response; what one has in
-        # common with the motion would pass for a part of it
-        motion, *others = (cosine_transform(late.resample(each)) for each in (
-            moved.channels.rate, *(column for name in _MOTION_EFFECTS
-                                   for column in effect_candidate(name).columns(moved))))
-        own = [rate, *(each - motion * (motion @ each) / (motion @ motion) for each in others)]
+        others = [column for name in _MOTION_EFFECTS
+                  for column in effect_candidate(name).columns(moved)]
     most = 0.5 * HEADING_TREATMENT.prior[0]
     # on average no motion is ahead of its command
     if fitted.scale_deviation > most or response @ lags < -LEAD:
@@ -148,6 +160,51 @@ def _follow(replay: Replay) -> tuple[Replay, float, float, Array]:
             'seconds each, with rests, or use a measured rate or heading as the reference')
     return (moved, float(response @ lags), fitted.lag_deviation,
             limits if chosen else np.full(2, math.inf))
+
+
+def _changes_between_samples(replay: Replay, response: Array, left: Array) -> Array:
+    """
+    Return what is left of the output by changes of the command between samples, rad/s, (n,).
+
+    A change is earlier than the sample that shows it, or is followed after an uneven time. Such
+    times are normal, with the likeliest standard deviation, if it is worth its number (Schwarz);
+    otherwise, or where the responses to the changes overlap, zeros are returned.
+    """
+    grid, command = replay.held_command
+    lead = -round(kernel_lags(replay.interval)[0] / replay.interval)
+    known = replay.valid & np.isfinite(left)
+    whole = np.zeros(len(command))
+    whole[grid[known]] = left[known]
+    noise = white_noise_deviation(left[known])
+    alike = oaconvolve(response, response[::-1])[len(response) - 1:]
+    sizes = np.diff(command)
+    at = np.flatnonzero(np.abs(sizes) * math.sqrt(alike[0]) > noise)
+    alike = alike[:np.flatnonzero(np.abs(alike) > _MIN_RATIO * alike[0])[-1] + 1]
+    if not 0 < len(at) * len(alike) < len(command):
+        return np.zeros(len(left))
+    sizes, alike = sizes[at], alike * np.linspace(1.0, 0.0, len(alike), endpoint=False)
+    seen = sizes * oaconvolve(whole, response[::-1])[at - lead + len(response) - 1]
+    width = int(np.max(np.searchsorted(at, at + len(alike)) - np.arange(len(at))))
+    bands = np.zeros((width, len(at)))
+    for place, band in enumerate(bands):
+        apart = at[place:] - at[:len(at) - place]
+        band[:len(apart)] = (np.append(alike, 0.0)[np.minimum(apart, len(alike))]
+                             * sizes[place:] * sizes[:len(apart)])
+    count, added = np.count_nonzero(known), np.zeros(len(command))
+    best = count * math.log(whole @ whole) - math.log(count)
+    for deviation in 0.1 * 2.0 ** np.arange(6):  # of the times, in samples
+        ratio = (deviation / noise) ** 2
+        factor = cholesky_banded(ratio * bands + np.eye(width, 1), lower=True)
+        delays = ratio * cho_solve_banded((factor, True), seen)
+        impulses = np.zeros(len(command))
+        impulses[at] = sizes * delays
+        tried = oaconvolve(np.pad(impulses, (len(response) - 1 - lead, lead)), response, 'valid')
+        rest = left[known] - tried[grid[known]]
+        criterion = (count * math.log(rest @ rest + delays @ delays / ratio)
+                     + 2.0 * float(np.log(factor[0]).sum()))
+        if criterion < best:
+            best, added = criterion, tried
+    return np.asarray(added[grid])
 
 
 def _limit_acceleration(command: Array, interval: float, limits: Array) -> Array:

@@ -20,13 +20,14 @@ that are held out, and if the interval of its size excludes 0.
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 import math
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named,
+    Candidate, fitted_shape_indices, generic_terms, indices_by_cause, is_named, MAX_STEP_TIMES,
     propose_candidates, smooth_shapes, unnamed_variable, with_shape)
 from gyro_calibration.diagnosis.causes import (
     cause_finding, cause_parameters, CAUSES, SINGLE_EVENT_REMEDY, slip_times)
@@ -84,6 +85,7 @@ class Search:
     unidentifiable: frozenset[str] = frozenset()
     # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
+    finds_several: bool = True  # whether several steps are searched for at once
 
     def candidate_evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
@@ -258,7 +260,9 @@ def search_causes(search: Search) -> Causes:
     everything = _select_forward(search)
     if all(is_named(each) for each in everything):
         return everything
-    named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates))))
+    # without generic terms nothing tells a part from another structure in time
+    named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates)),
+                                    finds_several=False))
     return max((everything, named),
                key=lambda causes: fit_causes(search.problem, causes).log_likelihood - sum(
                    complexity_penalty(each)
@@ -271,10 +275,69 @@ def _select_forward(search: Search) -> Causes:
         if search.on_progress(None, f'search for causes, {len(named)} found'):
             break
         one_more = _find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
-        if one_more is None:
+        more = _with_several(search, named) if one_more is None else (*named, one_more)
+        if not more:
             break
-        named = _eliminate_backward(search, refine_jointly(search, (*named, one_more)))
+        named = _eliminate_backward(search, refine_jointly(search, more))
     return named
+
+
+def _with_several(search: Search, causes: Causes) -> Causes:
+    """
+    Return causes with several more, steps of the bias among them; nothing without them.
+
+    A random walk explains several steps, or steps and a drift, about as well as any one of them:
+    they are looked for in white noise, and must be significant together. A drift replaces the
+    steps that follow it.
+    """
+    if 'bias_step' not in search.scans or not search.finds_several:
+        return ()
+    problem, grown, tried = search.problem, causes, []
+    white = replace(
+        search, scans={}, candidates=tuple(filter(_is_lasting, search.candidates)),
+        problem=problem.with_noises([0]))  # white
+    while len(grown) < MAX_CAUSES:
+        step, evidence = max(search.scans['bias_step'](fit_causes(white.problem, grown)),
+                             key=lambda each: each[1] - each[0].penalty)
+        # the first of a pair may not be significant alone
+        if len(grown) > len(causes) + 1 and p_value(
+                'bias_step', evidence - step.penalty) > search.rate:
+            break
+        grown = _refine_in_turn(white, (*grown, step), len(causes))
+        tried.append(grown)
+    for drift, _ in sorted(_screen_causes(white, fit_causes(white.problem, grown)),
+                           key=lambda each: each[0].penalty - each[1])[:3]:
+        tried.append(_eliminate_backward(
+            white, _refine_in_turn(white, (*grown, drift), len(causes))))
+
+    def evidence_of(several: Causes) -> float:
+        """Return the evidence for several in place of the causes beyond that of noise alone."""
+        score, before = (fit_causes(problem, some).log_likelihood
+                         - sum(map(complexity_penalty, some)) for some in (several, causes))
+        more = max(len(several) - len(causes), 1)
+        return score - before - 0.5 * float(chi2.isf(search.rate / len(tried), more))
+
+    def are_apart(several: Causes) -> bool:
+        """Tell whether no steps of opposite signs are as near as the ends of a pulse, or a gap."""
+        steps = [each for each in several if each.cause == 'bias_step']
+        return all(one.log_index != other.log_index or one.values[0] * other.values[0] > 0.0
+                   or abs(one.shapes[0] - other.shapes[0]) * (MAX_STEP_TIMES + 1)
+                   >= problem.durations[one.log_index or 0]
+                   for one, other in combinations(steps, 2))
+
+    best = max(filter(are_apart, tried), key=evidence_of, default=())
+    if not best or evidence_of(best) < 0.0:
+        return ()
+    best = _eliminate_backward(search, _refine_in_turn(search, best, len(causes)))
+    return best if len(best) > len(causes) + 1 else ()
+
+
+def _refine_in_turn(search: Search, causes: Causes, first: int) -> Causes:
+    """Refine the shape of each cause from a first on, given the others, and then all together."""
+    for place in range(first, len(causes)):
+        fit = fit_causes(search.problem, _without(causes, place))
+        causes = (*causes[:place], refine_shape(fit, causes[place])[0], *causes[place + 1:])
+    return refine_jointly(search, causes)
 
 
 def _without(causes: Sequence[Candidate], place: int) -> Causes:

@@ -306,6 +306,19 @@ def test_a_step_of_the_bias_is_found_at_any_time_of_a_fast_random_walk(crossing,
         assert abs(value.estimate - true) < 4.0 * value.deviation
 
 
+@pytest.mark.parametrize('drift', [None, 'warm_up', 'bias_temperature'])
+def test_steps_that_a_random_walk_explains_as_well_are_found_together(drift):
+    generator, white, time = np.random.default_rng(21), 2e-4, np.arange(2400) / 20.0
+    temperature = 25.0 + 8.0 * np.sin(2.0 * np.pi * time / 120.0)
+    steps = np.cumsum(np.isin(time, (22.0, 59.0, 88.0)) * (-1.0) ** (time > 59.0)) * 8.0 * white
+    drifts = {None: 0.0, 'warm_up': 10.0 * white * np.exp(-time / 15.0),
+              'bias_temperature': 0.5 * white * (temperature - 25.0)}
+    noise = white * np.sqrt(20.0) * generator.standard_normal(2400)
+    found = diagnose([Log(time=time, output=noise + steps + drifts[drift],
+                          temperature=None if drift is None else temperature)], generator)
+    assert sorted(names_of(found)) == sorted([*3 * ['bias_step'], *filter(None, [drift])])
+
+
 def test_two_steps_of_the_bias_three_seconds_apart_have_sizes_of_their_own():
     log, _, _ = in_fast_walk(1e6, 1)
     sizes = {120.0: 4e-3, 123.0: 3e-3}
