@@ -29,13 +29,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
 import math
 
 from gyro_calibration.calibration.dwells import (
-    dwell_rounding_covariance, Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD,
-    select_dwells)
-from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY, robust_residual
+    Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD, select_dwells, step_covariance)
+from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import robust_deviation
@@ -44,7 +42,6 @@ import numpy as np
 from scipy.linalg import orth, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import softmax
-from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 #: With fewer, the others do not determine a model without one of them.
@@ -200,10 +197,10 @@ def find_inliers(dwells: Dwells) -> Mask:
     Return which dwells are not outlying, by a robust fit of the surface.
 
     Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
-    dwells of a sweep whose scale differs are not outlying. Few dwells are left out one by one.
+    dwells of a sweep whose scale differs are not outlying. Of few dwells none is left out.
     """
     if len(dwells) < _MIN_DWELLS:
-        return _leave_out_outliers(dwells)
+        return np.ones(len(dwells), dtype=bool)
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
         parts = _sweep_numbers(dwells)
@@ -217,56 +214,6 @@ def find_inliers(dwells: Dwells) -> Mask:
     spread = robust_deviation(np.sort(residual)[columns.shape[1]:])
     limit = OUTLIER_THRESHOLD * np.hypot(spread, np.nan_to_num(dwells.deviation)) + 1e-12
     return np.asarray(residual <= limit)
-
-
-def _leave_out_outliers(dwells: Dwells) -> Mask:
-    """
-    Return which of few dwells are not outlying: of a bias, a scale, and at most one effect more.
-
-    A dwell is outlying if the fit without it is better than with one more effect in its place,
-    beyond what is left by chance in the best of all dwells and effects: of a nonlinear gyro, one
-    more effect explains as much as any dwell that is left out.
-    """
-    kept, error = np.ones(len(dwells), dtype=bool), dwells.output - dwells.rate
-    fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
-    rate, rounding = dwells.rate / fastest, 1e-12 * fastest
-    known = np.nan_to_num(dwells.deviation)
-    effects = [np.abs(rate), rate ** 2, rate ** 3, rate ** 5]
-    if dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD:
-        warm = dwells.temperature - dwells.temperature.mean()
-        effects += [warm, rate * warm]
-    basic = np.column_stack([np.ones(len(rate)), rate])
-    choices = sum(math.comb(len(effects), count) for count in (0, 1, 2))
-
-    def misfits(more: tuple[Array, ...]) -> tuple[float, Array, int]:
-        """Return the sum of squares, those without each dwell, and the degrees of freedom."""
-        columns = orth(np.column_stack([basic, *more])[kept], 1e-4)
-        residual = error[kept] - columns @ (columns.T @ error[kept])
-        free = 1.0 - np.sum(columns ** 2, axis=1)
-        total = float(residual @ residual)
-        gain = residual ** 2 / np.maximum(free, 1e-9)
-        is_beyond = np.sqrt(gain) > OUTLIER_THRESHOLD * known[kept] + rounding
-        return total, total - np.where(is_beyond, gain, 0.0), len(residual) - columns.shape[1]
-
-    while True:
-        outlying, least = None, MIN_FIT_PROBABILITY
-        for count in (0, 1, 2):
-            fits = [misfits(more) for more in combinations(effects, count)]
-            without = np.min([each[1] for each in fits], axis=0)
-            best = int(np.argmin(without))
-            left = float(without[best]) + kept.sum() * rounding ** 2
-            spare = fits[0][2]
-            if spare < 3:
-                continue
-            instead = min(*np.delete(without, best), *(
-                misfits(more)[0] for more in combinations(effects, count + 1)))
-            chance = kept.sum() * choices * float(fisher.sf(
-                (instead - left) * (spare - 1) / left, 1, spare - 1))
-            if chance < least:
-                outlying, least = int(np.flatnonzero(kept)[best]), chance
-        if outlying is None:
-            return kept
-        kept[outlying] = False
 
 
 def _smooth_surface(dwells: Dwells) -> Array:
@@ -378,7 +325,7 @@ class Uncertainty:
         if len(dwells.rounding):
             # errors by the steps of the output are known: a small residual does not remove them
             whiten = Whitener(dwells, scatter).whiten
-            sizes_known, directions = np.linalg.eigh(dwell_rounding_covariance(
+            sizes_known, directions = np.linalg.eigh(step_covariance(
                 dwells.rate, dwells.output, dwells.rounding))
             known = np.linalg.pinv(whiten(columns / lengths)) @ whiten(
                 directions * np.sqrt(np.maximum(sizes_known, 0.0)))

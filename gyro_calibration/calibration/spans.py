@@ -45,7 +45,7 @@ from gyro_calibration.heading.integration import integrate, integrate_with_curva
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_holes, mark_rows, MISALIGNMENT_DEVIATION,
-    quantization_step, robust_deviation, rounding_errors, white_noise_deviation)
+    quantization_step, robust_deviation, white_noise_deviation)
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
@@ -288,16 +288,10 @@ class Spans:
     @cached_property
     def rest_rounding(self) -> float:
         """Return the standard deviation of the mean output of all rests by its steps, rad/s."""
-        rows = mark_rows(self.rests, len(self.log))
-        if not (self.output_step and rows.any()):
-            return 0.0
-        output = self.output
-        variance = np.average([np.var(output[first:last + 1]) for first, last in self.rests],
-                              weights=np.diff(self.rests)[:, 0]) / self.output_step ** 2
-        if variance > 0.25:  # as with a noise of half a step, which averages it out
-            return 0.0
-        return self.output_step * math.sqrt(rounding_errors(
-            np.array([variance]), np.array([float(rows.sum())]))[0])
+        variances = [np.var(self.output[first:last + 1]) for first, last in self.rests]
+        # a noise of half a step averages it out
+        is_coarse = bool(variances) and max(variances) <= 0.25 * self.output_step ** 2
+        return is_coarse * self.output_step / math.sqrt(12.0)
 
     def gyro_stamps(self, time: Array) -> Array:
         """Return the stamps of the gyro at times of the reference, s."""
