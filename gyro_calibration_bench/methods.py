@@ -8,13 +8,13 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 """
-Methods of the bench: gyro_calibration, greedy selection by BIC, and the lasso.
+Methods of the bench: gyro_calibration, and greedy selection by BIC.
 
 A method takes the paths of the logs of a case and the known model, or None, and returns the causes
 that it names and whether there is unexplained structure.
 
-The two baselines use the formulas of the generator, on means over half a second, and assume white
-noise. They have no columns for faults of samples, noise figures, saturation, quantization, slips,
+The baseline uses the formulas of the generator, on means over half a second, and assumes white
+noise. It has no columns for faults of samples, noise figures, saturation, quantization, slips,
 tones, and a wrong unit.
 """
 
@@ -47,7 +47,6 @@ LINEAR_SIZES = {'time_offset': 0.02, 'bandwidth': 0.02, 'clock_rate': 1e-4}
 #: Columns with a larger correlation are ambiguous.
 AMBIGUOUS_CORRELATION = 0.99
 WITHOUT_CANDIDATES = {*WITHOUT_COLUMN, 'saturation', 'interference_tone', 'reference_slip'}
-FOLD_COUNT = 5
 
 
 # gyro_calibration
@@ -84,7 +83,7 @@ def gyro_calibration(logs: Sequence[Path], known: KnownModel | None) -> Answer:
             bool(found.unexplained))
 
 
-# the baselines
+# the baseline
 
 @dataclass(frozen=True)
 class Problem:
@@ -210,46 +209,6 @@ def select_greedily(logs: Sequence[Path], known: KnownModel | None) -> Answer:
         chosen.append(place)
 
 
-def select_by_lasso(logs: Sequence[Path], known: KnownModel | None) -> Answer:
-    """Take the largest penalty whose error is within a standard error of the least."""
-    problem = build_problem(logs, known)
-    count, lengths = len(problem.error), np.linalg.norm(problem.columns, axis=0)
-    columns = problem.columns / lengths * math.sqrt(count)
-    fold = np.arange(count) * FOLD_COUNT // count
-    top = float(np.abs(columns.T @ problem.error).max()) / count
-    penalties = top * np.geomspace(1.0, 1e-3, 25)
-    errors = []
-    for out in range(FOLD_COUNT):
-        inside, outside = fold != out, fold == out
-        errors.append(
-            [np.mean((problem.error[outside] - columns[outside] @ weights) ** 2)
-             for weights in lasso_path(columns[inside], problem.error[inside], penalties)])
-    mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0) / math.sqrt(FOLD_COUNT)
-    least = int(np.argmin(mean))
-    place = int(np.flatnonzero(mean <= mean[least] + spread[least])[0])
-    weights = lasso_path(columns, problem.error, penalties[:place + 1])[-1]
-    return answers_of_columns(problem, list(np.flatnonzero(weights))), False
-
-
-def lasso_path(columns: np.ndarray, error: np.ndarray, penalties: np.ndarray) -> list[np.ndarray]:
-    """Return the weights of the lasso at falling penalties, by coordinate descent."""
-    gram, correlations = columns.T @ columns / len(error), columns.T @ error / len(error)
-    weights, path = np.zeros(len(correlations)), []
-    for penalty in penalties:
-        for _ in range(300):
-            before = weights.copy()
-            # a step has no column in a fold that does not hold it
-            for place in np.flatnonzero(np.diag(gram) > 1e-9):
-                partial_correlation = (correlations[place] - gram[place] @ weights
-                                       + gram[place, place] * weights[place])
-                weights[place] = (math.copysign(max(abs(partial_correlation) - penalty, 0.0),
-                                                partial_correlation) / gram[place, place])
-            if np.abs(weights - before).max() < 1e-3 * penalties[0]:
-                break
-        path.append(weights.copy())
-    return path
-
-
 def answers_of_columns(problem: Problem, chosen: Sequence[int]) -> list[NamedCause]:
     """Name each chosen effect once, with size and interval by least squares of all chosen."""
     if not chosen:
@@ -278,5 +237,4 @@ def answers_of_columns(problem: Problem, chosen: Sequence[int]) -> list[NamedCau
 
 METHODS = {
     'gyro_calibration': gyro_calibration,
-    'greedy': select_greedily,
-    'lasso': select_by_lasso}
+    'greedy': select_greedily}

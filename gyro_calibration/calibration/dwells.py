@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 from gyro_calibration.calibration.run_faults import (
     fit_scale, MAX_UNEXPLAINED_SHARE, refuse_unit_error)
+from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
@@ -87,6 +88,7 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     unexplained, scale = fit_scale(found.output, found.rate)
     if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
         refuse_unit_error(scale, 'reference')
+        refuse_scale(scale - 1.0, 'reference', 'give or omit --invert, or turn the gyro over')
     if (limited := _mark_limited(log, found)).any():
         places = [place for place, at_limit in zip(found.location, limited) if at_limit]
         remark = (f'{len(places)} dwells are at the limit of the output, '

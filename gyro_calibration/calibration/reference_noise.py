@@ -423,32 +423,14 @@ def heading_noise_share(log: Log) -> float:
     return math.sqrt(walks[0] / white)
 
 
-def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> Array:
-    """
-    Return the usual bend and change of a heading difference over a span, rad, shape (2,).
-
-    By medians, they are the standard deviations of its second difference over halves of the span,
-    as of the end of a random walk, and of its change beyond the bias; 0 where no span is known.
-    """
-    starts = np.linspace(time[0], time[-1] - span, 500)
-    first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
-                           for share in (0.0, 0.5, 1.0))
-    changes = np.array([first - 2.0 * middle + last, last - first - bias * span])
-    known = np.isfinite(changes[0])
-    return (np.array([robust_deviation(each[known]) for each in changes]) if known.any()
-            else np.zeros(2))
-
-
 def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     """
     Return a log without headings that are repeated while the gyro turns, as of a lost marker.
 
-    Also a remark on the longest of these stretches. The gyro turns where its heading deviates from
-    a straight line, which may be its bias, by more than a random walk does (Brownian bridge, at
-    1 %), and the error of the reference and its step; or where it changes beyond its usual bias by
-    that. The reference must then jump rather by what the gyro turned than not at all: a bias may
-    drift in a rest. The random walk is that of the difference to the reference elsewhere, or the
-    scatter of that difference over as long a time, if it is larger.
+    Also a remark on the longest of these stretches. In it the gyro turns, beyond its usual bias,
+    by more than the step of the reference and than it differs from the reference over as long a
+    time elsewhere (at 1 %). The reference must then jump rather by what the gyro turned than not
+    at all: a bias may drift in a rest.
     """
     heading = log.reference_heading
     known = np.flatnonzero(np.isfinite([] if heading is None else heading))
@@ -460,34 +442,27 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
         return log, []
     moving = heading.copy()
     moving[np.concatenate(runs)] = np.nan
-    usual = heading_difference(replace(log, reference_heading=moving))
-    if not usual.total_walk > 0.0:
-        return log, []
+    turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
+    difference = turned - moving
+    seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
+    bias = float(np.median(np.diff(difference[seconds]) / np.diff(log.time[seconds])))
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
-    step = quantization_step(heading[known])
-    turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
-    seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
-    bias = float(np.median(np.diff((turned - heading)[seconds]) / np.diff(log.time[seconds])))
-    first, last = np.array([rows[[0, -1]] for rows in runs]).T
-    following = np.append(known, known[-1])[np.searchsorted(known, last) + 1]
-    spans = log.time[last] - log.time[first]
-    unseen = turned[last] - turned[first] - bias * spans
-    jumps = heading[following] - heading[last] - (turned[following] - turned[last])
-    # the error of a jump, and by how much it is likelier with what the gyro turned than without
-    error = float(np.median(np.minimum(np.abs(jumps), np.abs(jumps - unseen))))
-    jumps_as_gyro = jumps ** 2 - (jumps - unseen) ** 2 > (2.0 * bound * error) ** 2
-    kept, lost = heading.copy(), []
-    for place in np.flatnonzero(jumps_as_gyro):
-        rows, span = runs[place], float(spans[place])
-        own = turned[rows[0]:rows[-1] + 1] - turned[rows[0]]
-        off = own - own[-1] * (log.time[rows[0]:rows[-1] + 1] - log.time[rows[0]]) / span
-        errors = np.maximum(
-            usual.total_walk * math.sqrt(span) + 2.0 * usual.constant_error,
-            _usual_changes(log.time, turned - moving, bias, span))
-        if (np.array([np.abs(off).max(), abs(unseen[place])]) > step + bound * errors).any():
+    kept, lost = heading.copy(), list[tuple[float, float, float]]()
+    for rows in runs:
+        first, last = rows[[0, -1]].tolist()
+        span = float(log.time[last] - log.time[first])
+        unseen = turned[last] - turned[first] - bias * span
+        starts = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1] - span, 500))
+        ends = np.minimum(np.searchsorted(log.time, log.time[starts] + span), len(log) - 1)
+        changes = difference[ends] - difference[starts] - bias * span
+        usual = robust_deviation(changes[np.isfinite(changes)])
+        after = known[min(np.searchsorted(known, last) + 1, len(known) - 1)]
+        jump = heading[after] - heading[last] - (turned[after] - turned[last])
+        if (abs(unseen) > quantization_step(heading[known]) + 2.0 * bound * usual
+                and abs(jump - unseen) < abs(jump)):
             kept[rows[1:]] = np.nan
-            lost.append((*log.time[rows[[0, -1]]].tolist(), float(np.ptp(own))))
+            lost.append((float(log.time[first]), float(log.time[last]), abs(unseen)))
     if not lost:
         return log, []
     begin, end, angle = max(lost, key=lambda each: each[1] - each[0])

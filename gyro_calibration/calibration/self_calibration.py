@@ -33,7 +33,6 @@ from gyro_calibration.calibration.run_faults import (
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.logs.quality import (
     quantization_step, refuse_dead, refuse_saturated, white_noise_deviation)
-from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
@@ -237,13 +236,8 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
                     slip_deviation: float) -> ScaleBiasFit:
-    """Fit on the stamps, or on an even grid if that leaves less."""
-    even_stamps = even_times(time)
-    jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
-    fit = min((fit_likelihood(stamps, rate, motion, largest_time_offset,
-                              slip_deviation=slip_deviation)
-               for stamps in ([time, even_stamps] if jitters else [time])),
-              key=lambda found: float(np.linalg.det(found.covariance)))
+    """Fit, and allow for an asymmetry of the gyro against a measured motion."""
+    fit = fit_likelihood(time, rate, motion, largest_time_offset, slip_deviation=slip_deviation)
     if not motion.is_measured:
         return fit
     # Against a profile the fit includes a scale difference between both senses of turning. Such an

@@ -214,11 +214,10 @@ def test_intervals_are_those_of_wilson():
     assert wilson_interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
 
 
-@pytest.mark.parametrize('method', ['greedy', 'lasso'])
-def test_a_baseline_names_a_large_effect_with_its_size(method, tmp_path):
+def test_the_baseline_names_a_large_effect_with_its_size(tmp_path):
     log, = hide(['scale_factor_asymmetry'], 20.0, np.random.default_rng(0), noise='white',
                 duration=300.0, sample_rate=25.0)
-    causes, unexplained = METHODS[method]([log.write(tmp_path / 'log.csv')], None)
+    causes, unexplained = METHODS['greedy']([log.write(tmp_path / 'log.csv')], None)
     cause, = (each for each in causes if each.effect == 'scale_factor_asymmetry')
     truth = log.truth['scale_factor_asymmetry']
     assert causes[0] == cause and not unexplained
