@@ -109,8 +109,8 @@ def _mark_limited(log: Log, dwells: Dwells) -> Mask:
     """
     Return which dwells are at the limit of the output of their log, shape (n,).
 
-    They have the largest output, in one sense or both, and a line through the others, beyond it at
-    each of their rates, leaves far less than a line and one more effect of the rate through all.
+    A line through the others is beyond it at each of their rates, and leaves far less than a line
+    and one more effect of the rate through all.
     """
     extreme, step = mark_extremes(require_output(log))
     limited = np.array([extreme[rows].mean() > 0.5 for rows in dwells.rows])
@@ -226,9 +226,9 @@ def _number_sweeps(rate: Array) -> tuple[Numbers, str]:
     """
     Return the number of the sweep of each dwell, by the order of the rates, shape (n,), and how.
 
-    The rates of a sweep, without its rests, increase or decrease, or their absolute values do with
-    changing sign: whichever gives the fewest sweeps. Where the median of these has less than four
-    dwells, nine blocks of consecutive dwells are taken as sweeps.
+    The rates of a sweep, or their absolute values with changing sign, increase or decrease:
+    whichever gives the fewest sweeps. Where their median has less than four dwells, blocks are
+    taken as sweeps.
     """
     number, largest = np.arange(len(rate)), float(np.abs(rate).max(initial=0.0))
     turning = np.abs(rate) > max(1e-3 * largest, 0.01 * DEGREE)
@@ -255,8 +255,7 @@ def _number_passes(value: Array, tolerance: float) -> Numbers:
     """
     Assign numbers to passes through values; a pass begins where the direction reverses.
 
-    Changes up to the tolerance have no direction. Values that are repeated where passes turn
-    belong to both in equal parts.
+    Values that are repeated where passes turn belong to both in equal parts.
     """
     change = np.diff(value)
     steps = np.where(np.abs(change) > tolerance, np.sign(change), 0.0)
@@ -318,12 +317,7 @@ class _Samples(NamedTuple):
         return float(np.ptp(self.time[rows]))
 
     def slope(self, rows: Numbers, angle: Array) -> float:
-        """
-        Return the mean rate of an angle over some samples, rad/s.
-
-        It is the slope of a straight line through a heading, whose errors are those of single
-        samples, and the difference of both ends over the duration of an integrated rate.
-        """
+        """Return the mean rate of an angle over some samples, rad/s."""
         time = self.time[rows]
         return (fit_scale(angle, time)[1] if self.rate is None
                 else float((angle[-1] - angle[0]) / (time[-1] - time[0])))
@@ -494,9 +488,8 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     Return the settling time of the output after a ramp, s.
 
     A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
-    over all but the shortest dwells, and over the longest ones, which show a slower response. It
-    is settled where it is within four standard deviations of its last half; below 20 ppm it always
-    is.
+    over dwells. It is settled within four standard deviations of its last half; below 20 ppm it
+    always is.
     """
     durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
     interval, width, found = max(0.05, float(np.median(np.diff(time)))), 4, 0.0
@@ -542,11 +535,9 @@ def _average(samples: _Samples,
     """
     Return reference rate, output and its standard deviation of each dwell (Ojeda et al., eq. 6).
 
-    Heading and integral of the output are averaged with the same weights, so that deviations of
-    the table from its steady rate are the same in both. The deviation is that of four to twelve
-    batches of at least 0.75 s, in which vibration and the response of a filter average out, and of
-    the rounding of an output with noise below half a step, which is returned too; nan where it is
-    not known.
+    Heading and integral of the output are averaged with the same weights. The deviation is that of
+    four to twelve batches of at least 0.75 s, in which vibration averages out, and of the rounding
+    of an output with noise below half a step, which is returned too; nan where it is not known.
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
     batches = np.clip(durations / 0.75, 4, 12).astype(int)

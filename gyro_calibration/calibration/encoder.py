@@ -222,8 +222,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
 
     A jump is a change from one value to the next beyond all rates of the gyro around it, and
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
-    1975). Two in a row, there and back, are a wrong value, which is left out; else they are a
-    motion that the gyro does not measure.
+    1975). Two in a row, there and back, are a wrong value, which is left out.
     """
     if log.time is None or log.output is None or log.reference_heading is None:
         return log, [], None
@@ -379,13 +378,10 @@ def _estimate_drift(motion: Motion, error: Array, bias: float,
     """
     Return the fit of the mean bias over a log, rad/s, and 95 % bounds of the angle random walk.
 
-    By the drifts between pieces of the log. The bounds, rad/√s, hold if nothing else moves the
-    heading.
-    What repeats itself with a motion within a piece is noise of the mean heading of that piece.
-    The bias has a normal prior about zero, of a tenth of the size that the technology has up to
-    all of it: a bias of many standard deviations stays; one that the log hardly shows would only
-    harm a heading. Given are, of the fit, the error of the heading, rad, shape (n,), and the bias,
-    rad/s.
+    By the drifts between pieces of the log; what repeats itself within a piece is noise of its
+    mean heading. The bias has a normal prior about zero, of a tenth of the size that the
+    technology has up to all of it: one that the log hardly shows would only harm a heading. Given
+    are the error of the heading of the fit, rad, shape (n,), and its bias, rad/s.
     """
     piece = _number_pieces(motion.time)
     counts = np.bincount(piece)

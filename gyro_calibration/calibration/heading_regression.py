@@ -109,10 +109,9 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    Rests that the motion contradicts are left out where no causes are given. Wheels of another
-    size may exceed what a gyro errs by: beside a course the values are means under the prior of
-    the technology and a wide one, weighted by their probability given the drive. A bias beyond the
-    technology is that of another one, whose bias may have any size.
+    Rests that the motion contradicts are left out where no causes are given. Beside a course the
+    values are means under the prior of the technology and a wide one, as of wheels of another
+    size, weighted by their probability given the drive.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
     corrected, point_variances = _correct_rate(spans, every)
@@ -260,12 +259,11 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
 
-    Nor less than their mean square error under the widest prior; nor than what they change by
-    without each place of a shaft (jackknife, Tukey 1958), as the few turning points of an even
-    swing may determine a value. The intervals of the first values are not wider than those of
-    their priors; that of a scale factor error that fewer than `MIN_STRETCHES` stretches determine
-    is as wide, as it cannot be separated from errors of the reference. Also the effective number
-    of stretches that determine each value, and the degrees of freedom.
+    Nor less than their mean square error under the widest prior, nor than what they change by
+    without each place of a shaft (jackknife, Tukey 1958). The intervals of the first values are
+    not wider than those of their priors; that of a scale factor error that fewer than
+    `MIN_STRETCHES` stretches determine is as wide. Also the effective number of stretches of each
+    value, and the freedom.
     """
     count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]

@@ -245,8 +245,7 @@ class _Regression:
         """
         Solve for one banded noise, and k variances of the shared values.
 
-        Return log likelihoods, (k,), values, (k, m + q), and the first m columns of the inverse
-        normal matrices, (k, m + q, m).
+        Return log likelihoods, (k,), values, (k, m + q), and m columns of inverses, (k, m + q, m).
         """
         weighted = covariance.solve(np.column_stack([self.columns, self.observed]))
         gram = self.columns.T @ weighted
@@ -332,12 +331,7 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
 
 
 def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
-    """
-    Return an axis where the sizes are likely, at least to the middle between old points.
-
-    It may go on beyond an end of the old axis: the likeliest point of a coarse grid is not always
-    next to the likeliest size.
-    """
+    """Return an axis where the sizes are likely, at least to the middle between old points."""
     if len(axis) == 1:
         return axis
     logarithms, step = np.log(sizes), math.log(axis[1] / axis[0])

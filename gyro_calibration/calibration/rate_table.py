@@ -393,8 +393,8 @@ def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
     """
     Set each fitted shape in turn to the best of a grid over its bounds.
 
-    A smaller one is preferred that is not significantly worse: at evenly spaced rates, fast sines
-    pass through the same dwells as a slow one.
+    A smaller one that is not significantly worse is preferred: fast sines pass through evenly
+    spaced dwells too.
     """
     channels = channels_of(dwells)
 
@@ -474,12 +474,7 @@ def _orthonormal_columns(columns: Array, tolerance: float) -> Array:
 
 def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
                         parts: Numbers) -> Array:
-    """
-    Return each dwell's residual of a fit without its part: the deleted residuals.
-
-    Where the part is not a whole sweep, the others of its sweep show the bias and scale they
-    share.
-    """
+    """Return each dwell's residual of a fit without its part: the deleted residuals."""
     left_out = np.full(len(whitened), math.inf)
     for part in range(parts.max() + 1):
         rows = np.flatnonzero(parts == part)
@@ -559,8 +554,8 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     """
     Return the errors of full turns at the rates and temperatures of dwells that are not outlying.
 
-    The rates by the model, rad/s, shape (n,), are as `Calibration.left_out_rate`. A turn is faster
-    than `min_rate`, rad/s.
+    The rates by the model, rad/s, (n,), are nan where it has none; turns are faster than
+    `min_rate`.
     """
     known = np.isfinite(rate)
     wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded

@@ -55,9 +55,8 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     """
     Return where a slow reference has its own values, or None if it has one in each sample.
 
-    Values that are held change in single samples. Straight lines between values meet at corners,
-    which may lie between two samples. Both must come at even intervals. Times, s, and values have
-    shape (n,), without nan.
+    Held values change in single samples, straight lines meet at corners; both at even intervals.
+    Times, s, and values have shape (n,), without nan.
     """
     step, sample = quantization_step(values), float(np.median(np.diff(time)))
     change = np.diff(values)
@@ -132,9 +131,8 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     """
     Return a log whose one reference is known at its own instants alone, and these.
 
-    Where instants lie between samples, the samples next to them get the values of a cubic spline.
-    A rate that is held as a command is not slow. The instants next to samples have shape (n,),
-    with nan; None if the reference is not slow.
+    The samples next to instants get the values of a cubic spline. A rate that is held as a command
+    is not slow. The instants have shape (n,), with nan; None if the reference is not slow.
     """
     is_heading = log.reference_heading is not None
     given = log.reference_heading if is_heading else log.reference_rate
@@ -210,8 +208,7 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     """
     Return rests of 3 s and more: first and last row, shape (r, 2), and where the reference stands.
 
-    The gyro is quiet, and the reference is lost, or stands: it is known and does not change. Where
-    it stands and the gyro is not quiet on average, something moves, and there is no rest.
+    The gyro is quiet, and the reference is lost, or stands: it is known and does not change.
     """
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
@@ -273,8 +270,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     Separate the difference of the headings of gyro and reference by its growth over time.
 
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    to second order from the best of some, a lag, a scale factor and a misalignment are fitted. An
-    error that was smoothed shows at lags beyond its time constant.
+    to second order from the best of some, a lag, a scale factor and a misalignment are fitted.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     stamps, output = log.time, bridge_gaps(log.output)
@@ -337,10 +333,9 @@ def rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, f
     """
     Return the variances of a reference rate and of the gyro, (rad/s)²; 0, 0 if none is detected.
 
-    A command has none, however it jumps. It is estimated where the reference is quietest, by the
-    updates of a held one. White noise is detected by third differences of alternating sign, other
-    noise by changes from sample to sample that the gyro does not show, unless the rate is known to
-    be commanded: a robot need not follow those.
+    A command has none. It is estimated where the reference is quietest, by the updates of a held
+    one. White noise is detected by third differences of alternating sign, other noise by changes
+    that the gyro does not show, unless the rate is known to be commanded.
     """
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
@@ -399,8 +394,7 @@ def heading_noise_share(log: Log) -> float:
     """
     Return the ratio of the rate noise of a reference heading to that of the gyro; 0 if none shows.
 
-    A filter or a magnetometer errs like a random walk of the heading over a second, of which the
-    gyro shows nothing. White noise of the heading does not count.
+    A filter or a magnetometer errs like a random walk. White noise of the heading does not count.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     turned = integrate(log.time, bridge_gaps(log.output))

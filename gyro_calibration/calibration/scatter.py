@@ -95,8 +95,7 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
-    It is the sweep, since errors that its dwells have in common do not predict other sweeps. With
-    fewer than `MIN_SWEEPS`, parts are about 60 blocks of time within sweeps, or the dwells.
+    It is the sweep; with fewer than `MIN_SWEEPS` a block of time within a sweep, of about 60.
     """
     sweeps, count = _sweep_numbers(dwells), min(len(dwells), 60)
     if sweeps.max() + 1 >= MIN_SWEEPS:
@@ -196,8 +195,8 @@ def find_inliers(dwells: Dwells) -> Mask:
     """
     Return which dwells are not outlying, by a robust fit of the surface.
 
-    Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
-    dwells of a sweep whose scale differs are not outlying. Of few dwells none is left out.
+    Where there are dwells enough, each sweep has a bias and scale of its own besides. Of few
+    dwells none is left out.
     """
     if len(dwells) < _MIN_DWELLS:
         return np.ones(len(dwells), dtype=bool)
@@ -244,8 +243,8 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     Fit columns (n, m) to an error (n,) for each of k scatters of sweeps' bias and scale, (k, 2).
 
     Return the logarithm of the determinants of covariance, in that of the dwells, and Gram matrix,
-    (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and the inverse of
-    the Gram matrix of the whitened columns, (k, m, m).
+    the sum of the squared whitened residuals, the values, (k, m), and the inverse Gram matrix, (k,
+    m, m).
     """
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
@@ -267,15 +266,12 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
 @dataclass(frozen=True)
 class Uncertainty:
     """
-    The uncertainty of values fitted to dwells.
+    The uncertainty of values fitted to dwells, averaged over possible scatters.
 
-    Few dwells and few sweeps do not determine how large the scatter is, so the distribution of the
-    values is averaged over possible scatters, weighted by their restricted likelihood: that of the
-    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
-    uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
-    its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
-    sweeps alone are then those of Student's distribution. That sweeps do not differ has the weight
-    of a factor of e in that variance, without which their intervals would be too wide.
+    That of the dwells gives Student's distribution, that of the sweeps is summed over a grid. Its
+    prior is uniform in the logarithm of the variance of a sweep's own bias, or scale (Box and Tiao
+    1973, section 5.2). That sweeps do not differ has the weight of a factor of e in that variance,
+    without which their intervals would be too wide.
     """
 
     weights: Array  # of possible scatters, shape (k,)
@@ -372,9 +368,9 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
 
     Effects that were not fitted may exist below the noise: a fit with more columns has a larger
     variance. Its mean over the fitted dwells is added to the variance of the bias; its value half
-    a width outside of the calibrated range gives the slopes. Given are the scatter of bias and
-    scale factor from sweep to sweep, rad/s and 1, (2,), and a function of rates, rad/s, and
-    temperatures, degC: the change of the output for each value, (n, m).
+    a width outside of the calibrated range gives the slopes. `columns` are functions of rates,
+    rad/s, and temperatures, degC; the scatter is that of bias and scale factor of sweeps, rad/s
+    and 1, (2,).
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = (np.zeros(len(dwells)) if dwells.temperature is None

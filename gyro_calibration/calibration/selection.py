@@ -121,8 +121,8 @@ def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
     """
     Fit the effects that predict left-out sweeps better, at a false alarm rate.
 
-    The best one is added until none is supported, then those that later ones made superfluous are
-    removed. With a given model they are changes of it. The effects of a `base` stay.
+    The best one is added until none is supported, then superfluous ones are removed, but for those
+    of a `base`. With a given model they are changes of it.
     """
     best = base = base or _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]

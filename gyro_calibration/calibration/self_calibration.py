@@ -219,12 +219,7 @@ def find_rounding(time: Array, output: Array, step: float) -> OutputRounding | N
 
 
 def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
-    """
-    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
-
-    By least squares on the blocks of `find_rounding`. Shape (2, 2) and (rad/s)²; both are zero
-    without steps.
-    """
+    """Return the covariance of (s, b) by steps, (2, 2), and the variance at rest, (rad/s)²."""
     if (found := find_rounding(time, output, quantization_step(output))) is None:
         return np.zeros((2, 2)), 0.0
     rate = (found.mean - fit.bias) / (1.0 + fit.scale_factor_error)
@@ -441,14 +436,12 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return a calibration by a profile whose log has too short a rest after it for `check_rest`.
 
-    A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
-    bias, which the samples after the motion show. A turn that they do not show, of a prior
-    deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
-    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn, by the
-    part up to the end of the log that determines the rate best: it settles before. The fit
-    is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
-    a measured reference, and without a covariance. It is refused where the robot turned throughout
-    the motion, or goes on turning after it.
+    A steady turn throughout a run has the effect of a bias, which the samples after the motion
+    show. A turn that they do not show, of a prior deviation `EXCESS_RATE_DEVIATION`, is in the
+    standard deviation of the bias, and so is all that they show of a robot that may settle yet, in
+    the part up to the end of the log that determines the rate best. The fit is returned unchanged
+    of a measured reference, and where fewer than 10 samples follow or the robot drives on. It is
+    refused where the robot turned throughout the motion, or goes on turning after it.
     """
     limits = RunLimits()
     end = motion.duration + max(fit.time_offset, 0.0)
@@ -506,11 +499,9 @@ def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[
     """
     Return derivatives of (s, b) by the rate at rest, shape (2,), and their covariance, (2, 2).
 
-    The rate is the mean of the output at rest less the bias of the run, rad/s; its variance is
-    that of the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a
-    turn by hand, or another response of the robot. That and a run as stated have even odds before
-    the rest is seen. The ratio of that error to the stated deviation has a half-Cauchy prior of
-    median 1.
+    The rate is the mean of the output at rest less the bias of the run, rad/s, with the variance
+    of that mean. A run as stated and one that errs by more (a slip, a turn by hand) have even
+    odds; the ratio of its error to the stated deviation has a half-Cauchy prior of median 1.
     """
     stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
@@ -534,8 +525,8 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
-    It begins up to its length in the limits later where the robot still moves, and is at most as
-    long as the motion. None where the log ends before, or the robot drives on.
+    It begins later where the robot still moves, and is at most as long as the motion. None where
+    the log ends before, or the robot drives on.
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)

@@ -459,8 +459,6 @@ class Spans:
         Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
 
         The errors of the most likely heading given both are independent of the difference of both.
-        Columns computed from the reference alone, or the gyro alone, would be correlated with the
-        noise of the observations.
         """
         if not self.treatment.errs_as_heading:
             return heading_change / (1.0 + self.reference_noise_ratio ** 2)
@@ -524,10 +522,9 @@ class Spans:
         """
         Return the column of a lag without its noise, what others explain of it, both (n + r,).
 
-        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro.
-        It is reduced to the share that the reference shows too (regression calibration, Carroll
-        and others 2006), if that is beyond chance. What is left of noise is an error of the lag,
-        s².
+        What other values do not explain of a lag may be noise of the gyro: it is reduced to the
+        share that the reference shows too (regression calibration, Carroll and others 2006). The
+        noise that is left is an error of the lag, s².
         """
         time, columns = self.stamps, self.base_columns()
         column = self.cause_columns(CauseTerm('bandwidth'))[:, 0]
