@@ -478,11 +478,10 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
     if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
-        yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag of '
-               'the reference or the gyro, as where it has one frequency, or a period that is not '
-               f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
-               'are for that, as far as the delay shows it. A reference that was smoothed without '
-               'a delay may err by more: turn slowly, at several speeds, with stops')
+        yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag, '
+               f'as where it has one frequency; {100.0 * fit.response_deviation:.2g} % of the '
+               'standard deviation are for that, as far as the delay shows it. Turn slowly, at '
+               'several speeds, with stops')
     if fit.misalignment.size:
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
         if chance < FALSE_ALARM_RATE:
@@ -497,9 +496,8 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
             yield (f'in motion the reference drifts by {rate:.3f} +- {half:.3f} deg/s (95 %) '
                    'against the rests in which it stands; the bias is that of the rests')
         elif fit.reference_adds_up:
-            yield ('the reference is never lost, as odometry, and stands in no rest: its drift in '
-                   'motion has the same effect as a bias, which the intervals do not include; '
-                   'rest now and then')
+            yield ('the reference stands in no rest: its drift in motion has the same effect as a '
+                   'bias, which the intervals do not include; rest now and then')
         half = NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0])
         largest, largest_bias = NORMAL_QUANTILE_975 * np.array(TECHNOLOGY_PRIORS[technology])
         if abs(fit.bias) > largest_bias:
@@ -510,11 +508,10 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                    f'{technology} have: check the units, and the size and distance of wheels')
         elif half > 1.001 * largest:
             yield ('the drive does not show whether the reference has a wrong scale, as of wheels '
-                   'at another distance, so that the interval of the scale factor error is wider '
-                   f'than that of gyros of the technology {technology}: turn more often')
+                   'at another distance: turn more often')
         else:
             yield (f'scale factor error and bias have priors of the technology {technology} '
-                   '(--technology) with mean zero, which the intervals include')
+                   '(--technology)')
         if not fit.reference_adds_up:
             return
     reference_error = -s / (1.0 + s)
@@ -524,10 +521,9 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
            f'would have the same effect as this scale factor error of {100 * s:+.2f} %: '
            'check it over whole turns closed on a mark')
     if fit.shaft_error.size and (turned := float(np.ptp(motion.heading))) < math.tau:
-        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, less than a revolution, '
-               'in which an error once in a revolution, as of an eccentric encoder, may have the '
-               'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
-               'not include what the likelihood does not show: turn further')
+        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, in which an error once '
+               'in a revolution, as of an eccentric encoder, may have the effect of a scale '
+               'factor error, 0.1 deg that of up to 0.17 %, beyond the interval: turn further')
 
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.

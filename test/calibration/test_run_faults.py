@@ -160,19 +160,6 @@ def test_a_limit_hidden_by_the_model_is_seen_in_the_output():
         self_calibrate(TIME, drifting, CALIBRATION_MOTION, output=clipped)
 
 
-LONG_RAMPS = motion_from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]),
-                               np.array([0, 0, 45, 45, -45, -45, 0, 0]) * DEGREE)
-
-
-@pytest.mark.parametrize('motion', [CALIBRATION_MOTION, LONG_RAMPS],
-                         ids=['short ramps', 'long ramps'])
-def test_coarse_quantization_is_no_saturation(motion):
-    code, time = 0.2 * DEGREE, np.arange(0.0, motion.duration, 0.01)
-    fit = self_calibrate(
-        time, np.round(((1 + S) * motion.rate_at(time - 0.1) + B) / code) * code, motion)
-    assert fit.scale_factor_error == pytest.approx(S, abs=0.02)
-
-
 @cache
 def calibrated(seed):
     return self_calibrate(TIME, output(seed), CALIBRATION_MOTION, noise=XV3500.noise)
