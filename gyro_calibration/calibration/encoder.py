@@ -207,7 +207,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
-class HeadingJumps(NamedTuple):
+class _HeadingJumps(NamedTuple):
     """Jumps of a reference heading that the gyro does not show."""
 
     rows: NDArray[np.intp]  # first rows after them
@@ -216,7 +216,7 @@ class HeadingJumps(NamedTuple):
     p_value: float  # chance of the largest in noise
 
 
-def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
+def bridge_jumps(log: Log) -> tuple[Log, list[str], _HeadingJumps | None]:
     """
     Return a log whose reference heading continues over its jumps as the gyro does, remarks, jumps.
 
@@ -258,7 +258,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
     back = above[:-1] & above[1:] & (np.abs(difference[:-1] + difference[1:]) <= noise)
     wrong = known[1:-1][back]
     sizes, heading, remarks = np.zeros(len(time)), log.reference_heading.copy(), []
-    found: HeadingJumps | None = None
+    found: _HeadingJumps | None = None
     if len(wrong):
         heading[wrong] = np.nan
         remarks.append('the reference is off in single values, which are left out, by up to '
@@ -269,7 +269,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
         change = min((difference, alone), key=lambda each: robust_deviation(each[usual]))
         sizes[jumps] = change[once]
         halvings = (beyond[once].max() - high) / max(high - low, 1e-300)
-        found = HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
+        found = _HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
                              tail * len(known) * 2.0 ** -min(halvings, 1000.0))
         remarks.append(
             f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
@@ -528,8 +528,8 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
 _MIN_DWELLS = 3
-HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
-                 'effects use --method dwells')
+_HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
+                  'effects use --method dwells')
 
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
@@ -565,7 +565,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                           'a log with a reference heading is fitted alone')
                          + '; give one log, or use --method dwells')
     if others:
-        raise InputError(HEADING_ALONE)
+        raise InputError(_HEADING_ALONE)
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
     if log.reference_heading is not None:

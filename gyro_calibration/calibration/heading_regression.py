@@ -276,10 +276,10 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
     scatter = np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5)
     variances = np.maximum(np.maximum(np.diag(fit.covariance), scatter),
                            np.diag(inverse) + (values[:count] - fit.values) ** 2)
-    effective = effective_clusters(stretch[inside], data.design[inside, :count])
+    effective = _effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
     for cluster in sectors:
-        rests_on = effective_clusters(cluster[inside], influence[inside])
+        rests_on = _effective_clusters(cluster[inside], influence[inside])
         scatter = _jackknife(data, cluster, inside)[:count]
         freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
         variances = np.maximum(variances, scatter)
@@ -305,7 +305,7 @@ def _jackknife(data: WhitenedRegression, cluster: NDArray[np.intp], inside: Mask
     return np.asarray((parts - 1) * np.var(without, axis=0) * (scale[-1] / scale[:-1]) ** 2)
 
 
-def effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
+def _effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
     """Return the effective number of clusters that determine each column."""
     shares = np.array([np.bincount(cluster, part ** 2) for part in columns.T])
     return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))

@@ -82,7 +82,7 @@ def find_reference_kind(log: Log, spans: Spans | None = None) -> tuple[str, str]
 
 def _as_odometry(log: Log) -> tuple[str, str] | None:
     """Return odometry and how it is known, if the errors of the reference add up in motion."""
-    errors = find_motion_errors(log)
+    errors = _find_motion_errors(log)
     return None if errors is None else (
         'odometry', 'its errors add up in motion: over a second it differs from the gyro by '
         '{:.2g} deg in turns, by {:.2g} deg in rests or slow turns'.format(
@@ -184,7 +184,7 @@ class _Seconds(NamedTuple):
     value_count: int  # of the fit
 
 
-def find_motion_errors(log: Log) -> tuple[float, float] | None:
+def _find_motion_errors(log: Log) -> tuple[float, float] | None:
     """
     Return how odometry errs over a second in turns, and the gyro in rests or slow turns, rad.
 

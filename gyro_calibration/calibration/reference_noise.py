@@ -149,7 +149,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         left = [(log.output - rate)[both] for rate in (
             given, np.interp(log.time, found.time, found.values))]
         steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
-        if steps < lines or output_delay(log, given) > 0.0:
+        if steps < lines or _output_delay(log, given) > 0.0:
             return log, None
     # not those in gaps
     after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
@@ -167,7 +167,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
             else replace(log, reference_rate=own)), kept
 
 
-def output_delay(log: Log, rate: Array) -> float:
+def _output_delay(log: Log, rate: Array) -> float:
     """Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s."""
     assert log.time is not None and log.output is not None
     known, output = np.isfinite(rate), bridge_gaps(log.output)
@@ -251,7 +251,7 @@ def step_evenness(log: Log, step: float) -> float:
 
 
 @dataclass(frozen=True)
-class HeadingDifference:
+class _HeadingDifference:
     """Difference of the headings of gyro and reference over a second."""
 
     constant_error: float  # of the part that does not grow with time, rad
@@ -265,7 +265,7 @@ class HeadingDifference:
         return self.constant_error > max(0.25 * self.total_walk, 1e-9)
 
 
-def heading_difference(log: Log) -> HeadingDifference:
+def heading_difference(log: Log) -> _HeadingDifference:
     """
     Separate the difference of the headings of gyro and reference by its growth over time.
 
@@ -276,7 +276,7 @@ def heading_difference(log: Log) -> HeadingDifference:
     stamps, output = log.time, bridge_gaps(log.output)
     own = np.isfinite(log.reference_heading)
     if own.sum() < 2 * _BLOCK_SAMPLES:
-        return HeadingDifference(0.0, 0.0)
+        return _HeadingDifference(0.0, 0.0)
     signals = [integrate_with_curvature(stamps, output), output, np.gradient(output, stamps)]
     sample, white = float(np.median(np.diff(stamps))), white_noise_deviation(output)
     heading, time, *crossing = (each[own] for each in (
@@ -320,16 +320,16 @@ def heading_difference(log: Log) -> HeadingDifference:
     whole = variance.pop(1.0, 0.0)
     error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
                         for part, each in variance.items())])
-    return HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * longest * interval)))
+    return _HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * longest * interval)))
 
 
 def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     """Return the ratio of the noise of a reference rate to that of the gyro; 0 if none shows."""
-    variance, gyro = rate_noise_variances(log, is_commanded)
+    variance, gyro = _rate_noise_variances(log, is_commanded)
     return math.sqrt(variance / max(gyro, 1e-3 * variance)) if variance else 0.0
 
 
-def rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, float]:
+def _rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, float]:
     """
     Return the variances of a reference rate and of the gyro, (rad/s)²; 0, 0 if none is detected.
 
@@ -344,7 +344,7 @@ def rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, f
     steps = np.diff(time[known])
     begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
     if log.time is not None and (is_commanded or len(begins) < 0.5 * len(rate)):
-        delay = output_delay(log, log.reference_rate)
+        delay = _output_delay(log, log.reference_rate)
         if delay > (0.0 if len(begins) < 0.5 * len(rate) else MAX_GYRO_LAG):
             return 0.0, 0.0
     slow = None if log.time is None else find_own_instants(log.time[known], rate)
@@ -403,7 +403,7 @@ def heading_noise_share(log: Log) -> float:
         return 0.0
     for own in (rows, rows[::2]):
         steps = np.diff(log.time[own])
-        variance, of_gyro = rate_noise_variances(Log(
+        variance, of_gyro = _rate_noise_variances(Log(
             time=log.time[own[1:]] - 0.5 * steps, output=np.diff(turned[own]) / steps,
             reference_rate=np.diff(log.reference_heading[own]) / steps))
         # the gyro has what is not in the difference

@@ -183,7 +183,7 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
 
 @dataclass(frozen=True)
-class OutputRounding:
+class _OutputRounding:
     """
     The errors of means over blocks of five samples by the steps of an output.
 
@@ -203,7 +203,7 @@ class OutputRounding:
         return np.asarray(sums @ sums.T)
 
 
-def find_rounding(time: Array, output: Array, step: float) -> OutputRounding | None:
+def find_rounding(time: Array, output: Array, step: float) -> _OutputRounding | None:
     """Return the errors by the steps of an output; None without a step, or beside more noise."""
     if not step:
         return None
@@ -215,7 +215,7 @@ def find_rounding(time: Array, output: Array, step: float) -> OutputRounding | N
     of_code = code[block]
     variance = np.bincount(of_code, (output - mean[block]) ** 2) / np.bincount(of_code)
     deviation = np.where(variance <= 0.25 * step ** 2, step / math.sqrt(12.0), 0.0)[code]
-    return OutputRounding(block, mean, code, deviation) if deviation.any() else None
+    return _OutputRounding(block, mean, code, deviation) if deviation.any() else None
 
 
 def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:

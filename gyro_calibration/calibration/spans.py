@@ -80,7 +80,7 @@ def lag_deviation(delay: float) -> float:
 
 
 @dataclass(frozen=True)
-class ReferenceTreatment:
+class _ReferenceTreatment:
     """Settings of the comparison of a kind of reference with the gyro."""
 
     min_span: float  # least length, s
@@ -101,11 +101,11 @@ class ReferenceTreatment:
         return _DELAY_SIGMAS * self.prior[2]
 
 
-COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
-                                      15.0, False, True)
+COURSE_TREATMENT = _ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
+                                       15.0, False, True)
 #: A reference with errors of an instrument.
-HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
-                                       True)
+HEADING_TREATMENT = _ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0,
+                                        True, True)
 _TREATMENTS = {
     'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
     # on the host of the gyro: small delays, as a swing agrees again a period later
@@ -153,7 +153,7 @@ class Spans:
     # first and last row of each rest, shape (r, 2), and whether the reference is known there
     rests: NDArray[np.intp]
     stands: Mask
-    treatment: ReferenceTreatment  # of the kind of the reference
+    treatment: _ReferenceTreatment  # of the kind of the reference
     # smaller and larger angle random walk, by the white noise of samples and reference rate, and
     # by the difference of gyro and reference over a second, rad/√s
     walk_bounds: tuple[float, float]
