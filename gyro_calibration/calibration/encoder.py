@@ -12,12 +12,9 @@
 Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
 
 The input is a log in time with a reference heading, and the method the likelihood of headings, or
-the regression of a course over ground. The error of an encoder is constant while its reading is,
-and known where the reading changes by a step; so readings are used at their steps (an error of
-step / √12 at each sample would give rests too much weight). The interval of
-the scale is the scatter between pieces of the log, since the error that repeats in each period of
-a swing is no noise of the fit, and at least that between places of the shaft; that of the bias is
-its wander between pieces.
+the regression of a course over ground. The interval of the scale is the scatter between pieces of
+the log, since the error that repeats in each period of a swing is no noise of the fit, and at
+least that between places of the shaft; that of the bias is its wander between pieces.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -270,7 +267,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], _HeadingJumps | None]:
         sizes[jumps] = change[once]
         halvings = (beyond[once].max() - high) / max(high - low, 1e-300)
         found = _HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
-                             tail * len(known) * 2.0 ** -min(halvings, 1000.0))
+                              tail * len(known) * 2.0 ** -min(halvings, 1000.0))
         remarks.append(
             f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
             f'to the next, at {format_list([f"{time[row]:.2f} s" for row in jumps])}, where the '

@@ -11,14 +11,10 @@
 """
 The motion within the limits of a robot that minimizes the heading error of a later drive.
 
-The accuracy of a run is computed before it is driven: the columns and priors of `fit_likelihood`
-and the noise figures of the gyro give the covariance of scale factor error s and bias b, with the
-rest after the run as in `check_rest`, and that of the heading of a later drive. Flicker and random
-walk of the bias, which the fit does not weigh, are propagated through its weights.
-
-A motion that returns has no net turn, so that the estimates of s and b are independent. The
-deviation of the bias depends on the white noise N, the time T, N / √T, and the rest, but not on
-the motion; that of s depends on the motion.
+The columns and priors of `fit_likelihood` and the noise figures of the gyro give the covariance of
+scale factor error s and bias b, with the rest after the run as in `check_rest`, and that of the
+heading of a later drive. The deviation of b depends on the white noise and the time, not on the
+motion, which determines s: a motion that returns has no net turn.
 """
 
 from collections.abc import Iterable

@@ -191,9 +191,8 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
 
     About its mean over the log a bias is the sum of ``u_j cos(ω_j (t - t_0))`` with ``ω_j = π j /
     T``. The variance of ``u_j`` is ``2 / T`` times the two-sided spectrum at ``ω_j``, ``B²/ω`` and
-    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. How far that mean
-    is from the bias where the log began has the variance ``2/π B²`` and ``K² T / 3``, which the
-    log does not show: `fit_noise_grid` adds it to the variance of the value `wandering_value`.
+    ``K²/ω²``. That mean differs from the bias where the log began by the variance ``2/π B²`` and
+    ``K² T / 3``, which `fit_noise_grid` adds to the value `wandering_value`.
 
     Parameters
     ----------

@@ -12,9 +12,8 @@
 From dwells to a gyro's model: values of effects, covariance, and errors of left-out sweeps.
 
 The errors are also those of full turns of 360 degrees (Ojeda et al., section 4), of the heading in
-each turn, rad, in proportion to its duration: with the bias of a rest before the mission only, and
-with a model and then the bias that remains at rest. Dwells that allow no answer raise
-`DataRefused`.
+each turn, rad: with the bias of a rest before only, and with a model and that bias after it.
+Dwells that allow no answer raise `DataRefused`.
 """
 
 from __future__ import annotations

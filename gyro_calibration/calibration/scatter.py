@@ -12,17 +12,14 @@
 The scatter of dwells about a gyro's effects, and the uncertainty of the effects' values.
 
 The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
-that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
-that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
-dwells of one sweep do not count as thirty independent ones: about a smooth surface over rate and
-temperature, as about too few effects they would include the error of a missing effect. The prior
-is uniform in the deviation of the quietest dwell, relative to all (Chung et al. 2013,
-Psychometrika 78:685): by the likelihood alone, a dwell of small deviation may be taken as exact.
+that of its sweep's bias, and that of its sweep's scale factor. Their sizes are estimated by
+restricted likelihood about a smooth surface over rate and temperature, as about too few effects
+they would include the error of a missing effect. The prior is uniform in the deviation of the
+quietest dwell, relative to all (Chung et al. 2013, Psychometrika 78:685): by the likelihood alone,
+a dwell of small deviation may be taken as exact.
 
-The covariance of the values states how well the dwells determine them, if the model is complete
-and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
-change by as much as from sweep to sweep, and outside of the calibrated temperatures and rates,
-effects that were not fitted add errors.
+The covariance of the values states how well the dwells determine them, the tolerance the errors of
+another run, or outside of the calibrated temperatures and rates.
 """
 
 from __future__ import annotations

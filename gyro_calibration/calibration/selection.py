@@ -11,11 +11,10 @@
 """
 Selection of a gyro's effects: by the prediction of left-out sweeps, each choice with its reason.
 
-Bias, scale factor error and their slopes over temperature belong to every model, as every gyro has
-them: the slopes where the dwells determine them better than a data sheet does. Another effect is
-taken where it reduces the error of left-out sweeps and is significant, given the number of effects
-tried. Sine response and cubic nonlinearity explain nearly the same; where the data do not
-distinguish them, the one by the physics of the instrument is taken, if the instrument is known.
+Bias, scale factor error and the slopes over temperature that the dwells determine better than a
+data sheet belong to every model. Another effect is taken where it reduces the error of left-out
+sweeps and is significant, given the number of effects tried. Sine response and cubic nonlinearity
+explain nearly the same; the physics of the instrument decides where the data do not.
 """
 
 from collections.abc import Sequence
