@@ -86,6 +86,20 @@ class Answer:
     text: str
 
 
+def table_row(case: Case) -> str:
+    """Return the row of the table that a case counts in."""
+    if case.part == 'references':
+        kind, suffix = case.reference, ', with a model' if case.noise == 'floor' else ''
+        return f'{kind}, ' + (f'{case.multiple:g} times' if case.names else 'nothing' + suffix)
+    return {'nothing': f'nothing, {case.noise}',
+            'effects': f'one effect, {case.multiple:g} times',
+            'pairs': f'two effects, {case.multiple:g} times',
+            'triples': f'three effects, {case.multiple:g} times',
+            'outside': f'outside the catalogue, {case.multiple:g} times',
+            'sets': 'look-alikes',
+            'separated': 'look-alikes, and a log that separates them'}[case.part]
+
+
 def answered(case: Case, seed: int) -> Answer:
     """Run a case; one that fails in whatever way is a row of the table, and not the end of it."""
     generator = random_source(case, seed)
@@ -100,7 +114,7 @@ def answered(case: Case, seed: int) -> Answer:
         text, failed = f'{type(raised).__name__}: {raised}', True
     seconds = time.process_time() - begin
     how = judge_findings(hidden, findings, beyond, case.allowed)
-    return Answer(case.table_row, how, how.is_right and not failed, bool(hidden.truth.names),
+    return Answer(table_row(case), how, how.is_right and not failed, bool(hidden.truth.names),
                   seconds, f'{case}\n    {text}')
 
 

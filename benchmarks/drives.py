@@ -20,7 +20,7 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.model.presets import GOOD_MEMS, Preset, RD2100, XV3500
+from gyro_calibration.model.presets import Preset, RD2100, XV3500
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +28,9 @@ from numpy.typing import NDArray
 STEP, GRID = 0.01, 0.1
 
 
+MPU6050 = Preset('MPU-6050', 'as measured at rest on the encoder turntable', 0.64)
+GOOD_MEMS = Preset('good MEMS', 'round figures of the better ones, such as the ADIS16488',
+                   0.3, 6.0, 0.01, 0.2)
 GYROS = {each.name: each for each in (XV3500, RD2100, GOOD_MEMS)}
 
 

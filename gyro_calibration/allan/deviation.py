@@ -11,8 +11,6 @@
 """
 Overlapping Allan deviation over averaging time, with bounds, of a record at rest.
 
-A record has samples on an even grid, without outliers and motion.
-
 Times are in samples, except in the chart. An Allan variance is a mean square of second differences
 of the angle, and mean squares of Gaussian values have the covariance 2 c² summed over all pairs
 (Greenhall and Riley, Uncertainty of stability variances based on finite differences, PTTI 2003).
@@ -66,8 +64,7 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     Put samples with increasing stamps, s and rad/s, shape (n,), on an even grid; lost are nan.
 
     An output that is nan counts as lost, as does one with `moving` 1; without `moving` the heading
-    by a reference, rad, is tested for motion. Raise `DataRefused` for too few samples, a dead
-    gyro, stamps without an even interval, or motion.
+    by a reference, rad, is tested for motion. Raise `DataRefused` for what is no record at rest.
     """
     _refuse_few(len(output))
     known = np.isfinite(output) if moving is None else np.isfinite(output) & (moving == 0.0)
@@ -322,8 +319,8 @@ def covariance_form(samples: int, first: int, second: int,
     Return the covariance of two Allan variances as a form of squared coefficients, shape (5, 5).
 
     Angle quantization is white: only lags at which two of its samples coincide contribute. A ramp
-    is no noise, but adds a mean m to values with the covariance c, and 4 m² c to the covariance of
-    their squares. A process, its times in samples, adds a row and column.
+    adds a mean m to values with the covariance c, and 4 m² c to the covariance of their squares. A
+    process, its times in samples, adds a row and column.
     """
     counts = (samples + 1 - 2 * first, samples + 1 - 2 * second)
     area = float(first) ** 2 * float(second) ** 2

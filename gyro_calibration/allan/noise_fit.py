@@ -337,8 +337,7 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
     The squared coefficients are found by generalized least squares (as in the generalized method
     of wavelet moments of Guerrier, Skaloud, Stebler and Victoria-Feser, JASA 2013), none of them
-    negative, with the covariance of the fitted noise itself. The shortest averaging times, which
-    the filters of a gyro bend, are left out until the sum of the terms fits the rest.
+    negative. The shortest averaging times, which the filters of a gyro bend, are left out.
 
     The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Raise
     `DataRefused` for too few samples, or where no sum of terms fits them.

@@ -22,19 +22,17 @@ from itertools import compress
 import math
 from typing import Any, NamedTuple
 
-from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.run_faults import (
     fit_scale, MAX_UNEXPLAINED_SHARE, refuse_unit_error)
+from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     find_runs, largest_divisor, mark_extremes, mark_rows, mask_outliers, mask_repeated_samples,
-    noise_before_rounding, quantization_step, rounding_product)
+    quantization_step)
 from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
-from scipy.special import digamma, polygamma
-from scipy.stats import f as fisher
 
 #: Minimum number of samples of a dwell, and minimum duration after all cuts, s.
 _MIN_SAMPLES, _MIN_DURATION = 8, 1.5
@@ -62,8 +60,9 @@ class Dwells:
     location: tuple[str, ...]  # of each dwell in its file, for messages
     remarks: tuple[str, ...] = ()  # on what was found and left out, one sentence each
     rows: tuple[Numbers, ...] = ()  # of the log, whose mean each dwell is
-    # step of a coarse output and deviation of its noise, rad/s, (n, 2); empty where it is fine
-    rounding: Array = field(default_factory=lambda: np.empty((0, 2)))
+    # standard deviation of the error by the steps of the output, rad/s, which dwells share
+    # (`step_covariance`); shape (n,), or empty
+    rounding: Array = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         return len(self.rate)
@@ -79,23 +78,17 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
     found = dwells_from_table(log) if log.time is None else find_dwells(log, min_share)
     if log.time is not None and not name:  # several logs may have a rate each
         # dwells over less than half of the rates of the log, such as rests alone
-        if log.reference_rate is not None:
-            rates = log.reference_rate[np.isfinite(log.reference_rate)]
-        else:
-            heading = np.asarray(log.reference_heading)
-            known = np.isfinite(heading)
-            rates = np.diff(np.interp(np.arange(log.time[0], log.time[-1]), log.time[known],
-                                      heading[known]))
-        low, high = np.quantile(rates, [0.01, 0.99])
+        low, high = np.nanquantile(require_output(log), [0.01, 0.99])
         if np.ptp(found.rate) < 0.5 * (high - low):
             raise NothingSteady(
                 f'the reference is steady at {found.rate.min() / DEGREE:.1f} to '
-                f'{found.rate.max() / DEGREE:.1f} deg/s only, and turns at {low / DEGREE:.1f} to '
-                f'{high / DEGREE:.1f} deg/s; hold faster rates for longer, or use '
-                '--method likelihood')
+                f'{found.rate.max() / DEGREE:.1f} deg/s only, and the gyro shows '
+                f'{low / DEGREE:.1f} to {high / DEGREE:.1f} deg/s; hold faster rates for longer, '
+                'or use --method likelihood')
     unexplained, scale = fit_scale(found.output, found.rate)
     if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
         refuse_unit_error(scale, 'reference')
+        refuse_scale(scale - 1.0, 'reference', 'give or omit --invert, or turn the gyro over')
     if (limited := _mark_limited(log, found)).any():
         places = [place for place, at_limit in zip(found.location, limited) if at_limit]
         remark = (f'{len(places)} dwells are at the limit of the output, '
@@ -116,48 +109,26 @@ def _mark_limited(log: Log, dwells: Dwells) -> Mask:
     """
     Return which dwells are at the limit of the output of their log, shape (n,).
 
-    They have one output, in one sense or both; a line through the others is beyond it at each of
-    their rates, and leaves less than one more effect of the rate in place of the limit. Of an
-    output that shows its noise, dwells have the same value by chance seldom.
+    A line through the others is beyond it at each of their rates, and leaves far less than a line
+    and one more effect of the rate through all.
     """
     extreme, step = mark_extremes(require_output(log))
     limited = np.array([extreme[rows].mean() > 0.5 for rows in dwells.rows])
-    times = np.array([len(rows) if log.time is None else 1 for rows in dwells.rows])
-    fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
-    # dwells of one rate and output have one rounding error, and count once
-    group = np.rint(dwells.rate / (0.005 * fastest))
-    used = np.zeros(len(dwells), dtype=bool)
-    used[np.unique(np.column_stack([group, np.rint(dwells.output / (1e-9 * fastest))]), axis=0,
-                   return_index=True)[1]] = True
-    line = np.column_stack([np.ones(len(dwells)), dwells.rate / fastest])
-    others, repeats, spare = used & ~limited, times[limited].sum() - 1, used.sum() - 3.0
-    if repeats < 1 or spare < 1 or not others.any() or np.ptp(line[others, 1]) < 0.01:
+    rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
+    line = np.column_stack([np.ones(len(rate)), rate])
+    if limited.sum() < 2 or len(np.unique(rate[~limited])) < 3:
         return np.zeros(len(dwells), dtype=bool)
 
-    def fit(columns: Array, rows: Mask) -> tuple[Array, float]:
-        """Return the values expected in all dwells by a fit to some, and its squares."""
-        expected = columns @ np.linalg.lstsq(columns[rows], dwells.output[rows], rcond=None)[0]
-        return expected, float(np.sum((dwells.output - expected)[rows] ** 2))
+    def residual(columns: Array, rows: Mask) -> Array:
+        return np.asarray(dwells.output - columns @ np.linalg.lstsq(
+            columns[rows], dwells.output[rows], rcond=None)[0])
 
-    expected, squares = fit(line, others)
-    beyond = (expected * np.sign(dwells.output))[limited] > np.abs(dwells.output[limited])
-    # with the variance of the steps, which is known, for each dwell
-    known = used.sum() * (step ** 2 / 12.0 + (1e-12 * fastest) ** 2)
-    left, spare = squares + known, spare + used.sum() * known / (squares + known)
-    rate = line[:, 1]
-    instead = min(fit(np.column_stack([line, effect]), used)[1]
+    off, everywhere = residual(line, ~limited), np.ones(len(rate), dtype=bool)
+    instead = min(float(np.sum(residual(np.column_stack([line, effect]), everywhere) ** 2))
                   for effect in (np.abs(rate), rate ** 2, rate ** 3))
-    chance = min(3.0 * float(fisher.sf((instead - left) * spare / left, 1, spare)), 1.0)
-    # the scatter of the others, between those of one rate, or by the samples of a fine output
-    group = np.unique(group[~limited], return_inverse=True)[1]
-    error, times = (dwells.output - expected)[~limited], times[~limited]
-    counts = np.bincount(group, times)
-    error = error - (np.bincount(group, times * error) / counts)[group]
-    scatter = max(math.sqrt(float(times @ error ** 2) / max(times.sum() - len(counts), 1)), 1e-300)
-    if not len(dwells.rounding):
-        scatter = max(scatter, float(np.median(np.nan_to_num(dwells.deviation[~limited]))))
-    chance *= min(step / (2.0 * math.sqrt(math.pi) * scatter), 1.0) ** repeats
-    return limited & bool(beyond.all() and chance < MIN_FIT_PROBABILITY)
+    left = float(np.sum(off[~limited] ** 2)) + len(rate) * step ** 2 / 12.0
+    is_beyond = -np.sign(dwells.output[limited]) * off[limited] > 0.0
+    return limited & bool(is_beyond.all() and instead > OUTLIER_THRESHOLD * left)
 
 
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
@@ -187,7 +158,7 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
     return Dwells(rate, output, np.concatenate(temperatures) if has_temperature else None,
                   deviation, sweep, sum((part.location for part in parts), ()), remarks,
                   sum((part.rows for part in parts), ()),
-                  rounding if len(rounding) == len(rate) else np.empty((0, 2)))
+                  rounding if len(rounding) == len(rate) else np.empty(0))
 
 
 def require_output(log: Log) -> Array:
@@ -231,66 +202,33 @@ def dwells_from_table(log: Log) -> Dwells:
     try:
         deviation: Array = np.array(log.others.get(
             'deviation_dps', [math.nan] * len(log)), dtype=float)[rows] * DEGREE
+        deviation[~(deviation > 0.0)] = math.nan
     except ValueError as error:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
     output, temperature = output[rows], None if log.temperature is None else log.temperature[rows]
-    first, number = _find_distinct(rate, output, temperature)
-    is_coarse = len(first) < len(rows)
-    rounding: Array = np.empty((0, 2))
-    if is_coarse or not (deviation > 0.0).any():  # that of the steps is the only one that is known
-        # The step is the largest one that all differences are multiples of, those of a coarse
-        # output but for its decimals. Where the rates explain it, as those of a gyro without
-        # errors, it is at most 1 deg/s.
-        changes, of_rates = output - output[0], 0.5 * largest_divisor(rate - rate[0])
-        step = largest_divisor(changes)
-        coarse = largest_divisor(changes, step) if is_coarse else 0.0
-        if 2.0 * math.sqrt(step * np.abs(changes).max()) < coarse < of_rates:
-            step = coarse  # by multiples that the decimals leave certain
-        if step > of_rates:
-            step = largest_divisor(np.append(changes, DEGREE))
-        if len(_coarse_rounding(rate[first], output[first], step, np.zeros(len(first)))[0]):
-            rounding, of_steps = _coarse_rounding(rate, output, step, np.zeros(len(rows)))
-            deviation = np.hypot(np.maximum(np.nan_to_num(deviation), 0.0), of_steps)
-    found = Dwells(rate, output, temperature, np.where(deviation > 0.0, deviation, np.nan),
-                   0 * sweep if is_coarse else sweep, tuple(f'row {row + 1}' for row in rows),
-                   tuple(remarks), tuple(np.split(rows, len(rows))), rounding)
-    if not is_coarse or len(rounding):
-        return found
-    repeats = format_list([str(row + 1) for row in np.delete(rows, first)])
-    remarks.append('most repeats of a rate have the same output, by its steps, so that rows which '
-                   f'repeat another one count once: {repeats}')
-    return replace(select_dwells(found, np.isin(np.arange(len(rows)), first)), rows=tuple(
-        rows[number == each] for each in range(len(first))), remarks=tuple(remarks))
-
-
-def _find_distinct(rate: Array, output: Array,
-                   temperature: Array | None) -> tuple[Numbers, Numbers]:
-    """
-    Return the first of equal dwells, and of which each dwell is one, shape (m,) and (n,).
-
-    Dwells of one rate, output and temperature are equal where most repeats of rates are: they have
-    one error by the steps of the output, of which several do not tell more.
-    """
-    warm = np.zeros(len(rate)) if temperature is None else np.nan_to_num(temperature)
-    warm = np.floor((warm - warm.min()) / MIN_TEMPERATURE_SPREAD)
-    places = len(np.unique(np.column_stack([rate, warm]), axis=0))
-    _, first, number = np.unique(np.column_stack([rate, warm, output]), axis=0, return_index=True,
-                                 return_inverse=True)
-    if 2 * (len(rate) - len(first)) <= len(rate) - places:
-        return np.arange(len(rate)), np.arange(len(rate))
-    order = np.argsort(first)
-    return first[order], np.argsort(order)[number.ravel()]
+    # The step is the largest one that all differences are multiples of. Where the rates explain
+    # it, as those of a gyro without errors, it is at most 1 deg/s.
+    changes = output - output[0]
+    step = largest_divisor(changes)
+    if step > 0.5 * largest_divisor(rate - rate[0]):
+        step = largest_divisor(np.append(changes, DEGREE))
+    # of means over many samples it is that of the digits of the file
+    rounding = np.full(len(rate), step / math.sqrt(12.0))
+    of_steps = _independent_deviation(rate, output, rounding)
+    deviation = np.hypot(deviation, of_steps) if (deviation > 0.0).any() else of_steps
+    return Dwells(rate, output, temperature, np.where(deviation > 0.0, deviation, np.nan), sweep,
+                  tuple(f'row {row + 1}' for row in rows), tuple(remarks),
+                  tuple(np.split(rows, len(rows))), rounding)
 
 
 def _number_sweeps(rate: Array) -> tuple[Numbers, str]:
     """
     Return the number of the sweep of each dwell, by the order of the rates, shape (n,), and how.
 
-    The rates of a sweep, without its rests, increase or decrease, or their absolute values do with
-    changing sign: whichever gives the fewest sweeps. Where the median of these has less than four
-    dwells, a sweep is the shortest block of dwells of three rates or more whose repetition is the
-    whole, in any order. Else nine blocks of consecutive dwells are taken as sweeps.
+    The rates of a sweep, or their absolute values with changing sign, increase or decrease:
+    whichever gives the fewest sweeps. Where their median has less than four dwells, blocks are
+    taken as sweeps.
     """
     number, largest = np.arange(len(rate)), float(np.abs(rate).max(initial=0.0))
     turning = np.abs(rate) > max(1e-3 * largest, 0.01 * DEGREE)
@@ -309,12 +247,6 @@ def _number_sweeps(rate: Array) -> tuple[Numbers, str]:
         lengths += np.bincount(sweep) > lengths  # the rests of a sweep are one of its rates
         if passes[-1] and np.median(lengths) >= 4:
             return sweep, 'numbered by the order of the rates'
-    for length in range(3, len(rate) // 2 + 1):
-        if len(rate) % length == 0:
-            blocks = np.sort(rate.reshape(-1, length))
-            if ((np.ptp(blocks, axis=0) <= tolerance).all()
-                    and (np.diff(blocks[0]) > tolerance).sum() >= 2):
-                return number // length, 'numbered by the repetition of the rates'
     return (number * min(9, len(rate)) // len(rate),
             'blocks of consecutive dwells, since the order of the rates shows no sweeps')
 
@@ -323,8 +255,7 @@ def _number_passes(value: Array, tolerance: float) -> Numbers:
     """
     Assign numbers to passes through values; a pass begins where the direction reverses.
 
-    Changes up to the tolerance have no direction. Values that are repeated where passes turn
-    belong to both in equal parts.
+    Values that are repeated where passes turn belong to both in equal parts.
     """
     change = np.diff(value)
     steps = np.where(np.abs(change) > tolerance, np.sign(change), 0.0)
@@ -386,12 +317,7 @@ class _Samples(NamedTuple):
         return float(np.ptp(self.time[rows]))
 
     def slope(self, rows: Numbers, angle: Array) -> float:
-        """
-        Return the mean rate of an angle over some samples, rad/s.
-
-        It is the slope of a straight line through a heading, whose errors are those of single
-        samples, and the difference of both ends over the duration of an integrated rate.
-        """
+        """Return the mean rate of an angle over some samples, rad/s."""
         time = self.time[rows]
         return (fit_scale(angle, time)[1] if self.rate is None
                 else float((angle[-1] - angle[0]) / (time[-1] - time[0])))
@@ -562,9 +488,8 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     Return the settling time of the output after a ramp, s.
 
     A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
-    over all but the shortest dwells, and over the longest ones, which show a slower response. It
-    is settled where it is within four standard deviations of its last half; below 20 ppm it always
-    is.
+    over dwells. It is settled within four standard deviations of its last half; below 20 ppm it
+    always is.
     """
     durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
     interval, width, found = max(0.05, float(np.median(np.diff(time)))), 4, 0.0
@@ -610,10 +535,9 @@ def _average(samples: _Samples,
     """
     Return reference rate, output and its standard deviation of each dwell (Ojeda et al., eq. 6).
 
-    Heading and integral of the output are averaged with the same weights, so that deviations of
-    the table from its steady rate are the same in both. The deviation is that of four to twelve
-    batches of at least 0.75 s, in which vibration and the response of a filter average out, and of
-    the rounding of the output, which is returned too; nan where it is not known.
+    Heading and integral of the output are averaged with the same weights. The deviation is that of
+    four to twelve batches of at least 0.75 s, in which vibration averages out, and of the rounding
+    of an output with noise below half a step, which is returned too; nan where it is not known.
     """
     durations = np.array([samples.duration(rows) for rows in dwells])
     batches = np.clip(durations / 0.75, 4, 12).astype(int)
@@ -640,84 +564,39 @@ def _average(samples: _Samples,
     # error the steps of the encoder. Under white noise its product with the duration is constant.
     variance = durations * (by_error if samples.rate is not None
                             else min(by_output, by_error, key=np.median))
-    # of samples of one value nothing is known, but for the rounding of their sum
-    variance[variance < durations * (1e-9 * np.abs(output).max()) ** 2] = 0.0
-    # Up to a quarter of a squared step, the variance depends on the place in the step, so such
-    # dwells have one noise. Where most are on one step each, the whole output shows the step.
+    # the noise of all dwells is one, as that of a few batches has an error of 40 %; of samples of
+    # one value nothing is known
+    common = float(np.mean(variance)) if np.any(
+        variance > durations * (1e-9 * np.abs(output).max()) ** 2) else 0.0
+    # Where most dwells are on one step each, the whole output shows the step.
     values = [samples.output[rows] for rows in dwells]
     step = (quantization_step(np.concatenate(values))
             if np.median([np.ptp(each) for each in values]) > 0.0
             else largest_divisor(np.unique(samples.output) - samples.output.min()))
-    noise: Array = np.zeros(len(dwells))
-    if step:
-        squares = np.array([float(np.var(each)) for each in values]) / step ** 2
-        if (quiet := squares <= 0.25).any():
-            squares[quiet] = squares[quiet].mean()
-        noise = np.sqrt(noise_before_rounding(squares))
-    rounding, of_steps = _coarse_rounding(rate, output, step, noise)
-    deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2
-                        + of_steps ** 2)
+    is_quiet = np.array([np.var(each) <= 0.25 * step ** 2 for each in values])
+    rounding = is_quiet * step / math.sqrt(12.0)
+    deviation = np.sqrt(common / durations + blur ** 2
+                        + _independent_deviation(rate, output, rounding) ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan), rounding
 
 
-def dwell_rounding_covariance(rate: Array, output: Array, rounding: Array) -> Array:
+def step_covariance(rate: Array, output: Array, rounding: Array) -> Array:
     """
-    Return the covariance of the means of dwells due to the steps of the output, shape (n, n).
+    Return the covariance of the errors of dwells by the steps of their output, (rad/s)², (n, n).
 
-    Where in a step a value lies is not known, but how far two values lie apart is; the mean
-    product of their errors is `rounding_product`. The variance of their noise is the mean, with
-    half of the variance of the distance: of the bias between dwells of nearly one rate, beyond the
-    steps, and of the scale, by the rounding of the fastest rate.
+    Where in a step a value lies is not known, but how far two values lie apart is. The errors of
+    two values without noise, uniform in a step, that are a part f of a step apart have the
+    correlation ``1 - 6 f (1 - f)``. Over the range of rates the steps determine the scale, and so
+    a distance, to half a step.
     """
-    place, wander = _place_in_steps(rate, output, rounding)
-    noise, apart = (rounding[:, 1] / rounding[:, 0]) ** 2, place[:, None] - place
-    noise = 0.5 * (noise[:, None] + noise + wander * (1.0 - np.eye(len(rate))))
-    noise = noise + (apart / max(float(np.abs(place).max()), 1e-300)) ** 2 / 24.0
-    is_alike = np.abs(np.log(rounding[:, :1] / rounding[:, 0])) < 1e-6
-    return (rounding_product(noise, apart) * rounding[:, :1] * rounding[:, 0] * is_alike)
+    place = rate * fit_scale(output, rate)[1]
+    apart = place[:, None] - place
+    part = np.mod(apart / np.maximum(rounding * math.sqrt(12.0), 1e-300), 1.0)
+    known = np.exp(-(math.pi * apart / max(float(np.abs(place).max()), 1e-300)) ** 2 / 6.0)
+    return np.outer(rounding, rounding) * (1.0 - 6.0 * part * (1.0 - part)) * known
 
 
-def _place_in_steps(rate: Array, output: Array, rounding: Array) -> tuple[Array, float]:
-    """Return the expected outputs, shape (n,), and the variance of the bias, both by the steps."""
-    turned, step = rate * fit_scale(output, rate)[1], rounding[:, 0]
-    changes = np.diff(((output - turned) / step)[np.argsort(turned)])
-    # by the median, which outlying dwells do not change: 0.455 of a variance
-    variance = float(np.median(changes ** 2)) / 0.91 - 1.0 / 12.0 if len(changes) else 0.0
-    return turned / step, max(variance, 0.0)
-
-
-def _coarse_rounding(rate: Array, output: Array, step: float, noise: Array) -> tuple[Array, Array]:
-    """
-    Return `Dwells.rounding`, with noise in steps, and deviations of its errors, rad/s, shape (n,).
-
-    None where noise or wander of the bias average the steps out. The deviations are those of
-    independent errors: of n dwells with the same error, each has n times its variance.
-    """
-    if step:
-        rounding = step * np.column_stack([np.ones(len(noise)), noise])
-        wander = _place_in_steps(rate, output, rounding)[1]
-        # from 0.5 on the series is below 1e-9, and the errors are a small part of the scatter
-        if float(noise.min()) ** 2 + 0.5 * wander < 0.5:
-            shared = dwell_rounding_covariance(rate, output, rounding)
-            return rounding, np.sqrt(np.maximum(shared, 0.0).sum(axis=1))
-    return np.empty((0, 2)), np.zeros(len(rate))
-
-
-def _shrink_variances(variance: Array, dof: Array) -> Array:
-    """
-    Shrink variances, shape (n,), toward their common value, by more if they agree.
-
-    A variance of twelve batches has a standard error of 40 %. Empirical Bayes: the logarithms are
-    shrunk by the scatter that the degrees of freedom explain (Smyth 2004, section 6.2).
-    """
-    known = variance > 0.0  # 0 where it is not known
-    if known.sum() < 3:
-        return variance
-    half_dof = dof[known] / 2.0
-    logarithm = np.log(variance[known]) - digamma(half_dof) + np.log(half_dof)
-    chance = polygamma(1, half_dof)
-    middle = float(np.average(logarithm, weights=half_dof))
-    excess = max(float(logarithm.var(ddof=1) - chance.mean()), 0.0)
-    shrunk = np.full(len(variance), math.exp(middle))
-    shrunk[known] = np.exp(middle + (logarithm - middle) * excess / (excess + chance))
-    return shrunk
+def _independent_deviation(rate: Array, output: Array, rounding: Array) -> Array:
+    """Return deviations as of independent errors: of n equal ones each has n times its square."""
+    shared = step_covariance(rate, output, rounding)
+    return np.sqrt(np.maximum(shared.sum(axis=1), np.diag(shared)))

@@ -12,12 +12,9 @@
 Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
 
 The input is a log in time with a reference heading, and the method the likelihood of headings, or
-the regression of a course over ground. The error of an encoder is constant while its reading is,
-and known where the reading changes by a step; so readings are used at their steps (an error of
-step / √12 at each sample would give rests too much weight). The interval of
-the scale is the scatter between pieces of the log, since the error that repeats in each period of
-a swing is no noise of the fit, and at least that between places of the shaft; that of the bias is
-its wander between pieces.
+the regression of a course over ground. The interval of the scale is the scatter between pieces of
+the log, since the error that repeats in each period of a swing is no noise of the fit, and at
+least that between places of the shaft; that of the bias is its wander between pieces.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,7 +38,7 @@ from gyro_calibration.calibration.reference_kind import find_reference_kind, is_
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
+    fit_profile, refuse_unit_error, split_run)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects, TECHNOLOGY_PRIORS)
 from gyro_calibration.calibration.self_calibration import (
@@ -60,7 +57,7 @@ from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import (
-    Motion, motion_from_headings, motion_from_log, motion_from_rates)
+    Motion, motion_from_headings, motion_from_log)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +204,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
-class HeadingJumps(NamedTuple):
+class _HeadingJumps(NamedTuple):
     """Jumps of a reference heading that the gyro does not show."""
 
     rows: NDArray[np.intp]  # first rows after them
@@ -216,14 +213,13 @@ class HeadingJumps(NamedTuple):
     p_value: float  # chance of the largest in noise
 
 
-def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
+def bridge_jumps(log: Log) -> tuple[Log, list[str], _HeadingJumps | None]:
     """
     Return a log whose reference heading continues over its jumps as the gyro does, remarks, jumps.
 
     A jump is a change from one value to the next beyond all rates of the gyro around it, and
     beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
-    1975). Two in a row, there and back, are a wrong value, which is left out; else they are a
-    motion that the gyro does not measure.
+    1975). Two in a row, there and back, are a wrong value, which is left out.
     """
     if log.time is None or log.output is None or log.reference_heading is None:
         return log, [], None
@@ -259,7 +255,7 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
     back = above[:-1] & above[1:] & (np.abs(difference[:-1] + difference[1:]) <= noise)
     wrong = known[1:-1][back]
     sizes, heading, remarks = np.zeros(len(time)), log.reference_heading.copy(), []
-    found: HeadingJumps | None = None
+    found: _HeadingJumps | None = None
     if len(wrong):
         heading[wrong] = np.nan
         remarks.append('the reference is off in single values, which are left out, by up to '
@@ -270,8 +266,8 @@ def bridge_jumps(log: Log) -> tuple[Log, list[str], HeadingJumps | None]:
         change = min((difference, alone), key=lambda each: robust_deviation(each[usual]))
         sizes[jumps] = change[once]
         halvings = (beyond[once].max() - high) / max(high - low, 1e-300)
-        found = HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
-                             tail * len(known) * 2.0 ** -min(halvings, 1000.0))
+        found = _HeadingJumps(jumps, sizes[jumps], robust_deviation(change[usual]),
+                              tail * len(known) * 2.0 ** -min(halvings, 1000.0))
         remarks.append(
             f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value '
             f'to the next, at {format_list([f"{time[row]:.2f} s" for row in jumps])}, where the '
@@ -285,8 +281,7 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
     Return a log with a single reference over time, and remarks on what was left out.
 
     Of a heading and a rate it is the heading, unless this is known for less than half as long, or
-    the rate is preferred and both turn alike. Where they contradict each other, and one is further
-    from the gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
+    the rate is preferred and both turn alike. A remark states where they contradict each other.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -311,16 +306,6 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         elif ((turned.any() or not alike)
               and abs(scale - 1.0) >= max(1e-3, math.sqrt(max(unexplained, 0.0)))):
             contradiction = f'turns {scale:.3f} times as far as'
-        if contradiction and log.output is not None:
-            rows = np.isfinite(log.output[known])
-            gyro = split_run(time[rows], log.output[known][rows])
-            left = []  # shares of the squares of what the gyro turned
-            for each in (motion_from_rates(time, rate[known]), motion):
-                delay = fit_profile(gyro, each, COURSE_TREATMENT.largest_delay)[2]
-                off = gyro.gyro_angle - gyro.reference_angle(each, delay)
-                left.append(float(np.var(off)) / max(float(np.var(gyro.gyro_angle)), 1e-300))
-            if max(left) > max((UNIT_TOLERANCE - 1.0) ** 2, 2.0 * min(left)):
-                by_rate = left[0] < left[1]
     remarks = [f'The reference heading is known in {counts[1]} samples only; the rate, known in '
                f'{counts[0]}, is used.'] if by_rate and 2 * counts[1] < counts[0] else []
     if contradiction:
@@ -390,13 +375,10 @@ def _estimate_drift(motion: Motion, error: Array, bias: float,
     """
     Return the fit of the mean bias over a log, rad/s, and 95 % bounds of the angle random walk.
 
-    By the drifts between pieces of the log. The bounds, rad/√s, hold if nothing else moves the
-    heading.
-    What repeats itself with a motion within a piece is noise of the mean heading of that piece.
-    The bias has a normal prior about zero, of a tenth of the size that the technology has up to
-    all of it: a bias of many standard deviations stays; one that the log hardly shows would only
-    harm a heading. Given are, of the fit, the error of the heading, rad, shape (n,), and the bias,
-    rad/s.
+    By the drifts between pieces of the log; what repeats itself within a piece is noise of its
+    mean heading. The bias has a normal prior about zero, of a tenth of the size that the
+    technology has up to all of it: one that the log hardly shows would only harm a heading. Given
+    are the error of the heading of the fit, rad, shape (n,), and its bias, rad/s.
     """
     piece = _number_pieces(motion.time)
     counts = np.bincount(piece)
@@ -495,11 +477,10 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
                'their stamps not of one clock: check them before the model is used')
     if fit.response_deviation ** 2 > 0.5 * fit.covariance[0, 0]:
-        yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag of '
-               'the reference or the gyro, as where it has one frequency, or a period that is not '
-               f'much longer; {100.0 * fit.response_deviation:.2g} % of the standard deviation '
-               'are for that, as far as the delay shows it. A reference that was smoothed without '
-               'a delay may err by more: turn slowly, at several speeds, with stops')
+        yield ('the motion hardly distinguishes a scale factor error from a smoothing or a lag, '
+               f'as where it has one frequency; {100.0 * fit.response_deviation:.2g} % of the '
+               'standard deviation are for that, as far as the delay shows it. Turn slowly, at '
+               'several speeds, with stops')
     if fit.misalignment.size:
         angle, half, chance = oblique_angle(fit.misalignment, fit.misalignment_covariance)
         if chance < FALSE_ALARM_RATE:
@@ -514,9 +495,8 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
             yield (f'in motion the reference drifts by {rate:.3f} +- {half:.3f} deg/s (95 %) '
                    'against the rests in which it stands; the bias is that of the rests')
         elif fit.reference_adds_up:
-            yield ('the reference is never lost, as odometry, and stands in no rest: its drift in '
-                   'motion has the same effect as a bias, which the intervals do not include; '
-                   'rest now and then')
+            yield ('the reference stands in no rest: its drift in motion has the same effect as a '
+                   'bias, which the intervals do not include; rest now and then')
         half = NORMAL_QUANTILE_975 * math.sqrt(fit.covariance[0, 0])
         largest, largest_bias = NORMAL_QUANTILE_975 * np.array(TECHNOLOGY_PRIORS[technology])
         if abs(fit.bias) > largest_bias:
@@ -527,11 +507,10 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
                    f'{technology} have: check the units, and the size and distance of wheels')
         elif half > 1.001 * largest:
             yield ('the drive does not show whether the reference has a wrong scale, as of wheels '
-                   'at another distance, so that the interval of the scale factor error is wider '
-                   f'than that of gyros of the technology {technology}: turn more often')
+                   'at another distance: turn more often')
         else:
             yield (f'scale factor error and bias have priors of the technology {technology} '
-                   '(--technology) with mean zero, which the intervals include')
+                   '(--technology)')
         if not fit.reference_adds_up:
             return
     reference_error = -s / (1.0 + s)
@@ -541,16 +520,15 @@ def _list_remarks(fit: ScaleBiasFit, motion: Motion, method: str,
            f'would have the same effect as this scale factor error of {100 * s:+.2f} %: '
            'check it over whole turns closed on a mark')
     if fit.shaft_error.size and (turned := float(np.ptp(motion.heading))) < math.tau:
-        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, less than a revolution, '
-               'in which an error once in a revolution, as of an eccentric encoder, may have the '
-               'effect of a scale factor error, 0.1 deg that of up to 0.17 %; the interval does '
-               'not include what the likelihood does not show: turn further')
+        yield (f'the reference turns by {turned / DEGREE:.0f} deg in all, in which an error once '
+               'in a revolution, as of an eccentric encoder, may have the effect of a scale '
+               'factor error, 0.1 deg that of up to 0.17 %, beyond the interval: turn further')
 
 
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
 _MIN_DWELLS = 3
-HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
-                 'effects use --method dwells')
+_HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
+                  'effects use --method dwells')
 
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
@@ -558,10 +536,6 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     """Calibrate by the dwells of logs, by their paths, or by the heading of one (`api.fit`)."""
     for log in logs.values():
         _refuse_own_reference(log)
-    chosen = {path: choose_reference(log) for path, log in logs.items()}
-    # the rate alone, where the gyro shows that the heading is wrong
-    alone = {path: each for path, (each, _) in chosen.items() if each.reference_heading is None}
-    logs, remarks = {**logs, **alone}, [each for path in alone for each in chosen[path][1]]
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
     if method == 'dwells' or method is None and (others or any(
             log.time is None or log.reference_rate is not None or log.reference_heading is None
@@ -578,7 +552,6 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                         raise type(error)(f'{name}: {error}') from None
                     raise
             table = join_dwells(parts)
-            table = replace(table, remarks=(*remarks, *table.remarks))
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
                 return (SelectedEffects(fit_effects(table, effects), (), ()) if effects
@@ -591,13 +564,13 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                           'a log with a reference heading is fitted alone')
                          + '; give one log, or use --method dwells')
     if others:
-        raise InputError(HEADING_ALONE)
+        raise InputError(_HEADING_ALONE)
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
     if log.reference_heading is not None:
         return found
     return replace(found, remarks=(
-        *remarks, 'the log has a reference rate, which is constant '
+        'the log has a reference rate, which is constant '
         f'{_MIN_DWELLS - 1} times at most, or for up to {100.0 * FEW_DWELLS_SHARE:g} % of the '
         'time; so the rate is integrated, and headings are compared. For other effects than bias '
         'and scale factor error, hold each rate for some seconds', *found.remarks))

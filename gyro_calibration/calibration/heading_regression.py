@@ -23,7 +23,7 @@ technology of the gyro.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any
@@ -31,14 +31,13 @@ from typing import Any
 from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
-    average_hypotheses, carried_shares, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior)
+    average_hypotheses, fit_noise_grid, GridFit, heading_noise, HierarchicalPrior)
 from gyro_calibration.calibration.run_faults import fit_profile, split_run
 from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.spans import (
     BASE_VALUES, CauseTerm, design_matrix, DRIFT_TERM, MISALIGNMENT_TERM, Spans, WIDE_PRIOR)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask, NORMAL_QUANTILE_975
-from gyro_calibration.logs.quality import (
-    robust_deviation)
+from gyro_calibration.logs.quality import robust_deviation
 from gyro_calibration.model.motion import motion_from_headings
 import numpy as np
 from numpy.typing import NDArray
@@ -110,10 +109,9 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    Rests that the motion contradicts are left out where no causes are given. Wheels of another
-    size may exceed what a gyro errs by: beside a course the values are means under the prior of
-    the technology and a wide one, weighted by their probability given the drive. A bias beyond the
-    technology is that of another one, whose bias may have any size.
+    Rests that the motion contradicts are left out where no causes are given. Beside a course the
+    values are means under the prior of the technology and a wide one, as of wheels of another
+    size, weighted by their probability given the drive.
     """
     every, prior = spans.all_causes(causes), spans.treatment.prior
     corrected, point_variances = _correct_rate(spans, every)
@@ -230,39 +228,24 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     prior, deviation = spans.treatment.prior, spans.prior_deviations(causes)
     observed, (waves, shared) = spans.observed, spans.bias_wander()
 
-    def fit_with(correlation: Array | None = None, reference_walk: Array | None = None,
-                 walk_size: float | None = None, **options: Any) -> GridFit:
-        parts = heading_noise(in_motion, rates, point_variances, correlation=correlation,
-                              angle_random_walk=(low * least, high * most),
-                              reference_walk=reference_walk,
-                              is_measured=spans.is_measured[:len(spans.time) - 1])
-        if walk_size is not None:
-            parts[2] = replace(parts[2], size_range=(walk_size, walk_size))
-        parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
-                         off_diagonal=None if part.off_diagonal is None
-                         else np.append(part.off_diagonal, 0.0 * durations))
-                 for part, of_rests in zip(parts, [
-                     durations, *[0.0 * durations] * (len(parts) - 1)])]
-        return fit_noise_grid(
-            observed, columns, parts if spans.treatment.errs_as_heading else parts[:1] + parts[3:],
-            waves, shared, prior_deviation=deviation, carried=None if correlation is None
-            else np.append(carried_shares(correlation), 0.0 * durations), **options)
-
-    if spans.treatment.is_fine:
-        fit = fit_with()
-    else:
-        walk, size = _reference_walk(spans, fit_with) if spans.adds_up else (None, None)
-        greatest, likeliest = -math.inf, None
-        for over_span in (0.0, 0.2, 0.4, 0.6, 0.8):
-            correlation = over_span ** (np.diff(spans.time) / spans.treatment.min_span)
-            evidence = fit_with(correlation, walk, size).log_evidence
-            if evidence < greatest:
-                break
-            greatest, likeliest = evidence, correlation
-        # what a drive of minutes does not determine is drawn to 0
-        fit = fit_with(likeliest, walk, size, wandering_value=1, hierarchical_priors=[
+    # by many small slips, the errors of odometry add up with the angle turned
+    parts = heading_noise(in_motion, rates, point_variances, (low * least, high * most),
+                          np.abs(spans.angles) if spans.adds_up and not spans.treatment.is_fine
+                          else None, spans.is_measured[:len(spans.time) - 1])
+    parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
+                     off_diagonal=None if part.off_diagonal is None
+                     else np.append(part.off_diagonal, 0.0 * durations))
+             for part, of_rests in zip(parts, [
+                 durations, *[0.0 * durations] * (len(parts) - 1)])]
+    if not spans.treatment.errs_as_heading:
+        parts = parts[:1] + parts[3:]
+    # what a drive of minutes does not determine is drawn to 0
+    options: dict[str, Any] = {} if spans.treatment.is_fine else {
+        'wandering_value': 1, 'hierarchical_priors': [
             HierarchicalPrior(name, place, (1e-2 * size, size))
-            for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))])
+            for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))]}
+    fit = fit_noise_grid(observed, columns, parts, waves, shared, prior_deviation=deviation,
+                         **options)
     values = fit.values + spans.correction(causes, len(fit.values))
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
                    np.ones(len(values)))
@@ -271,41 +254,16 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     return replace(done, covariance=covariance, effective_stretches=effective, freedom=freedom)
 
 
-def _reference_walk(spans: Spans,
-                    fit_with: Callable[..., GridFit]) -> tuple[Array | None, float | None]:
-    """
-    Return how errors of odometry grow over each span, shape (n,), and their size.
-
-    They do not add up, grow with the time in motion, or with the angle turned by many small slips,
-    or a slip is a share of a whole turn, from a reversal to the next: whichever is the likeliest.
-    """
-    angles, independent = np.abs(spans.angles), np.zeros(len(spans.time) - 1)
-    number = np.cumsum(np.diff(spans.angles > 0.0, prepend=spans.angles[0] > 0.0))
-    walks = [None, np.diff(spans.point_means(spans.time_in_motion)), angles,
-             angles * np.bincount(number, angles)[number]]
-    fits = [fit_with(independent, each) for each in walks]
-    walk, fit = max(zip(walks, fits), key=lambda each: each[1].log_evidence)
-    if walk is None:
-        return None, None
-    of_spans, white, by_span = (fit.likeliest_sizes[name] ** 2 for name in (
-        'angle_random_walk', 'reference', 'reference_walk'))
-    left, grown, duration = (np.bincount(number, each) for each in (
-        fit.residual[:len(walk)], walk, np.diff(spans.time)))
-    by_turn = np.sum(left ** 2 - of_spans * duration - 2.0 * white) / np.sum(grown)
-    return walk, math.sqrt(max(by_turn, by_span))
-
-
 def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
                                prior: Array) -> tuple[Array, Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores of stretches.
 
-    Nor less than their mean square error under the widest prior; nor than what they change by
-    without each place of a shaft (jackknife, Tukey 1958), as the few turning points of an even
-    swing may determine a value. The intervals of the first values are not wider than those of
-    their priors; that of a scale factor error that fewer than `MIN_STRETCHES` stretches determine
-    is as wide, as it cannot be separated from errors of the reference. Also the effective number
-    of stretches that determine each value, and the degrees of freedom.
+    Nor less than their mean square error under the widest prior, nor than what they change by
+    without each place of a shaft (jackknife, Tukey 1958). The intervals of the first values are
+    not wider than those of their priors; that of a scale factor error that fewer than
+    `MIN_STRETCHES` stretches determine is as wide. Also the effective number of stretches of each
+    value, and the freedom.
     """
     count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
@@ -318,10 +276,10 @@ def _cluster_robust_covariance(data: WhitenedRegression, fit: GridFit,
     scatter = np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5)
     variances = np.maximum(np.maximum(np.diag(fit.covariance), scatter),
                            np.diag(inverse) + (values[:count] - fit.values) ** 2)
-    effective = effective_clusters(stretch[inside], data.design[inside, :count])
+    effective = _effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
     for cluster in sectors:
-        rests_on = effective_clusters(cluster[inside], influence[inside])
+        rests_on = _effective_clusters(cluster[inside], influence[inside])
         scatter = _jackknife(data, cluster, inside)[:count]
         freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
         variances = np.maximum(variances, scatter)
@@ -347,7 +305,7 @@ def _jackknife(data: WhitenedRegression, cluster: NDArray[np.intp], inside: Mask
     return np.asarray((parts - 1) * np.var(without, axis=0) * (scale[-1] / scale[:-1]) ** 2)
 
 
-def effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
+def _effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
     """Return the effective number of clusters that determine each column."""
     shares = np.array([np.bincount(cluster, part ** 2) for part in columns.T])
     return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))

@@ -330,10 +330,9 @@ def tracking_error_columns(motion: Motion, time: Array,
     """
     Return the deviations from a profile that scale, bias, delay and lag do not describe.
 
-    The gyro's scale may differ between the two senses of turning. The response of the robot may be
-    of higher order than a lag, and have a delay and a lag of its own in each turn, as where the
-    acceleration is limited. The robot may slip in each turn, by a fraction of it with a standard
-    deviation of at most `slip_deviation`, and while it decelerates.
+    They are a scale that differs between the senses of turning, a response of higher order, a
+    delay and a lag of each turn, and slips of each turn and of its deceleration, of a standard
+    deviation of at most `slip_deviation`.
 
     Returns
     -------
@@ -379,9 +378,8 @@ def _find_step_crossings(motion: Motion, step: float) -> Array:
     """
     Return the middles between lasting readings one step apart, with variances in units of theirs.
 
-    The error of a reading is constant; where it changes by one step, the heading is the edge
-    between the two, but for the turn between the samples. The columns are those of
-    `_find_constant_readings`.
+    There the heading is the edge between the two, but for the turn between the samples. The
+    columns are those of `_find_constant_readings`.
     """
     change = np.abs(np.diff(motion.heading))
     index = np.flatnonzero(change > 0.5 * step)
@@ -406,8 +404,8 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> Array:
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
     All samples of a constant reading count as one, but for the first and the last if they last
-    much longer than the readings next to them: then the gyro rests, and their samples share one
-    error. The columns are time, heading, variance, and this error of the first and the last.
+    much longer than the readings next to them, as rests, whose samples share one error. The
+    columns are time, heading, variance, and this error of the first and the last.
     """
     change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
     run = np.cumsum(change > 0.5 * step)
@@ -431,9 +429,8 @@ def _random_walk_covariance(time: Array, weight: Array,
     """
     Return the variance of increments by a random walk, and the covariance of neighbours, s, (n,).
 
-    The increments are between weighted means of blocks. With A the weights summed up to each
-    point, a mean is the last value less the sum of A times the steps of the walk, or the first one
-    plus that of 1 - A.
+    With A the weights summed up to each point, the weighted mean of a block is the last value less
+    the sum of A times the steps of the walk, or the first one plus that of 1 - A.
     """
     interval = np.diff(time, append=time[-1])
     until = np.cumsum(weight)
@@ -567,8 +564,8 @@ def _repetition(data: _Increments, estimate: _Estimate) -> float:
     """
     Return how many times the same errors occur, as in an even swing: 1 if all are independent.
 
-    There are as many groups, by place and sense, as a pass through the motion has blocks. It is
-    the mean square of a group's mean, times its number of blocks, over that of all.
+    It is the mean square of the mean of blocks at one place and sense, times their number, over
+    that of all.
     """
     turned, white = data.columns[:, 0], estimate.noise.whiten(estimate.residual)
     heading = np.cumsum(turned) - 0.5 * turned
@@ -587,9 +584,8 @@ def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
     """
     Return the columns with an acceleration whose noise is not correlated with the observations.
 
-    White noise of the variance N² of the gyro has the covariance -N² / base with an acceleration
-    by the gyro over a base, and reference headings of the variance r the covariance 2 r / base²
-    with one by the reference. In a mean with weights inverse to them both cancel.
+    White noise N² of the gyro has the covariance -N² / base with an acceleration by the gyro, and
+    headings of the variance r have 2 r / base² with one by the reference: in a mean both cancel.
     """
     columns = data.columns.copy()
     if len(data.accelerations):
@@ -607,9 +603,8 @@ def _lag_prior(data: _Increments, estimate: _Estimate, offset: float,
     The motion determines a lag by the part of the acceleration that gyro and reference both show
     and the other columns do not explain, less two standard deviations. If it does so more narrowly
     than what is `possible`, s², or than the lag that is found, only the shape of the response is
-    not known: from a mean over a time, with a fifth of the square of a lag less in the fourth
-    order than a Gaussian window, to a filter of first order with the lag `offset` ** 2 / 2. Else
-    the lag is 0, as in a swing of one frequency, and what it may do to the scale is uncertain.
+    not known: from a mean over a time to a filter of first order. Else the lag is 0, as in a swing
+    of one frequency, and what it may do to the scale is uncertain.
     """
     of_first_order = 0.5 * offset ** 2
     possible = max(possible, of_first_order)
@@ -723,10 +718,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
     Return the time offset, s, the increments there, and their fits.
 
     First values and covariance averaged over the noise, then the estimate at the likeliest one,
-    the profile, and the deviation of the scale by a lag that the motion does not determine. Half
-    the variance of the times by which a smoothed heading, or a gyro, is late is from 0, of a
-    delay, to half the square of their mean, of a first-order lag, a standard deviation of the
-    prior.
+    the profile, and the deviation of the scale by a lag that the motion does not determine.
     """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
@@ -779,8 +771,7 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     """
     Return the true heading where gyro and reference begin, and its standard deviation, rad.
 
-    It counts from the reference's first heading: that of the first block less its expected noise,
-    given all that follows, and less the gyro's turn before it.
+    It is that of the first block less its expected noise and the gyro's turn before it.
     """
     heading, elapsed, shared, gyro_angle = (data.start_offsets[0], data.start_offsets[1],
                                             data.start_offsets[2:-1], data.start_offsets[-1])
@@ -806,10 +797,9 @@ EXCESS_RATE_DEVIATION = 0.0175
 def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
         DeviatingStretch, NDArray[np.intp], Array, float]:
     """
-    Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and the noise.
+    Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and the robust noise.
 
     The values are fitted with the excess turn of each stretch, so that they do not absorb a slip.
-    The standard deviation of the noise is that of a robust fit.
     """
     noise, interval = estimate.noise, data.columns[:, 1]
     shared = data.columns[:, 4:] @ estimate.values[4:]

@@ -11,14 +11,10 @@
 """
 The motion within the limits of a robot that minimizes the heading error of a later drive.
 
-The accuracy of a run is computed before it is driven: the columns and priors of `fit_likelihood`
-and the noise figures of the gyro give the covariance of scale factor error s and bias b, with the
-rest after the run as in `check_rest`, and that of the heading of a later drive. Flicker and random
-walk of the bias, which the fit does not weigh, are propagated through its weights.
-
-A motion that returns has no net turn, so that the estimates of s and b are independent. The
-deviation of the bias depends on the white noise N, the time T, N / √T, and the rest, but not on
-the motion; that of s depends on the motion.
+The columns and priors of `fit_likelihood` and the noise figures of the gyro give the covariance of
+scale factor error s and bias b, with the rest after the run as in `check_rest`, and that of the
+heading of a later drive. The deviation of b depends on the white noise and the time, not on the
+motion, which determines s: a motion that returns has no net turn.
 """
 
 from collections.abc import Iterable
@@ -112,10 +108,8 @@ class CalibrationForecast:
         """
         Return the prediction for a motion that turns and has the length of the forecast.
 
-        In a search the blocks have one length. A fit takes shorter blocks where the motion is
-        fast, which improves the bias by 0.3 %: a search with these would prefer fast motions, at
-        the cost of the scale; one with the allowance for a difference between the senses of
-        turning would prefer slow ones.
+        In a search the blocks have one length, and the senses of turning one scale: else it would
+        prefer fast motions, or slow ones, at the cost of the scale.
         """
         longest = min(MAX_BLOCK_DURATION, self._duration / 40.0)
         blocks = (math.ceil(self._duration / longest) if in_search
@@ -173,9 +167,9 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, drive_duratio
     Return the noise of the observations of a run and its rest, and of the heading of the drive.
 
     The n observations are the increments between the blocks of the run, rad, and the mean rate of
-    the rest, rad/s. Returned are the inverse of the covariance of the increments
-    by white noise, rad⁻²; the covariance of the observations by all noise, (n, n), and that with
-    the heading of the drive, (n, m); and the variance of that heading, rad², (m,).
+    the rest, rad/s. Returned are the inverse covariance of the increments by white noise, the
+    covariance of the observations by all noise, (n, n), that with the heading of the drive, (n,
+    m), and the variance of that heading, rad², (m,).
     """
     cells = blocks * _CELLS_PER_BLOCK
     rest = duration + np.cumsum([SETTLING_TIME, RunLimits.rest_duration])
@@ -227,9 +221,8 @@ class _MotionFamily:
     """
     Motions of one duration that alternate between two headings, as points of a unit cube.
 
-    The axes: number of turns, sense of the first one, fractions of the headings above and below 0
-    that are used, rates of one pair of turns and of the next, and fraction of the time that is
-    rest between turns.
+    The axes: number of turns, sense of the first one, shares of the headings above and below 0,
+    rates of one pair of turns and of the next, and share of rests between turns.
     """
 
     def __init__(self, robot: RobotLimits, duration: float):

@@ -37,19 +37,10 @@ name               unit       noise
 angle_random_walk  rad/√s     gyro, white: variance in proportion to the length of the span
 reference          rad        reference, white from point to point; neighbouring spans share one
 motion             s          the same, in proportion to the rate at the point: side slip, jitter
-reference_walk     rad/√s, …  reference that adds up its errors: in the span's time in motion,
-                              by the angle turned, √rad, or by its square, 1
+reference_walk     √rad       reference that adds up its errors, by the angle turned
 bias_instability   rad/s      gyro, flicker of the two-sided spectrum B²/ω
 rate_random_walk   rad/s/√s   gyro, random walk of the two-sided spectrum K²/ω²
 =================  =========  ==================================================================
-
-Errors of a reference that last longer than a span are autoregressive, with a correlation ``φ_k``
-between the points of span ``k``. The differences of observations and columns ::
-
-    y_k - c_k y_(k-1),    c_k = φ_(k-1) (1 - φ_k) / (1 - φ_(k-1)),    c_1 = 0
-
-have tridiagonal covariances again (Cochrane and Orcutt 1949), and as their matrix has the
-determinant 1, likelihoods of different correlations can be compared (`carried_shares`).
 """
 
 from __future__ import annotations
@@ -117,7 +108,6 @@ class GridFit:
     residual: Array
     unobservable_variance: float  # of the shared noise, that looks like one of the values
     _noise: TridiagonalMatrix
-    _carried: Array | None
 
     @property
     def deviations(self) -> Array:
@@ -130,7 +120,7 @@ class GridFit:
 
     def whiten(self, columns: Array) -> Array:
         """Return columns, shape (n,) or (n, k), with independent banded noise of variance 1."""
-        return self._noise.whiten(_quasi_differences(columns, self._carried))
+        return self._noise.whiten(columns)
 
 
 class TridiagonalMatrix:
@@ -157,7 +147,6 @@ class TridiagonalMatrix:
 
 def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
                   angle_random_walk: tuple[float, float] | None = None,
-                  correlation: Array | None = None,
                   reference_walk: Array | None = None,
                   is_measured: Mask | None = None) -> list[BandedNoise]:
     """
@@ -171,8 +160,6 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
         where a point is an outlier
     angle_random_walk : smallest and largest N that is possible, rad/√s, where a log at rest, a
         data sheet or the differences between samples bound it; equal ends where it is known
-    correlation : of the errors of the reference at both ends of each span, shape (n,); the parts
-        are then those of the differences by `carried_shares`. None where they are independent
     reference_walk : variance by which errors of a reference that add up grow over each span,
         relative to the others, shape (n,); the third part is then 'reference_walk'
     is_measured : whether the gyro is known in each span, (n,); any turn is possible in others
@@ -181,51 +168,19 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     points = np.ones(len(time)) if point_variance is None else point_variance
     rate_rms = math.sqrt(float(np.mean(rate**2))) + 1e-12
     sizes = math.radians(1e-4), math.radians(10.0)  # possible ones of the reference
-    moving = (BandedNoise('reference_walk', *_walk_covariance(reference_walk, correlation), sizes)
+    moving = (BandedNoise('reference_walk', reference_walk, None, sizes)
               if reference_walk is not None else BandedNoise(
-                  'motion', *difference_covariance(points * rate ** 2, correlation),
+                  'motion', *difference_covariance(points * rate ** 2),
                   (1e1 * sizes[0] / rate_rms, sizes[1] / rate_rms)))
     unknown = np.zeros(0) if is_measured is None else (~is_measured).astype(float)
-    holes = [BandedNoise('hole', *_walk_covariance(unknown, correlation), (_ANY_TURN, _ANY_TURN))
-             ] if unknown.any() else []
-    return [BandedNoise('angle_random_walk', *_walk_covariance(np.diff(time), correlation),
-                        angle_random_walk or sizes),
-            BandedNoise('reference', *difference_covariance(points, correlation), sizes), moving,
-            *holes]
+    holes = [BandedNoise('hole', unknown, None, (_ANY_TURN, _ANY_TURN))] if unknown.any() else []
+    return [BandedNoise('angle_random_walk', np.diff(time), None, angle_random_walk or sizes),
+            BandedNoise('reference', *difference_covariance(points), sizes), moving, *holes]
 
 
-def _walk_covariance(variance: Array,
-                     correlation: Array | None) -> tuple[Array, Array | None]:
-    """Return variances of independent increments, and covariances with the one before."""
-    if correlation is None:
-        return variance, None
-    carried, before = carried_shares(correlation), np.append(0.0, variance[:-1])
-    return variance + carried ** 2 * before, -carried * before
-
-
-def difference_covariance(variance: Array,
-                          correlation: Array | None = None) -> tuple[Array, Array]:
+def difference_covariance(variance: Array) -> tuple[Array, Array]:
     """Return variances of differences between points, and covariances with the one before."""
-    if correlation is None:
-        return variance[1:] + variance[:-1], -variance[:-1]
-    # of the innovations e of h_k = φ_k h_(k-1) + e_k: y_k - c_k y_(k-1) = e_k - ratio_k e_(k-1)
-    innovation = (1.0 - correlation ** 2) * variance[1:]
-    ratio = (1.0 - correlation) / np.append(1.0, 1.0 - correlation[:-1])
-    before = ratio * np.append(variance[0], innovation[:-1])
-    return innovation + ratio * before, -before
-
-
-def carried_shares(correlation: Array) -> Array:
-    """Return the share of the observation before that is subtracted from each, shape (n,)."""
-    ratio = (1.0 - correlation[1:]) / (1.0 - correlation[:-1])
-    return np.append(0.0, correlation[:-1] * ratio)
-
-
-def _quasi_differences(columns: Array, carried: Array | None) -> Array:
-    """Return columns, shape (n,) or (n, k), less a share of the row before."""
-    if carried is None:
-        return columns
-    return np.concatenate([columns[:1], columns[1:] - (carried[1:] * columns[:-1].T).T])
+    return variance[1:] + variance[:-1], -variance[:-1]
 
 
 def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
@@ -236,9 +191,8 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
 
     About its mean over the log a bias is the sum of ``u_j cos(ω_j (t - t_0))`` with ``ω_j = π j /
     T``. The variance of ``u_j`` is ``2 / T`` times the two-sided spectrum at ``ω_j``, ``B²/ω`` and
-    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. How far that mean
-    is from the bias where the log began has the variance ``2/π B²`` and ``K² T / 3``, which the
-    log does not show: `fit_noise_grid` adds it to the variance of the value `wandering_value`.
+    ``K²/ω²``. That mean differs from the bias where the log began by the variance ``2/π B²`` and
+    ``K² T / 3``, which `fit_noise_grid` adds to the value `wandering_value`.
 
     Parameters
     ----------
@@ -290,8 +244,7 @@ class _Regression:
         """
         Solve for one banded noise, and k variances of the shared values.
 
-        Return log likelihoods, (k,), values, (k, m + q), and the first m columns of the inverse
-        normal matrices, (k, m + q, m).
+        Return log likelihoods, (k,), values, (k, m + q), and m columns of inverses, (k, m + q, m).
         """
         weighted = covariance.solve(np.column_stack([self.columns, self.observed]))
         gram = self.columns.T @ weighted
@@ -319,8 +272,7 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
                    shared_columns: Array | None = None, shared: Sequence[SharedNoise] = (),
                    prior_deviation: Array | None = None,
                    wandering_value: int | None = None,
-                   hierarchical_priors: Sequence[HierarchicalPrior] = (),
-                   carried: Array | None = None) -> GridFit:
+                   hierarchical_priors: Sequence[HierarchicalPrior] = ()) -> GridFit:
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
 
@@ -334,8 +286,6 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     prior_deviation : of the values about zero, shape (m,); infinite for a flat prior
     wandering_value : number of the value whose variance includes `unobservable_variance`
     hierarchical_priors : values with a prior of unknown size
-    carried : share of the observation before that is subtracted from each, shape (n,); None where
-        the errors of the observations are not autoregressive
     """
     count = columns.shape[1]
     if len(observed) <= count:
@@ -351,9 +301,7 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
                 for part in shared),
               *(SharedNoise(prior.name, np.eye(width)[prior.value_index], prior.size_range)
                 for prior in hierarchical_priors)]
-    regression = _Regression(_quasi_differences(observed, carried),
-                             _quasi_differences(together, carried), count, precision, banded,
-                             shared)
+    regression = _Regression(observed, together, count, precision, banded, shared)
     parts: list[BandedNoise | SharedNoise] = [*banded, *shared]
     axes = [np.array([low]) if low == high else np.geomspace(low, high, 5)
             for low, high in (part.size_range for part in parts)]
@@ -378,16 +326,11 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
                    dict(zip(names, sizes[best].tolist())),
                    float(logsumexp(log_likelihoods)) - math.log(len(weights)),
                    regression.observed - regression.columns @ likeliest,
-                   float(weights @ unobservable), noise, carried)
+                   float(weights @ unobservable), noise)
 
 
 def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
-    """
-    Return an axis where the sizes are likely, at least to the middle between old points.
-
-    It may go on beyond an end of the old axis: the likeliest point of a coarse grid is not always
-    next to the likeliest size.
-    """
+    """Return an axis where the sizes are likely, at least to the middle between old points."""
     if len(axis) == 1:
         return axis
     logarithms, step = np.log(sizes), math.log(axis[1] / axis[0])

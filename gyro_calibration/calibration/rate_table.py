@@ -12,9 +12,8 @@
 From dwells to a gyro's model: values of effects, covariance, and errors of left-out sweeps.
 
 The errors are also those of full turns of 360 degrees (Ojeda et al., section 4), of the heading in
-each turn, rad, in proportion to its duration: with the bias of a rest before the mission only, and
-with a model and then the bias that remains at rest. Dwells that allow no answer raise
-`DataRefused`.
+each turn, rad: with the bias of a rest before only, and with a model and that bias after it.
+Dwells that allow no answer raise `DataRefused`.
 """
 
 from __future__ import annotations
@@ -393,8 +392,8 @@ def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
     """
     Set each fitted shape in turn to the best of a grid over its bounds.
 
-    A smaller one is preferred that is not significantly worse: at evenly spaced rates, fast sines
-    pass through the same dwells as a slow one.
+    A smaller one that is not significantly worse is preferred: fast sines pass through evenly
+    spaced dwells too.
     """
     channels = channels_of(dwells)
 
@@ -474,12 +473,7 @@ def _orthonormal_columns(columns: Array, tolerance: float) -> Array:
 
 def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener,
                         parts: Numbers) -> Array:
-    """
-    Return each dwell's residual of a fit without its part: the deleted residuals.
-
-    Where the part is not a whole sweep, the others of its sweep show the bias and scale they
-    share.
-    """
+    """Return each dwell's residual of a fit without its part: the deleted residuals."""
     left_out = np.full(len(whitened), math.inf)
     for part in range(parts.max() + 1):
         rows = np.flatnonzero(parts == part)
@@ -559,8 +553,8 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     """
     Return the errors of full turns at the rates and temperatures of dwells that are not outlying.
 
-    The rates by the model, rad/s, shape (n,), are as `Calibration.left_out_rate`. A turn is faster
-    than `min_rate`, rad/s.
+    The rates by the model, rad/s, (n,), are nan where it has none; turns are faster than
+    `min_rate`.
     """
     known = np.isfinite(rate)
     wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded
@@ -577,13 +571,13 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     # the rest of each turn's sweep, or else the nearest in temperature, then in order
     degc, at = ((np.zeros(len(each)) if each.temperature is None else each.temperature)
                 for each in (dwells, turns))
-    of_rest = {number: float(degc[rows].mean()) for number, (rows, _) in rests.items()}
+    of_rest = {number: float(degc[rows].mean()) for number, rows in rests.items()}
     nearest = [rests[min(rests, key=lambda number: (
         number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
         for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]
     static, modelled = (
         # eq. 1 and 2, eq. 13 to 16: the integral over a turn of errors of a rate, less the bias
-        (error[wanted] - [weights @ error[rows] for rows, weights in nearest])
+        (error[wanted] - [error[rows].mean() for rows in nearest])
         * 2.0 * math.pi / np.abs(turns.rate)
         for error in (dwells.output - dwells.rate, rate - dwells.rate))
     remarks = [remark]
@@ -592,32 +586,16 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     return TurnErrors(turns, static, modelled, tuple(remarks))
 
 
-def _find_rests(dwells: Dwells) -> tuple[dict[int, tuple[Numbers, Array]], str]:
-    """
-    Return the rests of the sweeps (eq. 1), or if there is none the slowest turns both ways.
-
-    By the number of a sweep, they are the dwells that determine its static bias, and their
-    weights. The second value is a remark on their source.
-    """
-    speed = np.abs(dwells.rate)
-    at_rest, between = dict[int, tuple[Numbers, Array]](), dict[int, tuple[Numbers, Array]]()
-    sweeps = np.unique(dwells.sweep).tolist()
-    for number in sweeps:
-        rows = np.flatnonzero(dwells.sweep == number)
-        rests = rows[speed[rows] <= 0.1 * DEGREE]
-        if len(rests):
-            at_rest[number] = rests, np.full(len(rests), 1.0 / len(rests))
-        ways = [rows[way * dwells.rate[rows] > 0.0] for way in (1.0, -1.0)]
-        if all(map(len, ways)):
-            slowest = np.array([each[np.argmin(speed[each])] for each in ways])
-            between[number] = slowest, speed[slowest[::-1]] / speed[slowest].sum()
-    if not at_rest and not between:
-        raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that '
-                          'nothing shows the static bias; record a rest before each sweep')
-    found, remark = at_rest or between, (
-        'the static bias is from the rest of each sweep' if at_rest else
-        'no rest; the static bias is the error between the slowest turns both ways of each sweep')
-    if others := len(sweeps) - len(found):
-        remark += (f'; {others} of {len(sweeps)} sweeps have none and take that of the nearest '
+def _find_rests(dwells: Dwells) -> tuple[dict[int, Numbers], str]:
+    """Return the dwells at rest by the number of their sweep (eq. 1), and a remark on them."""
+    at_rest = np.flatnonzero(np.abs(dwells.rate) <= 0.1 * DEGREE)
+    if not len(at_rest):
+        raise DataRefused(f'{len(dwells)} dwells hold no rest, so that nothing shows the static '
+                          'bias; record a rest before each sweep')
+    found = {number: at_rest[dwells.sweep[at_rest] == number]
+             for number in np.unique(dwells.sweep[at_rest]).tolist()}
+    remark, sweeps = 'the static bias is from the rest of each sweep', len(np.unique(dwells.sweep))
+    if others := sweeps - len(found):
+        remark += (f'; {others} of {sweeps} sweeps have none and take that of the nearest '
                    'temperature')
     return found, remark

@@ -82,7 +82,7 @@ def find_reference_kind(log: Log, spans: Spans | None = None) -> tuple[str, str]
 
 def _as_odometry(log: Log) -> tuple[str, str] | None:
     """Return odometry and how it is known, if the errors of the reference add up in motion."""
-    errors = find_motion_errors(log)
+    errors = _find_motion_errors(log)
     return None if errors is None else (
         'odometry', 'its errors add up in motion: over a second it differs from the gyro by '
         '{:.2g} deg in turns, by {:.2g} deg in rests or slow turns'.format(
@@ -120,10 +120,8 @@ def find_drift(spans: Spans) -> tuple[float, float] | None:
     Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
 
     The bias that the motion shows is compared with that of the rests in which the reference
-    stands. Either may change steadily with time, and what depends on the rate is not of the
-    reference. None without such rests, or where both agree as a whole (Welch's test, at 0.01 %)
-    or in the ways from rest to rest, each compared with the rests around it, as the bias may
-    wander (at 1 %).
+    stands, beside steady changes and what depends on the rate. None without such rests, or where
+    both agree as a whole (Welch's test, at 0.01 %) or in the ways from rest to rest (at 1 %).
     """
     rests = spans.rests[spans.stands]
     if len(rests) < 2:
@@ -186,16 +184,15 @@ class _Seconds(NamedTuple):
     value_count: int  # of the fit
 
 
-def find_motion_errors(log: Log) -> tuple[float, float] | None:
+def _find_motion_errors(log: Log) -> tuple[float, float] | None:
     """
     Return how odometry errs over a second in turns, and the gyro in rests or slow turns, rad.
 
-    Such a rate is exactly 0 in rests, and such a heading constant. In motion it errs by more than
-    the gyro: the variance of the difference of their turns is more than twice that of rests, or of
+    In motion the variance of the difference of their turns is more than twice that of rests, or of
     the slower half where a heading never rests (F-test, at 1 %), beyond what smooth functions of
     the rate explain (differences of neighbours: Rice, Annals of Statistics 12, 1984). None for
-    another reference, for one that is mostly steady in motion, as of a rate table, and for one
-    that the motion follows later than a gyro does, as a robot its command.
+    another reference, one that is mostly steady in motion, and one that the motion follows late,
+    as a command.
     """
     seconds = _compare_seconds(log)
     if seconds is None:

@@ -55,9 +55,8 @@ def find_own_instants(time: Array, values: Array) -> OwnInstants | None:
     """
     Return where a slow reference has its own values, or None if it has one in each sample.
 
-    Values that are held change in single samples. Straight lines between values meet at corners,
-    which may lie between two samples. Both must come at even intervals. Times, s, and values have
-    shape (n,), without nan.
+    Held values change in single samples, straight lines meet at corners; both at even intervals.
+    Times, s, and values have shape (n,), without nan.
     """
     step, sample = quantization_step(values), float(np.median(np.diff(time)))
     change = np.diff(values)
@@ -132,9 +131,8 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
     """
     Return a log whose one reference is known at its own instants alone, and these.
 
-    Where instants lie between samples, the samples next to them get the values of a cubic spline.
-    A rate that is held as a command is not slow. The instants next to samples have shape (n,),
-    with nan; None if the reference is not slow.
+    The samples next to instants get the values of a cubic spline. A rate that is held as a command
+    is not slow. The instants have shape (n,), with nan; None if the reference is not slow.
     """
     is_heading = log.reference_heading is not None
     given = log.reference_heading if is_heading else log.reference_rate
@@ -151,7 +149,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
         left = [(log.output - rate)[both] for rate in (
             given, np.interp(log.time, found.time, found.values))]
         steps, lines = (np.abs(each - np.median(each)).sum() for each in left)
-        if steps < lines or output_delay(log, given) > 0.0:
+        if steps < lines or _output_delay(log, given) > 0.0:
             return log, None
     # not those in gaps
     after = np.clip(np.searchsorted(stamps, found.time), 1, len(stamps) - 1)
@@ -169,7 +167,7 @@ def keep_own_instants(log: Log) -> tuple[Log, OwnInstants | None]:
             else replace(log, reference_rate=own)), kept
 
 
-def output_delay(log: Log, rate: Array) -> float:
+def _output_delay(log: Log, rate: Array) -> float:
     """Return by how much the output of a gyro is later than a reference rate, up to 1 s, in s."""
     assert log.time is not None and log.output is not None
     known, output = np.isfinite(rate), bridge_gaps(log.output)
@@ -210,8 +208,7 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     """
     Return rests of 3 s and more: first and last row, shape (r, 2), and where the reference stands.
 
-    The gyro is quiet, and the reference is lost, or stands: it is known and does not change. Where
-    it stands and the gyro is not quiet on average, something moves, and there is no rest.
+    The gyro is quiet, and the reference is lost, or stands: it is known and does not change.
     """
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
     blocks = len(output) // second
@@ -254,7 +251,7 @@ def step_evenness(log: Log, step: float) -> float:
 
 
 @dataclass(frozen=True)
-class HeadingDifference:
+class _HeadingDifference:
     """Difference of the headings of gyro and reference over a second."""
 
     constant_error: float  # of the part that does not grow with time, rad
@@ -268,19 +265,18 @@ class HeadingDifference:
         return self.constant_error > max(0.25 * self.total_walk, 1e-9)
 
 
-def heading_difference(log: Log) -> HeadingDifference:
+def heading_difference(log: Log) -> _HeadingDifference:
     """
     Separate the difference of the headings of gyro and reference by its growth over time.
 
     Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    to second order from the best of some, a lag, a scale factor and a misalignment are fitted. An
-    error that was smoothed shows at lags beyond its time constant.
+    to second order from the best of some, a lag, a scale factor and a misalignment are fitted.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     stamps, output = log.time, bridge_gaps(log.output)
     own = np.isfinite(log.reference_heading)
     if own.sum() < 2 * _BLOCK_SAMPLES:
-        return HeadingDifference(0.0, 0.0)
+        return _HeadingDifference(0.0, 0.0)
     signals = [integrate_with_curvature(stamps, output), output, np.gradient(output, stamps)]
     sample, white = float(np.median(np.diff(stamps))), white_noise_deviation(output)
     heading, time, *crossing = (each[own] for each in (
@@ -324,23 +320,22 @@ def heading_difference(log: Log) -> HeadingDifference:
     whole = variance.pop(1.0, 0.0)
     error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
                         for part, each in variance.items())])
-    return HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * longest * interval)))
+    return _HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * longest * interval)))
 
 
 def rate_noise_share(log: Log, is_commanded: bool = False) -> float:
     """Return the ratio of the noise of a reference rate to that of the gyro; 0 if none shows."""
-    variance, gyro = rate_noise_variances(log, is_commanded)
+    variance, gyro = _rate_noise_variances(log, is_commanded)
     return math.sqrt(variance / max(gyro, 1e-3 * variance)) if variance else 0.0
 
 
-def rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, float]:
+def _rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, float]:
     """
     Return the variances of a reference rate and of the gyro, (rad/s)²; 0, 0 if none is detected.
 
-    A command has none, however it jumps. It is estimated where the reference is quietest, by the
-    updates of a held one. White noise is detected by third differences of alternating sign, other
-    noise by changes from sample to sample that the gyro does not show, unless the rate is known to
-    be commanded: a robot need not follow those.
+    A command has none. It is estimated where the reference is quietest, by the updates of a held
+    one. White noise is detected by third differences of alternating sign, other noise by changes
+    that the gyro does not show, unless the rate is known to be commanded.
     """
     assert log.output is not None and log.reference_rate is not None
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
@@ -349,7 +344,7 @@ def rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, f
     steps = np.diff(time[known])
     begins = np.flatnonzero(np.diff(rate, prepend=np.nan) != 0.0)
     if log.time is not None and (is_commanded or len(begins) < 0.5 * len(rate)):
-        delay = output_delay(log, log.reference_rate)
+        delay = _output_delay(log, log.reference_rate)
         if delay > (0.0 if len(begins) < 0.5 * len(rate) else MAX_GYRO_LAG):
             return 0.0, 0.0
     slow = None if log.time is None else find_own_instants(log.time[known], rate)
@@ -399,8 +394,7 @@ def heading_noise_share(log: Log) -> float:
     """
     Return the ratio of the rate noise of a reference heading to that of the gyro; 0 if none shows.
 
-    A filter or a magnetometer errs like a random walk of the heading over a second, of which the
-    gyro shows nothing. White noise of the heading does not count.
+    A filter or a magnetometer errs like a random walk. White noise of the heading does not count.
     """
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     turned = integrate(log.time, bridge_gaps(log.output))
@@ -409,7 +403,7 @@ def heading_noise_share(log: Log) -> float:
         return 0.0
     for own in (rows, rows[::2]):
         steps = np.diff(log.time[own])
-        variance, of_gyro = rate_noise_variances(Log(
+        variance, of_gyro = _rate_noise_variances(Log(
             time=log.time[own[1:]] - 0.5 * steps, output=np.diff(turned[own]) / steps,
             reference_rate=np.diff(log.reference_heading[own]) / steps))
         # the gyro has what is not in the difference
@@ -423,32 +417,14 @@ def heading_noise_share(log: Log) -> float:
     return math.sqrt(walks[0] / white)
 
 
-def _usual_changes(time: Array, difference: Array, bias: float, span: float) -> Array:
-    """
-    Return the usual bend and change of a heading difference over a span, rad, shape (2,).
-
-    By medians, they are the standard deviations of its second difference over halves of the span,
-    as of the end of a random walk, and of its change beyond the bias; 0 where no span is known.
-    """
-    starts = np.linspace(time[0], time[-1] - span, 500)
-    first, middle, last = (difference[np.searchsorted(time[:-1], starts + share * span)]
-                           for share in (0.0, 0.5, 1.0))
-    changes = np.array([first - 2.0 * middle + last, last - first - bias * span])
-    known = np.isfinite(changes[0])
-    return (np.array([robust_deviation(each[known]) for each in changes]) if known.any()
-            else np.zeros(2))
-
-
 def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     """
     Return a log without headings that are repeated while the gyro turns, as of a lost marker.
 
-    Also a remark on the longest of these stretches. The gyro turns where its heading deviates from
-    a straight line, which may be its bias, by more than a random walk does (Brownian bridge, at
-    1 %), and the error of the reference and its step; or where it changes beyond its usual bias by
-    that. The reference must then jump rather by what the gyro turned than not at all: a bias may
-    drift in a rest. The random walk is that of the difference to the reference elsewhere, or the
-    scatter of that difference over as long a time, if it is larger.
+    Also a remark on the longest of these stretches. In it the gyro turns, beyond its usual bias,
+    by more than the step of the reference and than it differs from the reference over as long a
+    time elsewhere (at 1 %). The reference must then jump rather by what the gyro turned than not
+    at all: a bias may drift in a rest.
     """
     heading = log.reference_heading
     known = np.flatnonzero(np.isfinite([] if heading is None else heading))
@@ -460,34 +436,27 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
         return log, []
     moving = heading.copy()
     moving[np.concatenate(runs)] = np.nan
-    usual = heading_difference(replace(log, reference_heading=moving))
-    if not usual.total_walk > 0.0:
-        return log, []
+    turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
+    difference = turned - moving
+    seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
+    bias = float(np.median(np.diff(difference[seconds]) / np.diff(log.time[seconds])))
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
-    step = quantization_step(heading[known])
-    turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
-    seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
-    bias = float(np.median(np.diff((turned - heading)[seconds]) / np.diff(log.time[seconds])))
-    first, last = np.array([rows[[0, -1]] for rows in runs]).T
-    following = np.append(known, known[-1])[np.searchsorted(known, last) + 1]
-    spans = log.time[last] - log.time[first]
-    unseen = turned[last] - turned[first] - bias * spans
-    jumps = heading[following] - heading[last] - (turned[following] - turned[last])
-    # the error of a jump, and by how much it is likelier with what the gyro turned than without
-    error = float(np.median(np.minimum(np.abs(jumps), np.abs(jumps - unseen))))
-    jumps_as_gyro = jumps ** 2 - (jumps - unseen) ** 2 > (2.0 * bound * error) ** 2
-    kept, lost = heading.copy(), []
-    for place in np.flatnonzero(jumps_as_gyro):
-        rows, span = runs[place], float(spans[place])
-        own = turned[rows[0]:rows[-1] + 1] - turned[rows[0]]
-        off = own - own[-1] * (log.time[rows[0]:rows[-1] + 1] - log.time[rows[0]]) / span
-        errors = np.maximum(
-            usual.total_walk * math.sqrt(span) + 2.0 * usual.constant_error,
-            _usual_changes(log.time, turned - moving, bias, span))
-        if (np.array([np.abs(off).max(), abs(unseen[place])]) > step + bound * errors).any():
+    kept, lost = heading.copy(), list[tuple[float, float, float]]()
+    for rows in runs:
+        first, last = rows[[0, -1]].tolist()
+        span = float(log.time[last] - log.time[first])
+        unseen = turned[last] - turned[first] - bias * span
+        starts = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1] - span, 500))
+        ends = np.minimum(np.searchsorted(log.time, log.time[starts] + span), len(log) - 1)
+        changes = difference[ends] - difference[starts] - bias * span
+        usual = robust_deviation(changes[np.isfinite(changes)])
+        after = known[min(np.searchsorted(known, last) + 1, len(known) - 1)]
+        jump = heading[after] - heading[last] - (turned[after] - turned[last])
+        if (abs(unseen) > quantization_step(heading[known]) + 2.0 * bound * usual
+                and abs(jump - unseen) < abs(jump)):
             kept[rows[1:]] = np.nan
-            lost.append((*log.time[rows[[0, -1]]].tolist(), float(np.ptp(own))))
+            lost.append((float(log.time[first]), float(log.time[last]), abs(unseen)))
     if not lost:
         return log, []
     begin, end, angle = max(lost, key=lambda each: each[1] - each[0])

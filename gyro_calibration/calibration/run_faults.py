@@ -8,22 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-Faults of a run that deviates from its profile: a name, a test and a remedy for each.
+"""Faults of a run: another unit, another motion than the profile, a deviating stretch."""
 
-The fault is the motion that explains the run best: the profile with one deviating stretch, driven
-faster or slower, at limited rates, begun late, or ended early.
-"""
-
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
 import math
 
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.columns import RATE_UNITS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import mark_extremes, Saturated, white_noise_deviation
+from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from scipy.linalg import orth
@@ -32,52 +25,32 @@ from scipy.linalg import orth
 _TRIAL_STEP = 0.1
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
 MAX_UNEXPLAINED_SHARE = 0.1
-#: Factor by which a motion with a deviating stretch must leave less than one without.
-_SLIP_PENALTY = 1.5
 
-#: Units that are confused, in rad/s: the usual ones, and all, the usual ones last.
-_USUAL_UNITS = {'mdeg/s': 1e-3 * DEGREE,
-                **{unit: RATE_UNITS[unit] for unit in ('mrad/s', 'deg/s', 'rad/s')}}
-_ALL_UNITS = {'revolutions/min': math.pi / 30.0, 'revolutions/s': 2.0 * math.pi,
-              'deg/h': RATE_UNITS['deg/h'], **_USUAL_UNITS}
-
-
-def _name_confusions(units: dict[str, float]) -> dict[float, tuple[str, str]]:
-    """Return the causes by reported over true rate; of equal ones, that of the later units."""
-    return {float(f'{taken / size:.6g}'): (
-        f'the gyro is in {unit} and read as {other}',
-        f'the profile in {other} and read as {unit}' if '/s' not in unit or '/s' not in other
-        else f'the profile in {other[:-2]} and read as {unit[:-2]}')
-        for (unit, size), (other, taken) in permutations(units.items(), 2)}
-
-
-#: Reported over true rate -> the cause in the gyro, and the one in the profile.
-_UNIT_CONFUSIONS = {
-    **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
-                f'the profile was driven at {factor:g} times its rate')
-       for base in (2.0, 4.0, 8.0, 10.0, 100.0) for factor in (base, 1.0 / base)},
-    **_name_confusions(_ALL_UNITS),
-    1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units',
-          'the profile in thousands'),
-    1e-3: ('the gyro is in thousands',
-           'the profile in thousandths (mdeg, mrad) and read as whole units'),
-}
+#: Units that are confused, in rad/s, the usual ones first.
+_UNITS = {'deg/s': DEGREE, 'rad/s': 1.0, 'mdeg/s': 1e-3 * DEGREE, 'mrad/s': 1e-3,
+          'revolutions/s': 2.0 * math.pi, 'revolutions/min': math.pi / 30.0,
+          'deg/h': DEGREE / 3600.0}
 #: Largest ratio of the scale factor of a gyro to 1 in the right unit, or to that of another unit.
 UNIT_TOLERANCE = 1.1
 
 
 def refuse_unit_error(scale: float, reference: str) -> None:
-    """Refuse a scale, reported over true rate, that a confused unit explains."""
+    """Refuse a scale, reported over true rate, that a confused unit or range explains."""
     size = max(abs(scale), 1e-300)
-    found = [factor for factor in _UNIT_CONFUSIONS
-             if 1.0 / UNIT_TOLERANCE < size / factor < UNIT_TOLERANCE]
-    if not found or 1.0 / UNIT_TOLERANCE < size < UNIT_TOLERANCE:
+    if 1.0 / UNIT_TOLERANCE < size < UNIT_TOLERANCE:
         return
-    usual = _name_confusions(_USUAL_UNITS)
-    gyro, profile = _UNIT_CONFUSIONS[min(
-        found, key=lambda factor: (factor not in usual, abs(math.log(size / factor))))]
+    causes = [(taken / given, f'the gyro is in {unit} and read as {other}',
+               f'the {reference} in {other} and read as {unit}')
+              for (unit, given), (other, taken) in permutations(_UNITS.items(), 2)]
+    causes += [(factor, f'the gyro is read with {factor:g} times its sensitivity',
+                f'the {reference} was driven at {factor:g} times its rate')
+               for ratio in (2.0, 4.0, 8.0, 10.0, 100.0) for factor in (ratio, 1.0 / ratio)]
+    found = [each for each in causes if 1.0 / UNIT_TOLERANCE < size / each[0] < UNIT_TOLERANCE]
+    if not found:
+        return
+    _, gyro, other = found[0]
     sign_note = ', and turns the other way' if scale < 0.0 else ''
-    cause = f'either {gyro}, or {profile.replace("profile", reference)}' if reference else gyro
+    cause = f'either {gyro}, or {other}' if reference else gyro
     if reference == 'reference' and size > 1.0:
         cause += ', or the reference was smoothed and shows less of a fast motion'
     raise DataRefused(f'the gyro reports {size:.4g} times what was turned{sign_note}: '
@@ -99,10 +72,9 @@ class RunPieces:
     edges: Array
     gyro_angle: Array
 
-    def reference_angle(self, motion: Motion, offset: float = 0.0, speed: float = 1.0,
-                        end: float = math.inf) -> Array:
-        """Return the turn in each piece, rad, by a motion late by `offset` and cut at `end`, s."""
-        return np.diff(motion.heading_at(np.minimum(speed * (self.edges - offset), end)))
+    def reference_angle(self, motion: Motion, offset: float = 0.0) -> Array:
+        """Return the turn in each piece, rad, by a motion that is late by `offset`, s."""
+        return np.diff(motion.heading_at(self.edges - offset))
 
     def fit_scale(self, reference: Array) -> tuple[float, float]:
         """Return the unexplained part of the squares, and the scale; 1 and 0 without pieces."""
@@ -165,118 +137,34 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
         gains[distinct], norms[distinct])
 
 
-def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
-                        slip: str = '') -> None:
-    """Refuse a run that another motion explains far better; `slip` is a message on a slip."""
-    trials = [(unexplained, unexplained, message) for unexplained, message
-              in _try_motions(run, motion, largest_offset)]
-    # a stretch of another turn
-    edges = np.arange(0, len(run.gyro_angle) + 1, 5)
-    interval = float(np.median(np.diff(run.edges)))
-    steps = np.where(np.arange(len(run.gyro_angle))[:, None] >= edges, interval, 0.0)
-    whole = max(float(np.sum((run.gyro_angle - run.gyro_angle.mean()) ** 2)), 1e-300)
-    for offset in _trial_offsets(largest_offset):
-        reference = run.reference_angle(motion, offset)
-        found = find_deviating_stretch(
-            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.gyro_angle)
-        unexplained = run.fit_scale(reference)[0] - found.explained_squares / whole
-        turned = found.excess_rate * float(edges[found.last] - edges[found.first]) * interval
-        trials.append((_SLIP_PENALTY * unexplained, unexplained, slip or format_slip(
-            motion, abs(turned), float(run.edges[edges[found.first]]))))
-    _, unexplained, message = min(trials)
-    if _SLIP_PENALTY * unexplained > fit_profile(
-            run, motion, largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
-        return
-    if unexplained > MAX_UNEXPLAINED_SHARE:
-        who, remedy = (('robot', 'was another profile driven?') if motion.name == 'profile' else
-                       ('gyro', 'check that both belong to one run'))
-        raise DataRefused(f'the {who} does not follow the {motion.name} (the closest motion '
-                          f'explains {100 * max(1 - unexplained, 0.0):.0f} % of the run): '
-                          f'{remedy}')
-    raise DataRefused(message)
-
-
-def refuse_limited(run: RunPieces, motion: Motion, largest_offset: float, time: Array,
-                   output: Array) -> None:
-    """
-    Refuse an output that stands at its largest value while the motion turns faster.
-
-    A line through the pieces below it is more than a step beyond it, and explains the run far
-    better. The steps may hide the noise of the gyro, by which others are recognized.
-    """
-    extreme, step = mark_extremes(output)
-    piece, duration = np.searchsorted(run.edges, time, side='right'), np.diff(run.edges)
-    samples, at_limit = (np.bincount(piece, weights, len(run.edges) + 1)[1:-1]
-                         for weights in (None, extreme))
-    below = at_limit < np.maximum(samples, 1)
-    columns = np.column_stack([
-        run.reference_angle(motion, fit_profile(run, motion, largest_offset)[2]), duration])
-    if below.all() or not below.any():
-        return
-    expected, of_all = (columns @ np.linalg.lstsq(columns[rows], run.gyro_angle[rows], rcond=None)[
-        0] for rows in (below, slice(None)))
-    left = run.gyro_angle - expected
-    beyond = -np.sign(run.gyro_angle) * left
-    left[~below] = np.minimum(beyond[~below], 0.0)
-    if (np.median((beyond / duration)[~below]) > step and np.sum((run.gyro_angle - of_all) ** 2)
-            > _SLIP_PENALTY * np.sum(left ** 2)):
-        raise Saturated(float(np.abs(output).max()), float(extreme.mean()))
+def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float) -> None:
+    """Refuse a run that the motion does not explain at any offset that is allowed, s."""
+    unexplained, scale, offset = fit_profile(run, motion, largest_offset)
+    late, _, begin = fit_profile(run, motion, 0.6 * motion.duration)
+    if late <= MAX_UNEXPLAINED_SHARE < unexplained:
+        raise DataRefused(f'the gyro is {abs(begin):.1f} s '
+                          f'{"behind" if begin > 0.0 else "ahead of"} the {motion.name}: begin '
+                          f'with it, or correct the time of the {motion.name}')
+    off = run.gyro_angle - run.gyro_angle.mean() - scale * (
+        reference := run.reference_angle(motion, offset)) + scale * reference.mean()
+    worst = float(run.edges[int(np.abs(off).argmax())])
+    who = 'robot' if motion.name == 'profile' else 'gyro'
+    raise DataRefused(f'the {who} does not follow the {motion.name}, which explains '
+                      f'{100.0 * max(1.0 - unexplained, 0.0):.0f} % of the run, least at about '
+                      f'{worst:.1f} s: check that both belong to one run, that it was driven at '
+                      'its speed and to its end, and that the robot reaches its rates')
 
 
 def fit_profile(run: RunPieces, motion: Motion,
                 largest_offset: float, step: float = _TRIAL_STEP) -> tuple[float, float, float]:
     """Return the unexplained fraction of the squares at the best delay, the scale, and that, s."""
-    return min((*run.fit_scale(run.reference_angle(motion, offset)), offset)
-               for offset in _trial_offsets(largest_offset, step).tolist())
-
-
-def _trial_offsets(largest_offset: float, step: float = _TRIAL_STEP) -> Array:
     count = round(largest_offset / step)
-    return np.arange(-count, count + 1) * step
+    return min((*run.fit_scale(run.reference_angle(motion, offset)), offset)
+               for offset in (step * np.arange(-count, count + 1)).tolist())
 
 
-def _try_motions(run: RunPieces, motion: Motion,
-                 largest_offset: float) -> Iterator[tuple[float, str]]:
-    """Give the unexplained part of a run by ends, speeds and starts, and the cause."""
-    duration, is_profile = motion.duration, motion.name == 'profile'
-    interval = float(np.median(np.diff(run.edges)))
-    for offset in _trial_offsets(largest_offset)[::2]:
-        whole = run.reference_angle(motion, offset)
-        largest = float(np.abs(whole).max(initial=0.0))
-        for limit in np.arange(0.3, 0.97, 0.05) * largest if is_profile else ():
-            yield (run.fit_scale(np.clip(whole, -limit, limit))[0],
-                   f'the robot reached {limit / interval / DEGREE:.0f} deg/s where the profile '
-                   f'turns at {largest / interval / DEGREE:.0f} deg/s: raise its limit, or drive '
-                   'a slower profile')
-        for end in np.arange(0.05, 0.97, 0.0125) * duration:
-            yield (run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
-                   f"the robot stopped at about {end:.1f} s of the profile's {duration:.1f} s: "
-                   'drive the whole profile' if is_profile else
-                   f'the gyro follows the {motion.name} until about {end:.1f} s of '
-                   f'{duration:.1f} s only: repair the line that stopped, and record again')
-        for speed in (2.0 ** (each / 16.0) for each in range(-32, 33)):
-            if max(speed, 1.0 / speed) > UNIT_TOLERANCE:
-                yield (run.fit_scale(run.reference_angle(motion, offset, speed))[0],
-                       f'the robot drove the profile {speed:.2f} times as fast as given, in '
-                       f'{duration / speed:.1f} s instead of {duration:.1f} s: drive it at its '
-                       'own speed, or give the profile that was driven' if is_profile else
-                       f'the gyro follows the {motion.name} at {speed:.2f} times its speed: '
-                       f'correct the time of the {motion.name}')
-    for offset in _trial_offsets(0.6 * duration):
-        if abs(offset) > largest_offset:
-            yield (run.fit_scale(run.reference_angle(motion, offset))[0],
-                   f'the robot began {abs(offset):.1f} s {"after" if offset > 0 else "before"} '
-                   'the profile: begin with it, or allow a larger time offset' if is_profile else
-                   f'the gyro is {abs(offset):.1f} s {"behind" if offset > 0 else "ahead of"} the '
-                   f'{motion.name}: correct the time of the {motion.name}')
-
-
-def format_slip(motion: Motion, angle: float, time: float, sigmas: float = math.nan) -> str:
-    """Say that the robot slipped or was bumped, or that a mount or a reference slipped."""
-    significance = '' if math.isnan(sigmas) else f' ({sigmas:.0f} standard deviations)'
-    cause = ('a slip or a bump; run again on free ground' if motion.name == 'profile' else
-             'a slip of the wheels or a jump of odom; run again on free ground'
-             if motion.name == 'odometry' else
-             'a slip of the mount or an error of the reference; mend it and run again')
-    return (f'a stretch of the run differs by {angle / DEGREE:.1f} deg from the '
-            f'{motion.name}{significance}, at about {time:.1f} s: {cause}')
+def format_slip(motion: Motion, angle: float, time: float, sigmas: float) -> str:
+    """Say that a stretch of the run deviates, by how much and when."""
+    return (f'a stretch of the run differs by {angle / DEGREE:.1f} deg from the {motion.name} '
+            f'({sigmas:.0f} standard deviations), at about {time:.1f} s: a slip or a bump, an end '
+            'or a limit of the motion, or an error of the reference; run again on free ground')

@@ -12,30 +12,25 @@
 The scatter of dwells about a gyro's effects, and the uncertainty of the effects' values.
 
 The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
-that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
-that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
-dwells of one sweep do not count as thirty independent ones: about a smooth surface over rate and
-temperature, as about too few effects they would include the error of a missing effect. The prior
-is uniform in the deviation of the quietest dwell, relative to all (Chung et al. 2013,
-Psychometrika 78:685): by the likelihood alone, a dwell of small deviation may be taken as exact.
+that of its sweep's bias, and that of its sweep's scale factor. Their sizes are estimated by
+restricted likelihood about a smooth surface over rate and temperature, as about too few effects
+they would include the error of a missing effect. The prior is uniform in the deviation of the
+quietest dwell, relative to all (Chung et al. 2013, Psychometrika 78:685): by the likelihood alone,
+a dwell of small deviation may be taken as exact.
 
-The covariance of the values states how well the dwells determine them, if the model is complete
-and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
-change by as much as from sweep to sweep, and outside of the calibrated temperatures and rates,
-effects that were not fitted add errors.
+The covariance of the values states how well the dwells determine them, the tolerance the errors of
+another run, or outside of the calibrated temperatures and rates.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
 import math
 
 from gyro_calibration.calibration.dwells import (
-    dwell_rounding_covariance, Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD,
-    select_dwells)
-from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY, robust_residual
+    Dwells, MIN_TEMPERATURE_SPREAD, Numbers, OUTLIER_THRESHOLD, select_dwells, step_covariance)
+from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import robust_deviation
@@ -44,7 +39,6 @@ import numpy as np
 from scipy.linalg import orth, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import softmax
-from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 #: With fewer, the others do not determine a model without one of them.
@@ -98,8 +92,7 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
-    It is the sweep, since errors that its dwells have in common do not predict other sweeps. With
-    fewer than `MIN_SWEEPS`, parts are about 60 blocks of time within sweeps, or the dwells.
+    It is the sweep; with fewer than `MIN_SWEEPS` a block of time within a sweep, of about 60.
     """
     sweeps, count = _sweep_numbers(dwells), min(len(dwells), 60)
     if sweeps.max() + 1 >= MIN_SWEEPS:
@@ -199,11 +192,11 @@ def find_inliers(dwells: Dwells) -> Mask:
     """
     Return which dwells are not outlying, by a robust fit of the surface.
 
-    Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
-    dwells of a sweep whose scale differs are not outlying. Few dwells are left out one by one.
+    Where there are dwells enough, each sweep has a bias and scale of its own besides. Of few
+    dwells none is left out.
     """
     if len(dwells) < _MIN_DWELLS:
-        return _leave_out_outliers(dwells)
+        return np.ones(len(dwells), dtype=bool)
     columns = _smooth_surface(dwells)
     if _count_scatter_terms(dwells) == 4:
         parts = _sweep_numbers(dwells)
@@ -217,56 +210,6 @@ def find_inliers(dwells: Dwells) -> Mask:
     spread = robust_deviation(np.sort(residual)[columns.shape[1]:])
     limit = OUTLIER_THRESHOLD * np.hypot(spread, np.nan_to_num(dwells.deviation)) + 1e-12
     return np.asarray(residual <= limit)
-
-
-def _leave_out_outliers(dwells: Dwells) -> Mask:
-    """
-    Return which of few dwells are not outlying: of a bias, a scale, and at most one effect more.
-
-    A dwell is outlying if the fit without it is better than with one more effect in its place,
-    beyond what is left by chance in the best of all dwells and effects: of a nonlinear gyro, one
-    more effect explains as much as any dwell that is left out.
-    """
-    kept, error = np.ones(len(dwells), dtype=bool), dwells.output - dwells.rate
-    fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
-    rate, rounding = dwells.rate / fastest, 1e-12 * fastest
-    known = np.nan_to_num(dwells.deviation)
-    effects = [np.abs(rate), rate ** 2, rate ** 3, rate ** 5]
-    if dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD:
-        warm = dwells.temperature - dwells.temperature.mean()
-        effects += [warm, rate * warm]
-    basic = np.column_stack([np.ones(len(rate)), rate])
-    choices = sum(math.comb(len(effects), count) for count in (0, 1, 2))
-
-    def misfits(more: tuple[Array, ...]) -> tuple[float, Array, int]:
-        """Return the sum of squares, those without each dwell, and the degrees of freedom."""
-        columns = orth(np.column_stack([basic, *more])[kept], 1e-4)
-        residual = error[kept] - columns @ (columns.T @ error[kept])
-        free = 1.0 - np.sum(columns ** 2, axis=1)
-        total = float(residual @ residual)
-        gain = residual ** 2 / np.maximum(free, 1e-9)
-        is_beyond = np.sqrt(gain) > OUTLIER_THRESHOLD * known[kept] + rounding
-        return total, total - np.where(is_beyond, gain, 0.0), len(residual) - columns.shape[1]
-
-    while True:
-        outlying, least = None, MIN_FIT_PROBABILITY
-        for count in (0, 1, 2):
-            fits = [misfits(more) for more in combinations(effects, count)]
-            without = np.min([each[1] for each in fits], axis=0)
-            best = int(np.argmin(without))
-            left = float(without[best]) + kept.sum() * rounding ** 2
-            spare = fits[0][2]
-            if spare < 3:
-                continue
-            instead = min(*np.delete(without, best), *(
-                misfits(more)[0] for more in combinations(effects, count + 1)))
-            chance = kept.sum() * choices * float(fisher.sf(
-                (instead - left) * (spare - 1) / left, 1, spare - 1))
-            if chance < least:
-                outlying, least = int(np.flatnonzero(kept)[best]), chance
-        if outlying is None:
-            return kept
-        kept[outlying] = False
 
 
 def _smooth_surface(dwells: Dwells) -> Array:
@@ -297,8 +240,8 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     Fit columns (n, m) to an error (n,) for each of k scatters of sweeps' bias and scale, (k, 2).
 
     Return the logarithm of the determinants of covariance, in that of the dwells, and Gram matrix,
-    (k,); the sum of the squared whitened residuals, (k,); the values, (k, m); and the inverse of
-    the Gram matrix of the whitened columns, (k, m, m).
+    the sum of the squared whitened residuals, the values, (k, m), and the inverse Gram matrix, (k,
+    m, m).
     """
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
@@ -320,15 +263,12 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
 @dataclass(frozen=True)
 class Uncertainty:
     """
-    The uncertainty of values fitted to dwells.
+    The uncertainty of values fitted to dwells, averaged over possible scatters.
 
-    Few dwells and few sweeps do not determine how large the scatter is, so the distribution of the
-    values is averaged over possible scatters, weighted by their restricted likelihood: that of the
-    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
-    uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
-    its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
-    sweeps alone are then those of Student's distribution. That sweeps do not differ has the weight
-    of a factor of e in that variance, without which their intervals would be too wide.
+    That of the dwells gives Student's distribution, that of the sweeps is summed over a grid. Its
+    prior is uniform in the logarithm of the variance of a sweep's own bias, or scale (Box and Tiao
+    1973, section 5.2). That sweeps do not differ has the weight of a factor of e in that variance,
+    without which their intervals would be too wide.
     """
 
     weights: Array  # of possible scatters, shape (k,)
@@ -378,7 +318,7 @@ class Uncertainty:
         if len(dwells.rounding):
             # errors by the steps of the output are known: a small residual does not remove them
             whiten = Whitener(dwells, scatter).whiten
-            sizes_known, directions = np.linalg.eigh(dwell_rounding_covariance(
+            sizes_known, directions = np.linalg.eigh(step_covariance(
                 dwells.rate, dwells.output, dwells.rounding))
             known = np.linalg.pinv(whiten(columns / lengths)) @ whiten(
                 directions * np.sqrt(np.maximum(sizes_known, 0.0)))
@@ -425,9 +365,9 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
 
     Effects that were not fitted may exist below the noise: a fit with more columns has a larger
     variance. Its mean over the fitted dwells is added to the variance of the bias; its value half
-    a width outside of the calibrated range gives the slopes. Given are the scatter of bias and
-    scale factor from sweep to sweep, rad/s and 1, (2,), and a function of rates, rad/s, and
-    temperatures, degC: the change of the output for each value, (n, m).
+    a width outside of the calibrated range gives the slopes. `columns` are functions of rates,
+    rad/s, and temperatures, degC; the scatter is that of bias and scale factor of sweeps, rad/s
+    and 1, (2,).
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = (np.zeros(len(dwells)) if dwells.temperature is None

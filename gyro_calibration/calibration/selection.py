@@ -11,16 +11,14 @@
 """
 Selection of a gyro's effects: by the prediction of left-out sweeps, each choice with its reason.
 
-Bias, scale factor error and their slopes over temperature belong to every model, as every gyro has
-them: the slopes where the dwells determine them better than a data sheet does. Another effect is
-taken where it reduces the error of left-out sweeps and is significant, given the number of effects
-tried. Sine response and cubic nonlinearity explain nearly the same; where the data do not
-distinguish them, the one by the physics of the instrument is taken, if the instrument is known.
+Bias, scale factor error and the slopes over temperature that the dwells determine better than a
+data sheet belong to every model. Another effect is taken where it reduces the error of left-out
+sweeps and is significant, given the number of effects tried. Sine response and cubic nonlinearity
+explain nearly the same; the physics of the instrument decides where the data do not.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 import math
 
 from gyro_calibration.calibration.dwells import Dwells
@@ -33,7 +31,6 @@ from gyro_calibration.model.effects import (
     SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
-from scipy.stats import f as fisher
 
 #: Probability of taking an effect that is not there, and of a false alarm in a fleet.
 FALSE_ALARM_RATE = 0.01
@@ -123,10 +120,8 @@ def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
     """
     Fit the effects that predict left-out sweeps better, at a false alarm rate.
 
-    The best one is added until none is supported, then those that later ones made superfluous are
-    removed. Where an effect that explains half of the errors would not be significant, as beside
-    another one in few dwells, two of the rate are added at once. With a given model they are
-    changes of it. The effects of a `base` stay.
+    The best one is added until none is supported, then superfluous ones are removed, but for those
+    of a `base`. With a given model they are changes of it.
     """
     best = base = base or _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
@@ -136,14 +131,6 @@ def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
                  if not {effect, CONFOUNDERS.get(effect)} & {*best.effects}]
         better = [each
                   for each in tried if each is not None and _is_supported(best, each, limit)]
-        if not better and best.dof > 2 and fisher.sf(best.dof - 1, 1, best.dof - 1) > limit:
-            # Each of two is significant given the choice of the other.
-            of_rate = [each for each in candidates if 'temperature' not in each.inputs
-                       and not {each, CONFOUNDERS.get(each)} & {*best.effects}]
-            both = (try_fit(best, (*best.effects, *pair)) for pair in combinations(of_rate, 2)
-                    if CONFOUNDERS.get(pair[0]) is not pair[1])
-            better = [each for each in both if each is not None
-                      and _is_supported(best, each, limit / len(candidates))]
         if not better:
             return _remove_superfluous(best, base.effects, limit)
         best = min(better, key=Calibration.cross_validation_misfit)

@@ -28,12 +28,11 @@ from gyro_calibration.calibration.likelihood import (
     ASYMMETRY_DEVIATION, EXCESS_RATE_DEVIATION, fit_likelihood, GoodnessOfFit, MAX_NOISE_SIGMAS,
     MAX_TRACKING_LAG, MIN_FIT_PROBABILITY, ScaleBiasFit)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_limited, refuse_other_motion,
-    refuse_unit_error, RunPieces, split_run)
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
+    fit_profile, format_slip, MAX_UNEXPLAINED_SHARE, refuse_other_motion, refuse_unit_error,
+    RunPieces, split_run)
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.logs.quality import (
-    quantization_step, refuse_dead, refuse_saturated, rounding_errors, white_noise_deviation)
-from gyro_calibration.logs.stamps import even_times
+    quantization_step, refuse_dead, refuse_saturated, white_noise_deviation)
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
@@ -131,8 +130,6 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     refuse_samples(time, rate, limits, output)
     refuse_saturated(rate if output is None else output)
     run = split_run(time, rate, motion)
-    refuse_limited(run, motion, limits.max_time_offset + MAX_TRACKING_LAG, time,
-                   rate if output is None else output)
     _refuse_run(time, run, motion, limits)
     if method == 'likelihood':
         fit = _fit_likelihood(time, rate, motion, limits.max_time_offset,
@@ -165,7 +162,7 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
-    _refuse_fit(fit, run, motion, limits, white_noise)
+    _refuse_fit(fit, motion, limits, white_noise)
     # A reference that follows the noise of the gyro, that of the model, or less by the samples: by
     # the likelihood ratio to the same fits with at least this noise. Without a model that of the
     # quietest samples may be vibration, which both follow, but then s and b are not 0.
@@ -186,19 +183,18 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
 
 @dataclass(frozen=True)
-class OutputRounding:
+class _OutputRounding:
     """
-    The errors of means over blocks of samples by the steps of an output.
+    The errors of means over blocks of five samples by the steps of an output.
 
-    At one code, as at all rests, the steps cause one error, which is no noise of a fit; between
-    codes the errors are independent, of the sizes of `rounding_errors`.
+    Blocks on one step, as all rests, have one error, which is no noise of a fit.
     """
 
     block: NDArray[np.intp]  # of each sample, shape (n,)
     mean: Array  # of each block, rad/s, shape (m,)
-    is_quiet: Mask  # whether the samples of a block show the noise at one rate, shape (m,)
-    code: NDArray[np.intp]  # of each block, shape (m,)
-    deviation: Array  # standard deviation of the error of each mean, rad/s, shape (m,)
+    code: NDArray[np.intp]  # number of the step of each block, shape (m,)
+    # standard deviation of the error of each mean, rad/s, (m,); 0 where noise averages it out
+    deviation: Array
 
     def covariance(self, weights: Array) -> Array:
         """Return the covariance of sums of samples with weights, (k, n), shape (k, k)."""
@@ -207,56 +203,36 @@ class OutputRounding:
         return np.asarray(sums @ sums.T)
 
 
-def find_rounding(time: Array, output: Array, step: float) -> OutputRounding | None:
-    """Return the errors by the steps of an output over five samples each; None without a step."""
+def find_rounding(time: Array, output: Array, step: float) -> _OutputRounding | None:
+    """Return the errors by the steps of an output; None without a step, or beside more noise."""
     if not step:
         return None
     length = 5.0 * float(np.median(np.diff(time)))
     block = np.unique(np.floor((time - time[0]) / length), return_inverse=True)[1]
     count = np.bincount(block)
-    mean = np.bincount(block, output / step) / count
-    variance = np.bincount(block, (output / step - mean[block]) ** 2) / count
-    if not (quiet := variance <= 0.25).any():
-        return None
-    near = np.abs(np.diff(mean)) < 1.0
-    before, after = np.append(False, near), np.append(near, False)
-    change = np.append(np.where(near, np.diff(mean), 0.0), 0.0)
-    local = mean + (change - np.roll(change, 1)) / (1.0 + before + after)
-    code = np.unique(np.rint(local), return_inverse=True)[1]
-    # a ramp may begin within a block
-    slow = np.abs(np.roll(mean, -2) - np.roll(mean, 2)) < 4.0 * 0.1
-    weight = count * np.where(quiet & before & after & slow, 1.0, 1e-6)
-    total: Array = np.bincount(code, weight).astype(float)
-    squares = rounding_errors(np.bincount(code, weight * np.minimum(variance, 1.0)) / total, total)
-    return OutputRounding(block, step * mean, quiet, code,
-                          step * np.sqrt(np.where(quiet, squares[code], 0.0)))
+    mean = np.bincount(block, output) / count
+    code = np.unique(np.rint(mean / step), return_inverse=True)[1]
+    of_code = code[block]
+    variance = np.bincount(of_code, (output - mean[block]) ** 2) / np.bincount(of_code)
+    deviation = np.where(variance <= 0.25 * step ** 2, step / math.sqrt(12.0), 0.0)[code]
+    return _OutputRounding(block, mean, code, deviation) if deviation.any() else None
 
 
 def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
-    """
-    Return the covariance of (s, b) by the steps of an output, and the variance of a mean at rest.
-
-    By least squares on the blocks of `find_rounding`. Shape (2, 2) and (rad/s)²; both are zero
-    without steps.
-    """
+    """Return the covariance of (s, b) by steps, (2, 2), and the variance at rest, (rad/s)²."""
     if (found := find_rounding(time, output, quantization_step(output))) is None:
         return np.zeros((2, 2)), 0.0
     rate = (found.mean - fit.bias) / (1.0 + fit.scale_factor_error)
     root = np.sqrt(np.bincount(found.block))[:, None]
     weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) / root.T
-    slowest = np.where(found.is_quiet, np.abs(rate), math.inf).argmin()
+    slowest = np.where(found.deviation > 0.0, np.abs(rate), math.inf).argmin()
     return found.covariance(weights[:, found.block]), float(found.deviation[slowest] ** 2)
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
                     slip_deviation: float) -> ScaleBiasFit:
-    """Fit on the stamps, or on an even grid if that leaves less."""
-    even_stamps = even_times(time)
-    jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
-    fit = min((fit_likelihood(stamps, rate, motion, largest_time_offset,
-                              slip_deviation=slip_deviation)
-               for stamps in ([time, even_stamps] if jitters else [time])),
-              key=lambda found: float(np.linalg.det(found.covariance)))
+    """Fit, and allow for an asymmetry of the gyro against a measured motion."""
+    fit = fit_likelihood(time, rate, motion, largest_time_offset, slip_deviation=slip_deviation)
     if not motion.is_measured:
         return fit
     # Against a profile the fit includes a scale difference between both senses of turning. Such an
@@ -345,26 +321,16 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
         refuse_other_motion(run, motion, largest_offset)
 
 
-def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits,
-                white_noise: float) -> None:
+def _refuse_fit(fit: ScaleBiasFit, motion: Motion, limits: RunLimits, white_noise: float) -> None:
     """Refuse by the first cause found, in the order in which they spoil later checks."""
-    largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual
     s = fit.scale_factor_error
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
-    has_slipped = excess_angle > limits.max_stretch_residual and sigmas > _MIN_SLIP_SIGMAS
-    slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
-            else '')
-    # the noise of mount and encoder deviates too; a wobble does not accumulate in the heading
-    noise_ratio = (fit.goodness.noise_ratio if fit.goodness
-                   else fit.angle_random_walk / max(white_noise, 1e-300))
-    strays = (not motion.is_measured and fit.heading_difference > limits.max_unexplained_angle
-              and noise_ratio > limits.max_noise_ratio)
-    if (has_slipped or strays or abs(fit.time_offset) > largest_offset
-            or deviation > limits.max_scale_deviation):
-        refuse_other_motion(run, motion, largest_offset, slip)
-    if has_slipped:
-        raise DataRefused(slip)
+    if excess_angle > limits.max_stretch_residual and sigmas > _MIN_SLIP_SIGMAS:
+        raise DataRefused(format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas))
+    if abs(fit.time_offset) > limits.max_time_offset + MAX_TRACKING_LAG:
+        raise DataRefused(f'the gyro is {fit.time_offset:.2f} s behind the {motion.name}: begin '
+                          f'with it, or correct the time of the {motion.name}')
     if abs(s) > limits.max_scale_factor_error and deviation <= limits.max_scale_deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
@@ -372,7 +338,11 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     refuse_bias(fit.bias, limits, 'do not turn the robot by hand')
     refuse_uncertain_scale(deviation, limits, ', and check that the profile is the one that was '
                            'driven' if motion.name == 'profile' else '')
-    if strays:
+    # the noise of mount and encoder deviates too; a wobble does not accumulate in the heading
+    noise_ratio = (fit.goodness.noise_ratio if fit.goodness
+                   else fit.angle_random_walk / max(white_noise, 1e-300))
+    if (not motion.is_measured and fit.heading_difference > limits.max_unexplained_angle
+            and noise_ratio > limits.max_noise_ratio):
         known = 'the model states' if fit.goodness else 'its samples show'
         raise DataRefused(f'the run is {noise_ratio:.1f} times as noisy as {known}, at most '
                           f'{limits.max_noise_ratio:g} are allowed: check that the robot follows '
@@ -466,14 +436,12 @@ def check_end(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return a calibration by a profile whose log has too short a rest after it for `check_rest`.
 
-    A steady turn of the robot throughout a run, as on a turntable or a slope, has the effect of a
-    bias, which the samples after the motion show. A turn that they do not show, of a prior
-    deviation `EXCESS_RATE_DEVIATION`, is in the standard deviation of the bias, and so is all that
-    they show of a robot whose profile ends less than `SETTLING_TIME` after its last turn, by the
-    part up to the end of the log that determines the rate best: it settles before. The fit
-    is returned unchanged where fewer than 10 samples follow the motion or the robot drives on, of
-    a measured reference, and without a covariance. It is refused where the robot turned throughout
-    the motion, or goes on turning after it.
+    A steady turn throughout a run has the effect of a bias, which the samples after the motion
+    show. A turn that they do not show, of a prior deviation `EXCESS_RATE_DEVIATION`, is in the
+    standard deviation of the bias, and so is all that they show of a robot that may settle yet, in
+    the part up to the end of the log that determines the rate best. The fit is returned unchanged
+    of a measured reference, and where fewer than 10 samples follow or the robot drives on. It is
+    refused where the robot turned throughout the motion, or goes on turning after it.
     """
     limits = RunLimits()
     end = motion.duration + max(fit.time_offset, 0.0)
@@ -531,11 +499,9 @@ def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[
     """
     Return derivatives of (s, b) by the rate at rest, shape (2,), and their covariance, (2, 2).
 
-    The rate is the mean of the output at rest less the bias of the run, rad/s; its variance is
-    that of the mean, (rad/s)². The error of a run may exceed its stated deviation: by a slip, a
-    turn by hand, or another response of the robot. That and a run as stated have even odds before
-    the rest is seen. The ratio of that error to the stated deviation has a half-Cauchy prior of
-    median 1.
+    The rate is the mean of the output at rest less the bias of the run, rad/s, with the variance
+    of that mean. A run as stated and one that errs by more (a slip, a turn by hand) have even
+    odds; the ratio of its error to the stated deviation has a half-Cauchy prior of median 1.
     """
     stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
@@ -559,8 +525,8 @@ def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
-    It begins up to its length in the limits later where the robot still moves, and is at most as
-    long as the motion. None where the log ends before, or the robot drives on.
+    It begins later where the robot still moves, and is at most as long as the motion. None where
+    the log ends before, or the robot drives on.
     """
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
     latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)

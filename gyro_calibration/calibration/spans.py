@@ -45,7 +45,7 @@ from gyro_calibration.heading.integration import integrate, integrate_with_curva
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_holes, mark_rows, MISALIGNMENT_DEVIATION,
-    quantization_step, robust_deviation, rounding_errors, white_noise_deviation)
+    quantization_step, robust_deviation, white_noise_deviation)
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
@@ -80,7 +80,7 @@ def lag_deviation(delay: float) -> float:
 
 
 @dataclass(frozen=True)
-class ReferenceTreatment:
+class _ReferenceTreatment:
     """Settings of the comparison of a kind of reference with the gyro."""
 
     min_span: float  # least length, s
@@ -101,11 +101,11 @@ class ReferenceTreatment:
         return _DELAY_SIGMAS * self.prior[2]
 
 
-COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
-                                      15.0, False, True)
+COURSE_TREATMENT = _ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
+                                       15.0, False, True)
 #: A reference with errors of an instrument.
-HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
-                                       True)
+HEADING_TREATMENT = _ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0,
+                                        True, True)
 _TREATMENTS = {
     'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
     # on the host of the gyro: small delays, as a swing agrees again a period later
@@ -153,7 +153,7 @@ class Spans:
     # first and last row of each rest, shape (r, 2), and whether the reference is known there
     rests: NDArray[np.intp]
     stands: Mask
-    treatment: ReferenceTreatment  # of the kind of the reference
+    treatment: _ReferenceTreatment  # of the kind of the reference
     # smaller and larger angle random walk, by the white noise of samples and reference rate, and
     # by the difference of gyro and reference over a second, rad/√s
     walk_bounds: tuple[float, float]
@@ -288,16 +288,10 @@ class Spans:
     @cached_property
     def rest_rounding(self) -> float:
         """Return the standard deviation of the mean output of all rests by its steps, rad/s."""
-        rows = mark_rows(self.rests, len(self.log))
-        if not (self.output_step and rows.any()):
-            return 0.0
-        output = self.output
-        variance = np.average([np.var(output[first:last + 1]) for first, last in self.rests],
-                              weights=np.diff(self.rests)[:, 0]) / self.output_step ** 2
-        if variance > 0.25:  # as with a noise of half a step, which averages it out
-            return 0.0
-        return self.output_step * math.sqrt(rounding_errors(
-            np.array([variance]), np.array([float(rows.sum())]))[0])
+        variances = [np.var(self.output[first:last + 1]) for first, last in self.rests]
+        # a noise of half a step averages it out
+        is_coarse = bool(variances) and max(variances) <= 0.25 * self.output_step ** 2
+        return is_coarse * self.output_step / math.sqrt(12.0)
 
     def gyro_stamps(self, time: Array) -> Array:
         """Return the stamps of the gyro at times of the reference, s."""
@@ -465,8 +459,6 @@ class Spans:
         Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
 
         The errors of the most likely heading given both are independent of the difference of both.
-        Columns computed from the reference alone, or the gyro alone, would be correlated with the
-        noise of the observations.
         """
         if not self.treatment.errs_as_heading:
             return heading_change / (1.0 + self.reference_noise_ratio ** 2)
@@ -530,10 +522,9 @@ class Spans:
         """
         Return the column of a lag without its noise, what others explain of it, both (n + r,).
 
-        What scale factor error, bias and delay do not explain of a lag may be noise of the gyro.
-        It is reduced to the share that the reference shows too (regression calibration, Carroll
-        and others 2006), if that is beyond chance. What is left of noise is an error of the lag,
-        s².
+        What other values do not explain of a lag may be noise of the gyro: it is reduced to the
+        share that the reference shows too (regression calibration, Carroll and others 2006). The
+        noise that is left is an error of the lag, s².
         """
         time, columns = self.stamps, self.base_columns()
         column = self.cause_columns(CauseTerm('bandwidth'))[:, 0]

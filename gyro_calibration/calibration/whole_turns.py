@@ -62,9 +62,8 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     Find scale factor error and bias from whole turns between two rests on one mark.
 
     Only the net number of turns matters, counter-clockwise positive; None is the nearest whole
-    one, for a scale factor error up to `_MAX_COUNTING_SCALE_ERROR`. The gyro must agree to less
-    than `_MAX_COUNT_ERROR` of a turn; so one with a large error needs few turns. The deviation is
-    that of the angle between the rests on the mark, rad. The rest is that of `self_calibrate`.
+    one. The deviation is that of the angle between the rests on the mark, rad. The rest is that of
+    `self_calibrate`.
     """
     refuse_samples(time, rate, limits, output)
     output = rate if output is None else output

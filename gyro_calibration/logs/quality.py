@@ -17,7 +17,8 @@ import math
 from gyro_calibration.logs.columns import ROTATIONS
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtri
+
 
 #: Standard deviation of the misalignment of the axes of gyro and reference, rad, as the cross-axis
 #: sensitivity in data sheets of MEMS gyros (MPU-6050: 2 %).
@@ -150,71 +151,6 @@ def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, f
 def quantization_step(values: Array) -> float:
     """Return the quantization step of an encoder or a digital output; 0 without one."""
     return find_codes(values).step
-
-
-def rounding_product(noise: Array, distance: Array) -> Array:
-    """
-    Return the mean product of the errors of two means of rounded values, steps².
-
-    The mean of values with normal noise of the variance v, rounded to a step q, errs by a periodic
-    function of the value without noise. Over all places in the step, the errors at a distance d
-    have the mean product ``q² / (2 π²) sum(exp(-4 π² k² v / q²) cos(2 π k d / q) / k²)``, k from 1
-    on: at none, q² / 12 without noise, and nothing from v = q² / 4 on (Widrow and Kollar 2008,
-    Quantization Noise).
-
-    Parameters
-    ----------
-    noise, distance : v, steps², and d, steps, of shapes that broadcast
-
-    """
-    total = np.zeros(np.broadcast_shapes(noise.shape, distance.shape))
-    for order in range(1, 30):
-        part = np.exp(-4.0 * (np.pi * order) ** 2 * noise) / (2.0 * (np.pi * order) ** 2)
-        total += part * np.cos(2.0 * np.pi * order * distance)
-        if part.max(initial=0.0) < 1e-9:
-            break
-    return total
-
-
-def noise_before_rounding(variance: Array) -> Array:
-    """
-    Return the variance of the noise of samples by that after they are rounded, steps².
-
-    Over all places in a step, rounding adds 1/12 less the variance of the error of the mean.
-    """
-    noise = np.linspace(0.0, 1.0, 1001)
-    return np.interp(variance, noise + 1.0 / 12.0 - rounding_product(noise, np.zeros(1)), noise)
-
-
-def rounding_errors(variance: Array, count: Array) -> Array:
-    """
-    Return the mean square errors of means of rounded values, by their variances, steps², (n,).
-
-    All values have normal noise of one size. That size, uniform in its logarithm from 0.01 to 1
-    step, and the places of the means in their steps, uniform, are weighted by how well they give
-    the variances: few means show hardly how large the noise is.
-
-    Parameters
-    ----------
-    variance, count : of the values of each mean, steps² and 1, shape (n,); a count below 1 is no
-        evidence
-
-    """
-    place, code = np.linspace(0.0, 0.5, 26)[:, None], np.arange(-4, 5)
-    variance, count = variance[:, None], count[:, None]
-    chances, squares = [], []
-    for noise in np.geomspace(0.01, 1.0, 25):
-        shares = ndtr((code + 0.5 - place) / noise) - ndtr((code - 0.5 - place) / noise)
-        mean = shares @ code
-        spread = shares @ code ** 2 - mean ** 2
-        # of values of two codes the variance has about this one, with that of the grid
-        width = spread / count + 1.0 / count ** 2 + 1e-4
-        chance = np.exp(-0.5 * (variance - spread) ** 2 / width) / np.sqrt(width) + 1e-12
-        chances.append(chance.mean(axis=1))
-        squares.append((chance @ (mean - place[:, 0]) ** 2) / chance.sum(axis=1))
-    logarithm = np.log(chances).sum(axis=1)
-    weights = np.exp(logarithm - logarithm.max())
-    return np.asarray(weights @ squares / weights.sum())
 
 
 #: Least share of the changes of an encoder heading that are not collinear with the two before, or

@@ -116,18 +116,6 @@ def fit_stamp_grid(time: Array) -> StampGrid:
                      bursts, max_gap)
 
 
-def even_times(time: Array) -> Array:
-    """Return the even times of stamps with bursts or jitter below an interval, else the stamps."""
-    try:
-        stamps = fit_stamp_grid(time)
-    except DataRefused:
-        return time
-    if stamps.max_deviation > stamps.interval and not stamps.has_bursts:
-        return time
-    number = _number_samples(stamps.lost_after)
-    return np.polynomial.Polynomial.fit(number, time, 1)(number)
-
-
 def count_lost_samples(time: Array) -> Integers | None:
     """Return how many samples are lost after each but the last; None without an even interval."""
     try:

@@ -11,9 +11,8 @@
 """
 Channels that need a history: time since power-on, lagged channels, the sign of heating.
 
-A `ChannelHistory` takes a stream sample by sample, or a log as a whole or in blocks, with the same
-results but for rounding (1e-14 rad/s). Each lag that is requested starts at the value of its
-channel at that time and is updated from then on.
+A stream sample by sample, and a log in blocks, have the same results but for rounding (1e-14
+rad/s). A lag starts at the value of its channel where it is first requested.
 """
 
 from __future__ import annotations

@@ -12,9 +12,8 @@
 Compensation: from the output of a gyro to the rate, the same for one sample and for a whole log.
 
 Where an effect is a function of the true rate, the model equation is solved by secant iteration
-with a fixed number of passes, so that a sample and a log take the same steps. A constant slope
-needs one pass, and a model of the output alone none. No separate inverse formula exists that could
-differ from the simulation.
+with a fixed number of passes. No separate inverse formula exists that could differ from the
+simulation.
 """
 
 from dataclasses import dataclass
@@ -119,9 +118,9 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     Return the derivative of the rate by each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then the
-    `GyroModel.active_tolerances`, then (s, b) of the self-calibration. The rate of the model
-    solves ``rate = output - error(rate)``, so the derivative of the error is divided by the slope
-    of the output there. Effects that compensation cannot undo have a derivative of 0.
+    `GyroModel.active_tolerances`, then (s, b) of the self-calibration. The derivative of the error
+    is divided by the slope of the output. Effects that compensation cannot undo have a derivative
+    of 0.
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None or model.active_tolerances:

@@ -11,16 +11,10 @@
 """
 Errors of a gyro: the formula of each effect between the true rate and the output.
 
-Simulation, calibration, diagnosis and compensation use the same formulas. An effect is a record
-and a model is a tuple of effects. Most effects add ``sum(columns(channels, *shapes) * values)`` to
-the output, so they are combined in any way. Others, such as a delay or rounding, are no function
-of one instant and change the signal itself; `not_compensated` states what compensation leaves of
-them.
-
-In this order: the records and a first-order lag; the polynomial of Ojeda, Chung and Borenstein;
-all other effects: of rate and temperature alone, which dwells of a rate table show; of past
-temperatures; of the time since power-on; of the surroundings; and those that change the signal. A
-new effect is one more record here.
+Simulation, calibration, diagnosis and compensation use the same formulas. Most effects add
+``sum(columns(channels, *shapes) * values)`` to the output. Others, such as a delay or rounding,
+change the signal itself; `not_compensated` states what compensation leaves of them. A new effect
+is one more record here.
 """
 
 from __future__ import annotations
@@ -126,10 +120,9 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
     """
     Return the lagged signal minus the signal, at one instant or at many (shape (n,)).
 
-    A lag obeys ``time_constant * d(lagged)/dt = signal - lagged``, solved exactly for a signal
-    that is linear between its samples. The difference decays by exp(-x) over an interval of x time
-    constants, and a change d of the signal reduces it by ``d (1 - exp(-x)) / x``. Interval, s, not
-    negative, and change are those since the previous sample.
+    ``time_constant * d(lagged)/dt = signal - lagged`` is solved exactly for a signal that is
+    linear between its samples. Interval, s, not negative, and change are those since the previous
+    sample.
     """
     if not isinstance(interval, np.ndarray):
         x = interval / time_constant

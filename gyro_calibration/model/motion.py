@@ -156,9 +156,8 @@ def read_motion(path: str | Path) -> Motion:
     """
     Read a motion profile from a CSV file, or raise `MotionError`.
 
-    It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s, which were commanded.
-    The reference of a log is a profile too: its heading, which was measured, where it has both,
-    and without the rows where it was lost.
+    It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s, which were commanded;
+    or the reference of a log, of which a heading was measured, without the rows where it was lost.
     """
     try:
         lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)

@@ -50,6 +50,3 @@ RD2100 = Preset('RD2100', 'KVH E-Core RD2100, open-loop fibre-optic, by Ojeda et
                 'Table I and section 5: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; '
                 'half of 2 % and of 0.2 deg/s, both over the range of temperatures',
                 5.0 / 60.0, 7.2, 0.01, 0.1, 0.1)
-MPU6050 = Preset('MPU-6050', 'as measured at rest on the encoder turntable', 0.64)
-GOOD_MEMS = Preset('good MEMS', 'round figures of the better ones, such as the ADIS16488',
-                   0.3, 6.0, 0.01, 0.2)

@@ -35,8 +35,8 @@ def read_settings(path: str | Path) -> Any:
     """
     Read a YAML file of names, texts, numbers, true, false, null and lists, or raise `ValueError`.
 
-    Dates are texts, and 1e-4, a text in YAML 1.1, is a number. A file that names its format, as
-    programs write it, must end with a line end: a truncated 9.3e-06 could read as 9.3.
+    Dates are texts, and 1e-4 is a number. A file that names its format must end with a line end: a
+    truncated 9.3e-06 could read as 9.3.
     """
     try:
         text = read_bytes(path, _MAX_SETTINGS_BYTES).decode('utf-8-sig')

@@ -32,9 +32,8 @@ def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussM
     """
     Return the process that fits bias instability and rate random walk best, and its error.
 
-    The logarithms of the Allan variances, angle random walk included, are compared at octaves from
-    the interval of the samples to the span, s. The error is the largest relative one of the Allan
-    deviation. If both figures are 0, the process has density 0.
+    The logarithms of the Allan variances are compared at octaves from the interval of the samples
+    to the span, s. The error is the largest relative one of the Allan deviation.
     """
     floor, walk = noise.bias_instability, noise.rate_random_walk
     if not floor and not walk:

@@ -341,15 +341,3 @@ def test_the_verb_puts_the_figures_into_a_model_and_loses_nothing_else(log, tmp_
     other = {'noise': 0, 'covariance': 0, 'noise_bounds': 0}
     assert {**vars(after), **other} == {**vars(before), **other}
     assert (after.covariance == before.covariance).all() and not alone.terms
-
-
-@pytest.mark.parametrize('words, code, said', [
-    (('LOG', '--model', 'x.yaml'), 2, 'given without --out'),
-    (('LOG', '--picture', 'chart.gif'), 2, 'ends in .png or .svg'),
-    (('SHORT',), 1, 'short.csv: 50 samples'), (('LOG', '--from', '4000'), 1, '--from 4000')])
-def test_what_the_verb_refuses_is_reported(log, tmp_path, run, words, code, said):
-    short = tmp_path / 'short.csv'
-    short.write_text('time_s,gyro_dps\n' + ''.join(f'{i / 100},{i % 7}\n' for i in range(50)))
-    found, _, error = run('allan', *({'LOG': log, 'SHORT': short}.get(word, word)
-                                     for word in words))
-    assert found == code and said in error

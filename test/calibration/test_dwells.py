@@ -74,12 +74,8 @@ SWEEPS = {
     'rests between': [rate for size in TENS for rate in (0, size)],
     'rests between, both signs in turn': [rate for size in TENS for rate in (0, size, 0, -size)],
     'rests around': [0, *range(-90, 91, 20), 0],
-    'rests around and in the middle': [0, *range(-90, -9, 20), 0, *range(10, 91, 20), 0],
-    'two dwells at each rate, rests around': [0, *np.repeat(range(-90, 91, 20), 2), 0],
     'two dwells at each rate one way, rests around and in the middle':
         [0, *np.repeat(TENS[:5], 2), 0, *np.repeat(TENS[5:], 2), 0],
-    'in random order': [-20, 100, 0, 60, -80, 40, -60, 20, 80, -100, 0, -40],
-    'three rates': [-100, 0, 100],
 }
 
 
@@ -88,15 +84,6 @@ def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
     found = dwells_from_table(table(sweep * 3))
     assert list(found.sweep) == list(np.repeat([0, 1, 2], len(sweep)))
     assert found.remarks[0].startswith('without a column sweep, the 3 sweeps are numbered by the ')
-
-
-@pytest.mark.parametrize('back', [[90, 70, 50, 30, 10, -10, -30, -50, -70, -90],
-                                  [90, 70, 50, 30, 10, 0, -10, -30, -50, -70, -90]],
-                         ids=['', 'a rest in the middle'])
-def test_up_and_down_between_rests_are_two_sweeps(back):
-    rates = [0, *back[::-1], 0, 0, *back, 0]
-    found = dwells_from_table(table(rates * 3))
-    assert list(found.sweep) == list(np.repeat(range(6), len(back) + 2))
 
 
 @pytest.mark.parametrize('rates, more, sweeps', [
@@ -116,7 +103,8 @@ def test_rows_without_output_or_reference_are_left_out_and_a_column_gives_deviat
     assert found.location == ('row 1', 'row 2', 'row 5')
     assert list(found.temperature) == [0.0, 1.0, 4.0]
     assert found.remarks[0] == '2 rows without output or reference are left out: 3, 4'
-    assert found.deviation[0] == 0.5 * DEGREE and np.isnan(found.deviation[1:]).all()
+    assert found.deviation[0] == pytest.approx(0.5 * DEGREE)
+    assert np.isnan(found.deviation[1:]).all()
 
 
 @pytest.mark.parametrize(('log', 'message'), [
@@ -281,8 +269,3 @@ def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):
     assert len(found) > 350 and abs(np.sign(found.rate).sum()) < 10
     scale, _ = np.polyfit(found.rate, found.output, 1)
     assert scale == pytest.approx(-1.006, abs=0.002)
-
-
-def test_a_turntable_that_turns_back_before_it_is_steady_is_refused(data):
-    with pytest.raises(DataRefused, match='likelihood'):
-        find_dwells(read_log(data / 'mems_encoder_turntable' / 'yaw_fast.csv.gz'))

@@ -13,8 +13,7 @@
 import math
 
 from gyro_calibration.calibration.noise_grid import (
-    BandedNoise, bias_wander_columns, carried_shares, difference_covariance, fit_noise_grid,
-    heading_noise, SharedNoise)
+    BandedNoise, bias_wander_columns, fit_noise_grid, heading_noise, SharedNoise)
 import numpy as np
 import pytest
 
@@ -89,21 +88,6 @@ def test_a_size_far_from_the_points_of_the_first_grid_is_found():
 def test_too_few_observations_are_refused():
     with pytest.raises(ValueError, match='2 observations do not determine 2 values'):
         fit_noise_grid(np.zeros(2), np.eye(2), [BandedNoise('a', np.ones(2), None, (1.0, 1.0))])
-
-
-def test_differences_of_autoregressive_errors_have_the_covariance_that_is_stated():
-    generator = np.random.default_rng(5)
-    correlation = np.where(np.arange(8) == 3, 0.0, generator.uniform(0.0, 0.9, 8))
-    lags = np.concatenate([[0.0], np.cumsum(-np.log(np.maximum(correlation, 1e-9)))])
-    errors = np.exp(-np.abs(lags[:, None] - lags))
-    difference = np.diff(np.eye(9), axis=0)
-    quasi = np.eye(8) - np.diag(carried_shares(correlation)[1:], -1)
-    diagonal, neighbours = difference_covariance(np.ones(9), correlation)
-    assert quasi @ difference @ errors @ difference.T @ quasi.T == pytest.approx(
-        np.diag(diagonal) + np.diag(neighbours[1:], -1) + np.diag(neighbours[1:], 1), abs=1e-6)
-    spans = heading_noise(np.arange(9.0), np.zeros(9), correlation=correlation)[0]
-    assert quasi @ quasi.T == pytest.approx(np.diag(spans.diagonal) + np.diag(
-        spans.off_diagonal[1:], -1) + np.diag(spans.off_diagonal[1:], 1))
 
 
 def test_a_span_that_the_gyro_does_not_cover_shows_nothing():

@@ -17,7 +17,6 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 from functools import cache
 import json
 import math
-import re
 
 from chance import fewest, most
 from conftest import operations
@@ -28,12 +27,11 @@ from gyro_calibration.calibration.self_calibration import (
     check_end, check_rest, describe_implausible_scale, find_rest_after, ReferenceErrors, RunLimits,
     self_calibrate)
 from gyro_calibration.calibration.whole_turns import calibrate_turns
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.motion import (
-    CALIBRATION_MOTION, constant_rate_motion, motion_from_headings, motion_from_log,
-    motion_from_rates)
+    CALIBRATION_MOTION, constant_rate_motion, motion_from_headings, motion_from_rates)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
@@ -97,25 +95,14 @@ LONG = np.arange(2301) / 100.0
 
 @pytest.mark.parametrize('time, moved, said', [
     (TIME, output(motion=constant_rate_motion([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])),
-     r"stopped at about (7\.[5-9]|8\.[0-5]) s of the profile's 20\.0 s"),
-    (LONG, output(time=LONG - 2.5), r'began (2\.4|2\.5|2\.6) s after the profile')],
-    ids=['an early end', 'a late beginning'])
-def test_a_motion_that_ends_early_or_begins_late_is_reported_by_when(time, moved, said):
+     r'does not follow the profile, which explains \d+ % of the run, least at about (7|8)\.\d s'),
+    (LONG, output(time=LONG - 2.5), r'the gyro is (2\.4|2\.5|2\.6) s behind the profile'),
+    (TIME, output() + (1 + S) * np.clip(CALIBRATION_MOTION.rate_at(TIME), -0.5, 0.5)
+     - (1 + S) * CALIBRATION_MOTION.rate_at(TIME), 'a limit of the motion')],
+    ids=['an early end', 'a late beginning', 'a limit of the robot'])
+def test_another_motion_is_reported_by_where_it_deviates(time, moved, said):
     with pytest.raises(DataRefused, match=said):
         self_calibrate(time, moved, CALIBRATION_MOTION, noise=XV3500.noise)
-
-
-@pytest.mark.parametrize('noise', [Noise(), XV3500.noise], ids=['noise unknown', 'noise known'])
-@pytest.mark.parametrize('limit', [25, 35, 42])
-def test_a_robot_that_does_not_reach_the_rates_of_the_profile_is_refused_by_its_limit(
-        limit, noise):
-    commanded = CALIBRATION_MOTION.rate_at(TIME)
-    reached = np.clip(commanded, -limit * DEGREE, limit * DEGREE)
-    with pytest.raises(DataRefused, match='deg/s where the profile turns at 45 deg/s') as refused:
-        self_calibrate(TIME, output() + (1 + S) * (reached - commanded), CALIBRATION_MOTION,
-                       noise=noise)
-    found = float(re.search(r'reached (\d+) deg/s', str(refused.value))[1])
-    assert found == pytest.approx(limit, abs=0.5 + 0.025 * 45)
 
 
 def test_a_run_without_known_noise_is_judged_by_the_noise_of_its_samples():
@@ -156,22 +143,14 @@ def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_len
 
 
 @pytest.mark.parametrize('factor, words', [
-    (60.0, 'the gyro is in deg/s and read as rad/s, or the profile in rad and read as deg'),
-    (0.159, 'either the gyro is in revolutions/s and read as rad/s, or the profile in rad and '),
+    (60.0, 'the gyro is in deg/s and read as rad/s, or the profile in rad/s and read as'),
+    (0.159, 'either the gyro is in revolutions/s and read as rad/s, or the profile in rad/s and '),
     (9.55, 'is in revolutions/min and read as rad/s, or the profile in rad/s and read as rev'),
-    (1000.0, r'either the gyro is in thousandths \(mdeg/s, mrad/s\) and read as whole units, or '),
+    (1000.0, 'either the gyro is in mdeg/s and read as deg/s, or the profile in deg/s and read'),
 ])
 def test_one_confusion_of_units_is_named_the_usual_one_first(factor, words):
     with pytest.raises(DataRefused, match=words):
         self_calibrate(TIME, factor * CALIBRATION_MOTION.rate_at(TIME), CALIBRATION_MOTION)
-
-
-def test_a_slip_against_a_reference_is_not_blamed_on_a_profile():
-    rate = output() + 0.3 * ((TIME > 9.0) & (TIME < 9.7))
-    measured, _ = motion_from_log(Log(time=TIME, reference_heading=CALIBRATION_MOTION.heading_at(
-        TIME)))
-    with pytest.raises(DataRefused, match='from the reference .* a slip of the mount'):
-        self_calibrate(TIME, rate, measured)
 
 
 def test_a_limit_hidden_by_the_model_is_seen_in_the_output():
@@ -179,19 +158,6 @@ def test_a_limit_hidden_by_the_model_is_seen_in_the_output():
     drifting = clipped - 1e-4 * TIME  # a compensation that changes with temperature
     with pytest.raises(DataRefused, match='saturated'):
         self_calibrate(TIME, drifting, CALIBRATION_MOTION, output=clipped)
-
-
-LONG_RAMPS = motion_from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]),
-                               np.array([0, 0, 45, 45, -45, -45, 0, 0]) * DEGREE)
-
-
-@pytest.mark.parametrize('motion', [CALIBRATION_MOTION, LONG_RAMPS],
-                         ids=['short ramps', 'long ramps'])
-def test_coarse_quantization_is_no_saturation(motion):
-    code, time = 0.2 * DEGREE, np.arange(0.0, motion.duration, 0.01)
-    fit = self_calibrate(
-        time, np.round(((1 + S) * motion.rate_at(time - 0.1) + B) / code) * code, motion)
-    assert fit.scale_factor_error == pytest.approx(S, abs=0.02)
 
 
 @cache

@@ -35,11 +35,7 @@ WANDERING = Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)
 
 
 def names(selection):
-    return names_of(selection.calibration)
-
-
-def names_of(fit):
-    return {effect.name for effect in fit.effects}
+    return {effect.name for effect in selection.calibration.effects}
 
 
 def of_table(rate, output):
@@ -110,18 +106,6 @@ def test_a_sine_that_passes_through_evenly_spaced_rates_is_not_taken_for_a_cubic
     terms = (*LINEAR, Term(CUBIC_NONLINEARITY, (0.001,)))
     table = measured(Table(sweeps=16, rates=11, dwell=0.01 * DEGREE), terms)
     assert 'cubic_nonlinearity' in names(select_effects(table, technology))
-
-
-def test_two_effects_in_few_dwells_are_found_where_each_alone_is_not_significant():
-    rate = np.linspace(-50.0, 50.0, 9) * DEGREE
-    for seed in range(10):
-        generator = np.random.default_rng(seed)
-        noise = 1e-5 * generator.standard_normal(9)
-        output = np.sin(0.25 * rate) / 0.25 - 0.002 * rate + 0.0025 * np.abs(rate) + noise
-        fit = select_effects(of_table(rate, output), 'open_loop_fog').calibration
-        assert {'sine_response', 'scale_factor_asymmetry'} < names_of(fit)
-        assert fit.terms[-1].effect is not SINE_RESPONSE or fit.terms[-1].values[
-            0] == pytest.approx(0.25, rel=0.02)
 
 
 def test_a_sine_is_taken_up_to_its_fringe_and_beyond_it_the_reason_says_so():

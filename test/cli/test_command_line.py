@@ -227,7 +227,7 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
 
 
 @pytest.mark.parametrize('factor, words', [
-    (1.1e3, 'the gyro is in thousandths (mdeg/s, mrad/s)'),
+    (1.1e3, 'the gyro is in mdeg/s and read as deg/s'),
     (145.0, 'times what was turned: correct its unit or sensitivity')], ids=['mdeg/s', 'counts'])
 def test_a_run_in_another_unit_whose_turns_are_implausible_is_refused_for_it(
         run, log, tmp_path, factor, words):

@@ -28,7 +28,6 @@ from gyro_calibration_bench.hidden.log import ALL
 from gyro_calibration_bench.hidden.noise import (
     draw_figures, generate_noise, markov_processes, Whitening)
 from gyro_calibration_bench.hidden.size import InformationMetric
-from gyro_calibration_bench.methods import METHODS
 from gyro_calibration_bench.scores import score_case, wilson_interval
 import numpy as np
 import pytest
@@ -212,17 +211,6 @@ def test_look_alikes_are_both_named_until_a_log_separates_them(part, causes, rig
 def test_intervals_are_those_of_wilson():
     # (k + z²/2 -+ z sqrt(k (n - k) / n + z²/4)) / (n + z²), by hand for 9 of 10
     assert wilson_interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
-
-
-@pytest.mark.parametrize('method', ['greedy', 'lasso'])
-def test_a_baseline_names_a_large_effect_with_its_size(method, tmp_path):
-    log, = hide(['scale_factor_asymmetry'], 20.0, np.random.default_rng(0), noise='white',
-                duration=300.0, sample_rate=25.0)
-    causes, unexplained = METHODS[method]([log.write(tmp_path / 'log.csv')], None)
-    cause, = (each for each in causes if each.effect == 'scale_factor_asymmetry')
-    truth = log.truth['scale_factor_asymmetry']
-    assert causes[0] == cause and not unexplained
-    assert cause.size == pytest.approx(truth.size, abs=4.0 * truth.standard_deviation)
 
 
 def test_a_case_is_random_by_its_name_and_the_seed():

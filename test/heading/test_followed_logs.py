@@ -14,6 +14,7 @@ import contextlib
 from functools import cache
 import math
 
+from drives import MPU6050
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
@@ -25,7 +26,6 @@ from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.motion import motion_from_headings
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.model.presets import MPU6050
 from gyro_calibration.ros.calibration_session import ODOMETRY
 from gyro_calibration.ros.inputs import Velocity
 from heading_track import follow
