@@ -129,11 +129,10 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
-                        'sensor_msgs/Imu or another type with a rate; default: the only Imu')
+                        'sensor_msgs/Imu or geometry_msgs/Vector3Stamped; default: the only Imu')
     parser.add_argument('--reference-topic', metavar='TOPIC', help='topic of the reference in a '
-                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, '
-                        'geometry_msgs/PoseStamped, TwistStamped or another type with a rate '
-                        'or an orientation; default: none')
+                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, or of geometry_msgs '
+                        'PoseStamped, TwistStamped, TransformStamped and the like; default: none')
     parser.add_argument('--temperature-topic', metavar='TOPIC', help='topic of the temperature '
                         'in a recording; default: the name nearest to the topic of the gyro')
 
@@ -226,8 +225,7 @@ def print_message(text: object) -> None:
 
 def make_origin(paths: Iterable[str]) -> dict[str, Any]:
     """Return the origin of a model, for its file: logs, date, program."""
-    files = [{'name': to_printable(file.name),
-              **({'sha256': sha256_digest(file)} if os.path.isfile(file) else {})}
+    files = [{'name': to_printable(file.name), 'sha256': sha256_digest(file)}
              for path in paths for file in list_recording_files(path)]
     return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
             'program': f'gyro_calibration {__version__}'}

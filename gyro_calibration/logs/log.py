@@ -166,17 +166,16 @@ def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None
                  columns: Mapping[str, str], axis: str, on_progress: Callable[[int], object] | None
                  ) -> Iterator[tuple[dict[str, Any], dict[str, tuple[str, ...]], tuple[str, ...]]]:
     """Give quantity -> values in SI, other columns as text, and the notes, of each block."""
-    # after each block, `on_progress` takes the number of bytes read, unless from a pipe
+    # after each block, `on_progress` takes the number of bytes read
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
-    with _convert_read_errors(path), open_regular_file(
-            path, allow_pipes=True) as file, io.TextIOWrapper(
+    with _convert_read_errors(path), open_regular_file(path) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
         lines = _iter_lines(text)
         table, first_line = _read_header(_limit_length(lines), columns, axis)
         if table.delimiter == ' ':  # of which there may be several
             lines = (' '.join(line.split()) + '\n' for line in lines)
-        budget = ExpansionBudget(path) if compressed and file.seekable() else None
+        budget = ExpansionBudget(path) if compressed else None
         if rate is not None:
             table.columns.pop('time', None)
         while True:
@@ -197,7 +196,7 @@ def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None
             last = _refuse_unordered_time(places, arrays.get('time'), last)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
-            if on_progress is not None and file.seekable():
+            if on_progress is not None:
                 on_progress(file.tell())
             if count > 1:
                 yield arrays, others, table.notes

@@ -30,7 +30,6 @@ from itertools import chain, repeat
 import os
 from pathlib import Path
 import re
-import shutil
 import sqlite3
 import struct
 import sys
@@ -40,7 +39,7 @@ from urllib.parse import quote
 import zlib
 
 from gyro_calibration.files import describe_error, open_regular_file, remedy, to_printable
-from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
+from gyro_calibration.logs.cdr import DEFINITIONS, LAYOUTS
 from gyro_calibration.logs.columns import excerpt
 from gyro_calibration.logs.log import ExpansionBudget, LogError
 
@@ -68,25 +67,17 @@ class Message:
 class Contents:
     """Contents of a recording as far as it was read."""
 
-    #: Topic -> message type; type with known quantities -> definition.
-    topics: dict[str, str] = field(default_factory=dict)
-    definitions: dict[str, str] = field(default_factory=dict)
+    topics: dict[str, str] = field(default_factory=dict)  # topic -> message type
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     skipped_parts: int = 0  # number of parts that are damaged or too large
 
-    def add_topic(self, topic: str, kind: str, encoding: str,
-                  definition: str) -> tuple[str, str] | None:
+    def add_topic(self, topic: str, kind: str, encoding: str) -> tuple[str, str] | None:
         """Store a topic; return it with its type, or None where it has no known quantities."""
         topic, kind = excerpt(topic), excerpt(kind)
         self.topics[topic] = kind
-        if kind not in self.definitions and encoding == 'cdr':
-            with suppress(MessageError):
-                definition = DEFINITIONS.get(kind, definition)
-                if parse_layout(definition).quantities:
-                    self.definitions[kind] = definition
-        return (topic, kind) if encoding == 'cdr' and kind in self.definitions else None
+        return (topic, kind) if encoding == 'cdr' and kind in LAYOUTS else None
 
 
 def _to_short_line(text: object) -> str:
@@ -252,7 +243,7 @@ class _McapReader:
 
     def __init__(self, contents: Contents, budget: ExpansionBudget):
         self._contents, self._budget = contents, budget
-        self._schemas: dict[int, tuple[str, str]] = {}
+        self._schemas: dict[int, str] = {}  # number -> message type
         self._channels: dict[int, tuple[str, str] | None] = {}
 
     def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
@@ -275,15 +266,12 @@ class _McapReader:
                 if channel := self._channels.get(number):
                     yield Message(*channel, received, _decompress_message(body[22:], self._budget))
             elif code == _RecordCode.SCHEMA:
-                kind, place = _read_text(body, 2)
-                definition, _ = _read_text(body, _read_text(body, place)[1])
-                self._schemas[struct.unpack_from('<H', body)[0]] = kind, definition
+                self._schemas[struct.unpack_from('<H', body)[0]] = _read_text(body, 2)[0]
             elif code == _RecordCode.CHANNEL:
                 number, schema = struct.unpack_from('<HH', body)
                 topic, place = _read_text(body, 4)
-                kind, definition = self._schemas.get(schema, ('unknown', ''))
                 self._channels[number] = self._contents.add_topic(
-                    topic, kind, _read_text(body, place)[0], definition)
+                    topic, self._schemas.get(schema, 'unknown'), _read_text(body, place)[0])
             elif code == _RecordCode.METADATA:
                 name, place = _read_text(body, 0)
                 place += 4
@@ -427,13 +415,9 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
-    with _open_database(source) as (database, tables):
+    with _open_database(source) as database:
         try:
-            definitions = dict(database.execute(
-                'SELECT topic_type, encoded_message_definition FROM message_definitions')
-                if 'message_definitions' in tables else ())
-            channels = {number: contents.add_topic(str(topic), str(kind), encoding,
-                                                   str(definitions.get(kind, '')))
+            channels = {number: contents.add_topic(str(topic), str(kind), encoding)
                         for number, topic, kind, encoding in database.execute(
                             'SELECT id, name, type, serialization_format FROM topics')}
         except _DATABASE_ERRORS as error:
@@ -458,53 +442,41 @@ def _read_database(source: Path, path: Path, contents: Contents,
 
 
 @contextmanager
-def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
-    """Open a database read-only, and give it with the names of its tables of stored columns."""
-    # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
-    # count corrected. Computed columns are not read: their cost is not limited by the size of the
-    # file.
-    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
-        reason: Exception | None = None
-        for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
-            file = source
-            if mode == 'copy':
-                file, mode = Path(shutil.copy(source, folder)), 'mode=ro'
-                with open(file, 'r+b') as copy:
-                    head = copy.read(100)
-                    if len(head) == 100:
-                        size = int.from_bytes(head[16:18], 'big')
-                        size = 1 << 16 if size == 1 else max(size, 1)
-                        copy.seek(28)
-                        copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
+def _open_database(source: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database read-only."""
+    # With the journal of a killed writer, else without it. Computed columns are not read: their
+    # cost is not limited by the size of the file.
+    reason: Exception | None = None
+    for mode in ('mode=ro', 'mode=ro&immutable=1'):
+        try:
+            database = sqlite3.connect(f'file:{quote(str(source.resolve()))}?{mode}', uri=True)
+        except _DATABASE_ERRORS as error:
+            reason = error
+            continue
+        with closing(database):
             try:
-                database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
+                database.text_factory = partial(str, encoding='utf-8', errors='replace')
+                # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite.
+                # A query is ended after a million steps plus ten per byte.
+                thousands = repeat(0, source.stat().st_size // 100 + 1000)
+                database.set_progress_handler(partial(next, thousands, 1), 1000)
+                if sys.version_info >= (3, 11):
+                    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
+                database.execute('PRAGMA trusted_schema = OFF')
+                tables = {name for name, text in database.execute(
+                    "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+                    if name in ('topics', 'messages')
+                    and str(text).upper().startswith('CREATE TABLE')
+                    and not any(hidden for *_, hidden in database.execute(
+                        f'PRAGMA table_xinfo({name})'))}
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
-            with closing(database):
-                try:
-                    database.text_factory = partial(str, encoding='utf-8', errors='replace')
-                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
-                    # SQLite. A query is ended after a million steps plus ten per byte.
-                    thousands = repeat(0, file.stat().st_size // 100 + 1000)
-                    database.set_progress_handler(partial(next, thousands, 1), 1000)
-                    if sys.version_info >= (3, 11):
-                        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
-                    database.execute('PRAGMA trusted_schema = OFF')
-                    tables = {name for name, text in database.execute(
-                        "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-                        if name in ('topics', 'messages', 'message_definitions')
-                        and str(text).upper().startswith('CREATE TABLE')
-                        and not any(hidden for *_, hidden in database.execute(
-                            f'PRAGMA table_xinfo({name})'))}
-                except _DATABASE_ERRORS as error:
-                    reason = error
-                    continue
-                if not {'topics', 'messages'} <= tables:
-                    raise LogError('is a database, but not a ROS 2 recording with tables of '
-                                   'stored columns; name a recording')
-                yield database, tables
-                return
+            if len(tables) < 2:
+                raise LogError('is a database, but not a ROS 2 recording with tables of stored '
+                               'columns; name a recording')
+            yield database
+            return
     raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '
                    'name a recording, or record again')
 

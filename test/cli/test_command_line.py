@@ -304,20 +304,6 @@ def test_a_method_that_gives_no_standard_deviation_claims_none(run, compensate, 
     assert np.isnan(compensate(log, tmp_path / 'new.yaml').columns['heading_std_rad'][-1])
 
 
-def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
-    """Its checksum would block for ever, since the writer has ended."""
-    rows = ''.join(f'{rate * 0.95 + 0.1 + 0.001 * (k % 3)},{rate}\n'
-                   for rate in range(-60, 61, 10) for k in range(3))
-    os.mkfifo(tmp_path / 'log.csv')
-    with subprocess.Popen(['sh', '-c', 'cat > "$0"', tmp_path / 'log.csv'], stdin=subprocess.PIPE,
-                          text=True) as writer:
-        writer.stdin.write(f'gyro_dps,reference_rate_dps\n{rows}')
-        writer.stdin.close()
-        code, _, error = run('fit', tmp_path / 'log.csv', '--out', tmp_path / 'model.yaml')
-    assert (code == 0 and read_model(tmp_path / 'model.yaml').origin['files']
-            == [{'name': 'log.csv'}]), error
-
-
 # progress, which is shown on a terminal, with the elapsed time, and nowhere else
 
 class Terminal(io.StringIO):
