@@ -105,10 +105,9 @@ def run(given: argparse.Namespace) -> Answer:
                      for name, label in COMPONENT_LABELS.items() if name in value.components]
             texts.append(f'  {value.name}: {value.format_interval(value.mean)}; '
                          f'{", ".join(parts)}')
-            if not value.is_slow:
-                texts.append('    ' + '; '.join(
-                    f'unit {to_printable(name)} {value.format_interval(interval)}'
-                    for name, interval in value.units.items()))
+            texts.append('    ' + '; '.join(
+                f'unit {to_printable(name)} {value.format_interval(interval)}'
+                for name, interval in value.units.items()))
         texts += [f'  {text}.' for text in describe_type(found)]
         lines += ['', *(wrap_line(each, 2 + len(each) - len(each.lstrip())) for each in texts)]
     data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),

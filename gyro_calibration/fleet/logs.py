@@ -11,16 +11,13 @@
 """
 The logs of a fleet: of which unit, type and drive each is, and its record.
 
-Unit, type and drive are in a table, in notes or in the names of files. The record has
-the calibration and the diagnosis. A single log does not distinguish slow effects (a ramp, a
-warm-up, the temperature) from the wander of the bias. Each is fitted alone with scale factor error
-and bias, to the increments of the heading over spans, with the noise of `noise_grid`. An effect
-repeats over many logs, wander does not.
+Unit, type and drive are in a table, in notes or in the names of files. The record has the
+calibration and the diagnosis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import asdict, dataclass, replace
@@ -49,12 +46,11 @@ from gyro_calibration.files import (
     write_atomically)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import find_delimiter
-from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES
-from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
+from gyro_calibration.logs.log import DataRefused, Log, QUANTITIES
+from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.logs.recording import read_file
 from gyro_calibration.logs.ros_bag import list_recording_files
-from gyro_calibration.model.channels import channels_from_log
-from gyro_calibration.model.effects import BIAS, CATALOGUE
+from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -251,41 +247,12 @@ def _read_notes(path: str) -> dict[str, str]:
 
 # the record of a log
 
-#: Shortest log for slow effects and for the bias at rest, s: in less, white noise hides them.
-_MIN_LOG_DURATION = 60.0
+#: Shortest log for the bias at rest, s: in less, white noise hides its wander.
+_MIN_REST_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Schema of the records; records of another one are not read.
-_SCHEMA = 'gyro_calibration/fleet_log/2'
-
-
-def _fit_spans(log: Log, time_offset: float, heading: tuple[Array, Array] | None) -> tuple[
-        Array, Callable[..., tuple[float, float]]]:
-    """Return edges of spans of a log, s, and a fit of its headings over them; none at rest."""
-    output = np.asarray(log.output)
-    known = np.isfinite(output)
-    time = np.asarray(log.time)[known] - time_offset
-    # 60 spans of at least 2 s
-    edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
-    turns: list[Array] = []
-    rate = np.zeros(len(edges))
-    if heading is not None:
-        place = np.searchsorted(heading[0], edges).clip(0, len(heading[0]) - 1)
-        edges = heading[0][np.unique(place)]
-        true = np.interp(edges, *heading)
-        turns = [np.diff(true)]
-        rate = np.gradient(true, edges) if len(true) > 1 else 0.0 * true
-    increments = np.diff(np.interp(edges, time, integrate(time, output[known])))
-    noise = heading_noise(edges, rate)[:None if turns else 1]
-
-    def fit(*column: Array) -> tuple[float, float]:
-        """Fit scale factor error, bias and a column; return the last value and its deviation."""
-        found = fit_noise_grid(
-            increments, np.column_stack([*turns, np.diff(edges), *column]), noise,
-            *bias_wander_columns(edges), wandering_value=len(turns))
-        return float(found.values[-1]), float(found.deviations[-1])
-
-    return edges, fit
+_SCHEMA = 'gyro_calibration/fleet_log/3'
 
 
 def _duration(log: Log) -> float:
@@ -294,31 +261,18 @@ def _duration(log: Log) -> float:
     return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
 
 
-def fit_slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]]:
-    """Return the slow effects of a log in time, by name; the gyro lags its reference, if any."""
-    assert log.time is not None
-    heading = None
-    if log.reference_heading is not None and np.isfinite(log.reference_heading).sum() > 1:
-        known = np.isfinite(log.reference_heading)
-        heading = log.time[known], log.reference_heading[known]
-    elif log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        heading = log.time, integrate(log.time, bridge_gaps(log.reference_rate))
-    if _duration(log) < _MIN_LOG_DURATION:
-        return {}
-    edges, fit = _fit_spans(log, time_offset, heading)
-    if len(edges) < 10:
-        return {}
-    channels, fits = channels_from_log(log), {}
-    for name, cause, *shapes in (  # the same time constants, s, for all logs, as they are pooled
-            ('rate_ramp', 'rate_ramp'), ('warm_up_60s', 'warm_up', 60.0),
-            ('warm_up_300s', 'warm_up', 300.0), ('bias_temperature', 'bias_temperature', 25.0)):
-        effect = CATALOGUE[cause]
-        (column,) = effect.columns(channels, *shapes)
-        if np.ptp(column) > 0.0:  # False with nan
-            angle = np.interp(edges, log.time, integrate(log.time, column))
-            fits[name] = _value_record(*fit(np.diff(angle)), effect.coefficients[0].unit)
-    return {name: each for name, each in fits.items()
-            if math.isfinite(each['deviation']) and each['deviation'] > 0.0}
+def _fit_rest(log: Log) -> tuple[float, float]:
+    """Return the bias of a log at rest, and its standard deviation beside its wander, rad/s."""
+    output = np.asarray(log.output)
+    known = np.isfinite(output)
+    time = np.asarray(log.time)[known]
+    # 60 spans of at least 2 s
+    edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
+    increments = np.diff(np.interp(edges, time, integrate(time, output[known])))
+    found = fit_noise_grid(increments, np.diff(edges)[:, None],
+                           heading_noise(edges, np.zeros(len(edges)))[:1],
+                           *bias_wander_columns(edges), wandering_value=0)
+    return float(found.values[0]), float(found.deviations[0])
 
 
 @dataclass(frozen=True)
@@ -352,8 +306,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
     ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
     ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
-    ``slow`` the same of effects that a single log does not distinguish from the wander of the
-    bias, each fitted alone; ``diagnosis`` is a summary.
+    ``diagnosis`` is a summary.
     """
     try:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
@@ -416,7 +369,6 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
         'reason': '', 'method': method, 'samples': len(log),
         'duration_s': None if log.time is None else float(log.time[-1] - log.time[0]),
         'values': values,
-        'slow': {} if log.time is None else fit_slow_effects(log, offset[0] if offset else 0.0),
         'noise': {name: float(value) for name, value in vars(model.noise).items()},
         'diagnosis': None, 'page': ''}
     if task.generator is None:
@@ -455,10 +407,10 @@ def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[flo
     if log.time is None or log.reference_rate is not None or log.reference_heading is None:
         refuse_unusable(log)
         if log.time is not None and is_at_rest(log):
-            if _duration(log) < _MIN_LOG_DURATION:
-                raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for '
+            if _duration(log) < _MIN_REST_DURATION:
+                raise DataRefused(f'rests for less than {_MIN_REST_DURATION:.0f} s: record for '
                                   'longer')
-            bias, deviation = _fit_spans(log, 0.0, None)[1]()
+            bias, deviation = _fit_rest(log)
             walk = (white_noise_deviation(log.output, order=1)
                     * math.sqrt(float(np.median(np.diff(log.time)))))
             return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),

@@ -27,7 +27,7 @@ from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.report import (
     Chart, draw_chart, element, join_markup, Line, Markup, render_page)
 from gyro_calibration.diagnosis.words import (
-    as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
+    as_sentence, display_unit, format_amount, format_quantity, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm, DRIVES, find_changes, find_outlying_groups, Interval, Observations, OWN_SHARE,
@@ -51,7 +51,6 @@ class _ValueSummary:
 
     name: str
     unit: str  # of the value, in SI
-    is_slow: bool  # an effect that one log does not distinguish from the wander of the bias
     records: Sequence[_LogRecord]  # of the logs that hold it
     components: Mapping[str, Interval]  # standard deviations
     mean: Interval  # of the type
@@ -98,20 +97,19 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
     """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
-    values = {}  # the names in more than one log, and whether each is a slow effect
+    values = {}  # the names in more than one log
     for kind in types:
-        names = [(name, key == 'slow') for each in logs[kind] for key in ('values', 'slow')
-                 for name in each[key]]
+        names = [name for each in logs[kind] for name in each['values']]
         values[kind] = [name for name in dict.fromkeys(names) if names.count(name) > 1]
-    # four tests of each value: outlying units, outlying drives, changes, effects of the type; and
-    # three of the effects of diagnoses: of the type, of a unit, of a drive
-    tests = 4 * sum(map(len, values.values())) + 3 * len(types)
+    # three tests of each value: outlying units, outlying drives, changes; and three of the effects
+    # of diagnoses: of the type, of a unit, of a drive
+    tests = 3 * sum(map(len, values.values())) + 3 * len(types)
     summaries = []
     for kind in types:
         found = {}
-        for value, slow in values[kind]:
+        for value in values[kind]:
             try:
-                found[value] = _summarize_value(value, slow, logs[kind], FALSE_ALARM_RATE / tests)
+                found[value] = _summarize_value(value, logs[kind], FALSE_ALARM_RATE / tests)
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
         units, drives = (_names(logs[kind], key) for key in ('unit', 'drive'))
@@ -126,15 +124,14 @@ def _names(records: Sequence[_LogRecord], key: str) -> list[str]:
                   key=lambda text: (len(text) if text.isdigit() else 0, text))
 
 
-def _summarize_value(name: str, slow: bool, records: Sequence[_LogRecord],
+def _summarize_value(name: str, records: Sequence[_LogRecord],
                      significance: float) -> _ValueSummary:
-    key = 'slow' if slow else 'values'
-    records = [each for each in records if name in each[key]]
+    records = [each for each in records if name in each['values']]
     units, drives, dates = (_names(records, kind) for kind in ('unit', 'drive', 'date'))
     unit, drive, day = (
         np.array([names.index(str(each[kind])) if each[kind] else -1 for each in records])
         for kind, names in (('unit', units), ('drive', drives), ('date', dates)))
-    value, deviation = (np.array([each[key][name][what] for each in records])
+    value, deviation = (np.array([each['values'][name][what] for each in records])
                         for what in ('value', 'deviation'))
     # age, years, and temperature, K, less their means, where they vary within units
     columns = {}
@@ -164,7 +161,7 @@ def _summarize_value(name: str, slow: bool, records: Sequence[_LogRecord],
     found_drives = pooled.estimate(drive=np.arange(len(drives)),
                                    fixed=np.zeros((len(drives), len(mean))))
     return _ValueSummary(
-        name, records[0][key][name]['unit'], slow, records, pooled.components, of_type(mean),
+        name, records[0]['values'][name]['unit'], records, pooled.components, of_type(mean),
         float(pooled.p_value(fixed=mean[None])[0]), of_type(mean, units=1.0, power_ons=1.0),
         of_units(mean), of_units(0.0 * mean), of_units(mean, power_ons=1.0),
         _by_name(drives, found_drives) if DRIVES in pooled.variance_names else {},
@@ -192,7 +189,7 @@ def describe_type(summary: _TypeSummary) -> Iterator[str]:
         label = readable_name(value.name)
         shares = {name: value.components[name] for name in meanings if name in value.components}
         owner = max(shares, key=lambda name: shares[name].value, default='')
-        if owner and shares[owner].low > 0.0 and not value.is_slow:
+        if owner and shares[owner].low > 0.0:
             yield f'{label} {meanings[owner]}'
         for alarms, who, differs, of in (
                 (value.outlying_units, 'unit', 'differs from its type by', ''),
@@ -204,16 +201,6 @@ def describe_type(summary: _TypeSummary) -> Iterator[str]:
                 yield (f'{label}: {who} {to_printable(alarm.name)} {differs} '
                        f'{format_amount(alarm.size, value.unit, value.name)}{since}{of} '
                        f'(probability {alarm.p_value:.1g})')
-    slow = [each for each in summary.values.values() if each.is_slow]
-    if repeating := find_missing_effects(summary):
-        first, *others = repeating
-        names = join_list([readable_name(each.name) for each in others], 'or')
-        alternatives = f'; not distinguishable from {names}' if others else ''
-        yield (f'{readable_name(first.name)}: it repeats in all units, so the model of the type '
-               f'lacks it: {first.format_interval(first.mean)}{alternatives}')
-    elif slow:
-        yield (f'{join_list([readable_name(each.name) for each in slow])}: none repeats; in '
-               'single logs they are the random walk of the bias')
     for count in count_effects(summary):
         name = to_printable(count.name)
         of_type = ('the references of all drives have it' if count.effect.startswith('reference_')
@@ -223,13 +210,6 @@ def describe_type(summary: _TypeSummary) -> Iterator[str]:
                   'drive': f'assigned to drive {name}, its reference or its vehicle'}
         yield (f'{readable_name(count.effect)}: established in {count.logs} of {count.of} logs, '
                f'of {count.units} of {len(summary.units)} units: {origin[count.owner]}')
-
-
-def find_missing_effects(summary: _TypeSummary) -> list[_ValueSummary]:
-    """Return the slow effects that repeat in all units, the most significant first."""
-    slow = [each for each in summary.values.values()
-            if each.is_slow and each.p_value < summary.significance]
-    return sorted(slow, key=lambda each: each.p_value)
 
 
 @dataclass(frozen=True)
@@ -292,7 +272,7 @@ def data(summary: _TypeSummary) -> dict[str, Any]:
                 OWN_SHARE: 'own_share_of_errors',
                 **{name: f'between_units_over_{over}' for name, over in zip(SLOPES, value.slopes)}}
         values[value.name] = {
-            'unit': value.unit, 'slow': value.is_slow, 'logs': len(value.records),
+            'unit': value.unit, 'logs': len(value.records),
             **{keys[name]: {'estimate': part.value, 'ci95': [part.low, part.high]}
                for name, part in value.components.items()},
             'type_mean': _interval_data(value.mean), 'new_unit': _interval_data(value.new_unit),
@@ -311,7 +291,6 @@ def data(summary: _TypeSummary) -> dict[str, Any]:
     return {'type': summary.name, 'units': list(summary.units), 'drives': list(summary.drives),
             'logs': len(summary.records), 'level': summary.significance, 'values': values,
             'effects': [asdict(each) for each in count_effects(summary)],
-            'lacking': [each.name for each in find_missing_effects(summary)],
             'sentences': list(describe_type(summary))}
 
 
@@ -333,7 +312,7 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
         terms, variances, tolerances = [], [], {'bias': 0.0, 'scale_factor_error': 0.0}
         for name, each in summary.values.items():
             # the time offset of logs is that of their references
-            if each.is_slow or name not in CATALOGUE or name == 'time_offset':
+            if name not in CATALOGUE or name == 'time_offset':
                 continue
             effect, found = CATALOGUE[name], each.next_power_on.get(unit, each.new_unit)
             # of the normal distribution with this interval
@@ -407,16 +386,16 @@ def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
     items = [element('li', as_sentence(text)) for text in describe_type(summary)]
     yield element('section', element('h2', name), element('ul', *items), variances)
 
-    values = [each for each in of_type if not each.is_slow]
     alarms = {'stands out': {alarm.name for each in of_type for alarm in each.outlying_units},
               'changed': {alarm.name for each in of_type for alarm in each.changes}}
     logs = Counter(each['unit'] for each in summary.records)
-    of_units = _table(['unit', 'logs', *(readable_name(each.name) for each in values), 'remark'], [
+    heads = ['unit', 'logs', *(readable_name(each.name) for each in of_type), 'remark']
+    of_units = _table(heads, [
         [_cell(unit), _cell(str(logs[unit]), logs[unit]),
-         *(_interval_cell(each, each.units.get(unit)) for each in values),
+         *(_interval_cell(each, each.units.get(unit)) for each in of_type),
          _cell(', '.join(text for text, names in alarms.items() if unit in names))]
         for unit in summary.units])
-    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
+    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in of_type]
     drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
               for each in of_type if each.drives]
     for heading, charts, text, more in (
@@ -468,7 +447,7 @@ def log_table(records: Sequence[Mapping[str, Any]]) -> str:
         rows.append({key: record.get(key) for key in (
             'log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')})
-        for name, value in (record.get('values', {}) | record.get('slow', {})).items():
+        for name, value in record.get('values', {}).items():
             rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
     columns = dict.fromkeys(key for row in rows for key in row)
     return format_rows([columns, *([row.get(key) for key in columns] for row in rows)])

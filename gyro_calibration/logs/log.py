@@ -54,9 +54,7 @@ NORMAL_QUANTILE_975 = 1.96
 CACHE_BLOCK_SAMPLES = 1 << 15
 BLOCK_ROWS = 1 << 16  # rows in a block of a log
 MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
-#: Largest number of characters of a line; and of notes and header, of a block of lines, or of a
-#: row that spans several lines.
-_MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24
+_MAX_LINE_LENGTH = 1 << 16  # characters
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
@@ -171,23 +169,13 @@ def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None
     with _convert_read_errors(path), open_regular_file(path) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
-        lines = _iter_lines(text)
-        table, first_line = _read_header(_limit_length(lines), columns, axis)
+        lines = _iter_lines(text, ExpansionBudget(path) if compressed else None)
+        table, first_line = _read_header(lines, columns, axis)
         if table.delimiter == ' ':  # of which there may be several
             lines = (' '.join(line.split()) + '\n' for line in lines)
-        budget = ExpansionBudget(path) if compressed else None
         if rate is not None:
             table.columns.pop('time', None)
-        while True:
-            block, length = list[str](), 0  # fewer lines where they are long
-            while (length < _MAX_BLOCK_LENGTH and (
-                    more := list(itertools.islice(lines, min(BLOCK_ROWS - len(block), 256))))):
-                block += more
-                length += sum(map(len, more))
-            if not block:
-                break
-            if budget:
-                budget.spend(sum(map(len, block)))
+        while block := list(itertools.islice(lines, BLOCK_ROWS)):
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
@@ -236,27 +224,19 @@ def _convert_read_errors(path: str | Path) -> Iterator[None]:
                        'wanted a CSV file, .csv or .csv.gz') from error
 
 
-def _iter_lines(text: io.TextIOWrapper) -> Iterator[str]:
+def _iter_lines(text: io.TextIOWrapper, budget: ExpansionBudget | None) -> Iterator[str]:
     """Give the lines of a file, without empty ones at its end."""
     empty: list[str] = []
     for line in iter(partial(text.readline, _MAX_LINE_LENGTH + 1), ''):
-        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _MAX_BLOCK_LENGTH:
+        if budget:
+            budget.spend(len(line))
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < BLOCK_ROWS:
             empty.append(line)
             continue
         if len(line) > _MAX_LINE_LENGTH:
             raise csv.Error(f'a line has more than {_MAX_LINE_LENGTH} characters')
         yield from empty
         empty.clear()
-        yield line
-
-
-def _limit_length(lines: Iterator[str]) -> Iterator[str]:
-    left = _MAX_BLOCK_LENGTH
-    for line in lines:
-        left -= len(line)
-        if left < 0:
-            raise csv.Error(f'a row, or what is before the first, has more than '
-                            f'{_MAX_BLOCK_LENGTH} characters')
         yield line
 
 
@@ -326,8 +306,7 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
 def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_line: int,
                      table: _FileHeader) -> _ParsedRows:
     """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
-    reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines)),
-                        delimiter=table.delimiter)
+    reader = csv.reader(itertools.chain(lines, remaining_lines), delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):

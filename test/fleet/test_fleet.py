@@ -317,8 +317,8 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
             and change.size == pytest.approx(3.0, abs=0.5))
 
 
-def records(ramp=0.0):
-    """Return records of five units on four drives, in which a ramp repeats or only wanders."""
+def records():
+    """Return records of five units on four drives."""
     generator = np.random.default_rng(9)
     off = 0.1 * np.arange(4)
 
@@ -329,30 +329,27 @@ def records(ramp=0.0):
          'date': '', 'temperature': None, 'diagnosis': None, 'page': '',
          'noise': {'angle_random_walk': 1e-4},
          'values': {'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
-                    'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
-         'slow': {'rate_ramp': of(ramp + generator.standard_normal(), 1.0, 'rad/s²')}}
+                    'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')}}
         for unit in range(5) for drive in range(4)]
 
 
-@pytest.mark.parametrize(('ramp', 'said'), [(0.0, 'none repeats'), (12.0, 'the type lacks it')])
-def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
-    (found,) = summarize_types(records(ramp))
+def test_each_value_is_laid_to_the_unit_or_the_reference():
+    (found,) = summarize_types(records())
     told = '; '.join(describe_type(found))
     assert 'bias is an error of the unit' in told
     assert 'time offset is an error of the reference' in told
-    assert said in told and 'differs from its type' not in told
+    assert 'differs from its type' not in told
     json.dumps(data(found), allow_nan=False)
 
 
 @pytest.mark.parametrize('unit', ['0', '4'])
 def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
     """As where one gyro rested only: by name the first one or the last."""
-    logs = [{**each, 'values': {'bias': each['values']['bias']}, 'slow': {}}
+    logs = [{**each, 'values': {'bias': each['values']['bias']}}
             if each['unit'] == unit else each for each in records()]
     (found,) = summarize_types(logs)
     assert set(found.values['bias'].units) == {*'01234'}
     assert set(found.values['time_offset'].units) == {*'01234'} - {unit}
-    assert set(data(found)['values']['rate_ramp']['units']) == {*'01234'} - {unit}
     assert set(dict(build_models(found))) == {'', *'01234'}
     assert unit in render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
 
@@ -378,7 +375,7 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
     """Over age all drift alike."""
     generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
     slopes = 1e-4 * (2.0 + generator.standard_normal(8))
-    logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '', 'slow': {},
+    logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '',
              'date': str(date(2026, 1, 1) + timedelta(365.25 * age)), 'temperature': temperature,
              'values': {'bias': {'value': unit + slope * temperature + 2e-3 * age
                                  + 1e-4 * generator.standard_normal(), 'deviation': 1e-5,
