@@ -34,7 +34,8 @@ from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX
 from gyro_calibration.heading.log_compensation import (
     LogCompensation, no_plausible_row_message, plausible_rows, rows_of, smooth_track)
 from gyro_calibration.heading.tracker import TrackerSettings
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
+from gyro_calibration.logs.log import (
+    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, Mask, select_rows, write_log_blocks)
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model
@@ -217,16 +218,17 @@ class CompensatedBlock:
 
 def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
                           found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
+    log = verb.read(given)
     if given.rest or given.hindsight:
-        log = verb.read(given)
         with verb.show_progress('heading'):
             blocks = iter([track_log(log, model, given.hindsight, given.log)])
     else:
         threshold = Threshold(given.threshold * DEGREE,
                               angle_random_walk=model.noise.angle_random_walk)
-        # what is interpolated to the stamps needs the whole log
-        logs = [verb.read(given)] if model.moves_stamps else verb.read_blocks(given)
-        blocks = integrate_log(logs, model, threshold)
+        # in blocks, which limit the memory, unless rates are interpolated to the stamps
+        size = len(log) if model.moves_stamps else BLOCK_ROWS
+        blocks = integrate_log((select_rows(log, slice(begin, begin + size))
+                                for begin in range(0, len(log), size)), model, threshold)
     for piece in check_finite(blocks, given.log):
         found.add(piece)
         yield piece.log, piece.full_columns()

@@ -24,10 +24,9 @@ from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.report import (
-    Chart, draw_chart, element, join_markup, Line, Markup, render_page)
+from gyro_calibration.diagnosis.report import element, join_markup, Markup, render_page
 from gyro_calibration.diagnosis.words import (
-    as_sentence, display_unit, format_amount, format_quantity, readable_name)
+    as_sentence, format_amount, format_quantity, readable_name)
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm, DRIVES, find_changes, find_outlying_groups, Interval, Observations, OWN_SHARE,
@@ -363,14 +362,13 @@ def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[s
     body = join_markup(
         element('header', element('p', 'Fleet', class_='about'), element('h1', title),
                 element('p', about, class_='gained') if about else None),
-        element('main', *(part for place, found in enumerate(types)
-                          for part in _type_sections(found, f't{place}')),
+        element('main', *(part for found in types for part in _type_sections(found)),
                 element('section', element('h2', 'Logs'), _table(heads, rows))),
         Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
     return render_page(f'Fleet: {title}', body)
 
 
-def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
+def _type_sections(summary: _TypeSummary) -> Iterator[Markup]:
     name, of_type = summary.name or 'Type not stated', summary.values.values()
     per, drifts = {'age': '/year', 'temperature': '/K'}, any(each.slopes for each in of_type)
     heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
@@ -395,18 +393,12 @@ def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
          *(_interval_cell(each, each.units.get(unit)) for each in of_type),
          _cell(', '.join(text for text, names in alarms.items() if unit in names))]
         for unit in summary.units])
-    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in of_type]
-    drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
-              for each in of_type if each.drives]
-    for heading, charts, text, more in (
-            ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
-             of_units),
-            ('drives', drives, 'An error that all units of a drive have in common is assigned to '
-             'its reference or to the vehicle.', None)):
-        if charts or more:
-            yield element('section', element('h2', f'{name}: {heading}'),
-                          element('p', text, class_='quiet'),
-                          element('div', *map(draw_chart, charts), class_='pairs'), more)
+    yield element('section', element('h2', f'{name}: units'), of_units)
+    if any(each.drives for each in of_type):
+        heads = ['drive', *(readable_name(each.name) for each in of_type)]
+        yield element('section', element('h2', f'{name}: drives'), _table(heads, [
+            [_cell(drive), *(_interval_cell(each, each.drives.get(drive)) for each in of_type)]
+            for drive in summary.drives]))
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
@@ -424,20 +416,6 @@ def _cell(text: str, key: float | None = None) -> Markup:
 def _interval_cell(value: _ValueSummary, interval: Interval | None) -> Markup:
     return (_cell('') if interval is None
             else _cell(value.format_interval(interval), interval.value))
-
-
-def _interval_chart(value: _ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
-                    style: str) -> Chart:
-    unit, factor = display_unit(value.unit, value.name)
-    low, high = (np.array([getattr(each, end) for each in intervals.values()])
-                 for end in ('low', 'high'))
-    lines = [Line(kind, style, 0.5 * factor * (high + low),
-                  0.5 * factor * (high - low) / NORMAL_QUANTILE_975, draw_dots=True)]
-    return Chart(f'{key}-{value.name}-{kind}s', f'{readable_name(value.name)} by {kind}',
-                 f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
-                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(intervals)}.',
-                 kind, '', np.arange(1.0, len(intervals) + 1.0), readable_name(value.name), unit,
-                 lines, x_names=list(intervals))
 
 
 def log_table(records: Sequence[Mapping[str, Any]]) -> str:

@@ -146,20 +146,6 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     return Log(**arrays, notes=notes, others=others)
 
 
-def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-                    columns: Mapping[str, str] = {}, axis: str = 'z',
-                    on_progress: Callable[[int], object] | None = None) -> Iterator[Log]:
-    """
-    Read a log file as `read_log`, in blocks, so that memory does not grow with its length.
-
-    A block has `BLOCK_ROWS` rows; the last one may have fewer, as may blocks with texts that span
-    lines. The columns name no attitude, which needs the whole log.
-    """
-    for arrays, others, notes in _read_blocks(path, sensitivity, rate, columns, axis,
-                                              on_progress):
-        yield Log(**arrays, notes=notes, others=others)
-
-
 def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None,
                  columns: Mapping[str, str], axis: str, on_progress: Callable[[int], object] | None
                  ) -> Iterator[tuple[dict[str, Any], dict[str, tuple[str, ...]], tuple[str, ...]]]:

@@ -42,7 +42,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, Motion, motion_from_headings, motion_from_rates, MotionError, read_motion)
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
+from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.ros.inputs import (
     Clock, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
 from gyro_calibration.ros.state_store import StateStore
@@ -416,8 +416,8 @@ class CalibrationSession:
             if run.end_reason:
                 raise DataRefused(run.end_reason)
             now = datetime.fromtimestamp(self._clock.date(), timezone.utc)
-            noise = estimator.model.noise
-            calibration, remark = fit_run(run, noise, now.isoformat(timespec='seconds'),
+            calibration, remark = fit_run(run, estimator.model.noise,
+                                          now.isoformat(timespec='seconds'),
                                           estimator.model.prior_deviations)
             if run.kind == REST:  # the scale factor error in use is kept
                 used = estimator.current_model.self_calibration
@@ -428,13 +428,11 @@ class CalibrationSession:
                 calibration = replace(
                     calibration, scale_factor_error=last.scale_factor_error,
                     covariance=((known[0][0], 0.0), (0.0, calibration.covariance[1][1])))
-            difference = describe_change(estimator.current_calibration, calibration, noise,
-                                         estimator.bias_age(now.timestamp()))
             trouble = self._store.store_calibration(calibration)
             estimator.use_calibration(self._store.model, now.timestamp())
             self._monitor.reset_biases()
             return True, '; '.join(filter(None, [
-                f'{calibration}, from {len(run.times)} samples', remark, difference, trouble]))
+                f'{calibration}, from {len(run.times)} samples', remark, trouble]))
         except DataRefused as error:
             cause = drive.describe_lateness(run.limits) if drive and not run.end_reason else ''
             return False, f'{cause} (the run shows: {error})' if cause else str(error)

@@ -324,7 +324,7 @@ def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypat
     assert re.search(r' 50 %  search \.\.\.  \d+ s.*\r +\r$', stream.getvalue(), re.DOTALL)
 
 
-# Logs of any length, which compensate reads in blocks
+# Long logs, which compensate processes in blocks
 
 POLYNOMIAL = (
     '\neffects:\n  rate_temperature_polynomial:\n'
@@ -334,15 +334,6 @@ POLYNOMIAL = (
     'noise: {angle_random_walk: 7.3e-4}\n'
     'self_calibration: {scale_factor_error: 0.01, bias: 0.001, '
     'covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}\n')
-
-#: Runs the program and then prints the peak memory of the process, KiB.
-_MEASURED = """
-import resource, sys
-from gyro_calibration.cli.main import main
-code = main(sys.argv[1:])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-sys.exit(code)
-"""
 
 
 def write_robot(path, rows):
@@ -364,23 +355,9 @@ def polynomial(tmp_path):
     return path
 
 
-def test_the_memory_does_not_grow_with_the_log(polynomial, tmp_path):
-    peaks = []
-    for rows in (100_000, 400_000):
-        write_robot(tmp_path / 'log.csv', rows)
-        words = ['compensate', 'log.csv', '--model', polynomial, '--out', 'out.csv',
-                 '--threshold', '0.3']
-        done = subprocess.run([sys.executable, '-c', _MEASURED, *map(str, words)],
-                              capture_output=True, text=True, cwd=tmp_path)
-        assert done.returncode == 0 and f'{rows} rows compensated' in done.stdout, done.stderr
-        assert not done.stderr, 'a bar is for a terminal only'
-        peaks.append(int(done.stdout.split()[-1]) / 1024)
-    assert peaks[1] < peaks[0] + 14.0, 'MiB; half of what 300 000 more rows of twelve numbers are'
-
-
 @pytest.fixture
 def small_blocks(monkeypatch):
-    monkeypatch.setattr('gyro_calibration.cli.verb.BLOCK_ROWS', 300)
+    monkeypatch.setattr('gyro_calibration.cli.compensate.BLOCK_ROWS', 300)
     monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', 300)
 
 

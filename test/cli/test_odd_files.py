@@ -28,7 +28,7 @@ from conftest import strict
 from gyro_calibration.files import to_printable, write_atomically
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.cdr import IMU
-from gyro_calibration.logs.log import Log, LogError, read_log, read_log_blocks, write_log
+from gyro_calibration.logs.log import Log, LogError, read_log, write_log
 from gyro_calibration.logs.ros_bag import Contents, read_messages
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.model_file import ModelError, read_model, write_model
@@ -77,13 +77,12 @@ each_kind = pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('read, error, name', [
     (lambda path: read_log(path), LogError, 'a.csv'),
     (lambda path: read_log(path), LogError, 'a.csv.gz'),
-    (lambda path: list(read_log_blocks(path)), LogError, 'a.csv'),
     (lambda path: read_model(path), ModelError, 'a.yaml'),
     (lambda path: read_motion(path), MotionError, 'a.csv'),
     (lambda path: list(read_messages(path, Contents())), LogError, 'a.mcap'),
     (lambda path: list(read_messages(path, Contents())), LogError, 'a.mcap.zstd'),
     (lambda path: list(read_messages(path, Contents())), LogError, 'a.db3'),
-], ids=['log', 'packed log', 'log in blocks', 'model', 'motion', 'mcap', 'packed mcap', 'db3'])
+], ids=['log', 'packed log', 'model', 'motion', 'mcap', 'packed mcap', 'db3'])
 def test_what_is_no_file_is_not_read(read, error, name, kind, tmp_path):
     KINDS[kind](tmp_path / name)
     before = len(os.listdir('/proc/self/fd'))

@@ -62,20 +62,12 @@ def draw_drive(path):
                                                     'compensated': np.sin(time) + 0.001 * time})
 
 
-def draw_encoder(path):
-    time = np.linspace(0.0, 10.0, 50)
-    true = 3.0 * np.sin(time)
-    return draw_headings(path, time, true, {
-        'not calibrated': true + 0.01 * time, 'calibrated': true + 1e-4 * np.sin(5.0 * time)},
-        'course over ground', is_apart=True)
-
-
 PICTURES = {
     'turns': lambda path: draw_turns(path, warm()),
     'turns without temperature': lambda path: draw_turns(path, without_temperature()),
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
-    'headings': draw_drive, 'encoder': draw_encoder}
+    'headings': draw_drive}
 
 
 @pytest.fixture(scope='module')

@@ -575,9 +575,7 @@ def test_calibrate_bias_keeps_the_scale_factor_error(tmp_path):
     assert rig.calibrate()[0]
     before = stored(rig)
     rig.robot.bias = 0.02
-    success, message = rig.calibrate(REST)
-    assert success and 'the bias changed by' in message, message
-    assert 'more than the model predicts' in message, message
+    assert rig.calibrate(REST)[0]
     assert stored(rig).bias == pytest.approx(0.02, abs=4e-4)
     assert stored(rig).scale_factor_error == before.scale_factor_error
     assert stored(rig).standard_deviations[0] == pytest.approx(before.standard_deviations[0])
