@@ -17,7 +17,7 @@ names each column with its unit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv
 from dataclasses import dataclass, field, replace
@@ -568,34 +568,29 @@ def refuse_wrapped(log: Log) -> None:
                           f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
 
 
-def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
+def write_log(path: str | Path, log: Log, more: Mapping[str, Array] = {}) -> None:
     """
     Write a log, .csv or .csv.gz, in SI columns and its other columns, atomically.
 
     `more` holds further columns: name -> array of shape (n,).
     """
-    write_log_blocks(path, [(log, more or {})])
-
-
-def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
-    """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
+    columns: dict[str, Any] = {
+        name: getattr(log, quantity) for name, (quantity, factor) in COLUMNS.items()
+        if factor == 1.0 and getattr(log, quantity) is not None}
+    texts = {name: list(map(_normalize_newlines, texts)) for name, texts in log.others.items()}
+    columns |= texts | {name: np.asarray(values, dtype=float) for name, values in more.items()}
     with (open_replacement(path) as file,
           # without a time, so that the same log gives the same file
           gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
           if str(path).endswith('.gz') else nullcontext(file) as data):
-        for number, (log, more) in enumerate(blocks):
-            columns: dict[str, Sequence[Any]] = {
-                name: getattr(log, quantity).tolist()
-                for name, (quantity, factor) in COLUMNS.items()
-                if factor == 1.0 and getattr(log, quantity) is not None}
-            columns |= {name: list(map(_normalize_newlines, texts))
-                        for name, texts in log.others.items()}
-            columns |= {name: np.asarray(values, dtype=float).tolist()
-                        for name, values in more.items()}
-            notes = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
-            head = '' if number else notes + format_rows([columns])
-            data.write((head + format_rows(zip(*columns.values()))).encode(
-                'utf-8', 'backslashreplace'))
+        text = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
+        text += format_rows([columns])
+        for begin in range(0, len(log), BLOCK_ROWS):
+            parts = (each[begin:begin + BLOCK_ROWS] for each in columns.values())
+            text += format_rows(zip(*(part if isinstance(part, list) else part.tolist()
+                                      for part in parts)))
+            data.write(text.encode('utf-8', 'backslashreplace'))
+            text = ''
 
 
 def _normalize_newlines(text: str) -> str:
