@@ -31,7 +31,7 @@ from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.fleet.logs import find_logs, LogTask, process_log
 from gyro_calibration.fleet.pooling import (
     DRIVES, Observations, PooledValue, POWER_ONS, SLOPES, UNITS)
-from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.run import process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
     build_models, count_effects, summarize_types)
 from gyro_calibration.heading.integration import integrate
@@ -288,31 +288,23 @@ def smallest(generator: Generator, fleets: int = 20) -> Iterator[str]:
         yield f'| {units} | {np.mean(sizes):.3g} | {np.mean(sizes) * np.sqrt(units):.3g} |'
 
 
-def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
-    """Give the cost of a task, the memory of the coordinator, and what killed workers cost."""
-    yield ('| logs | killed workers | survived | CPU a log, ms: alone, worker, coordinator | '
-           'memory, MB |')
-    yield '|---:|---:|---:|---:|---|'
-    for count, fatal in ((logs, False), (logs // 10, True)):
-        last = {(2 * each + 1) * count // (2 * killed) for each in range(killed * fatal)}
-        given = [-1 - number if number in last else number for number in range(count)]
-        alone = [_alone()]
-        begin = time.process_time()
-        done_, lost, memory, used = 0, 0, [], {}
-        with process_executors(2, preload=['fleet', 'processes']) as create:
-            for _, found in run_tasks(calibrate, iter(given), 2, create):
-                lost += isinstance(found, WorkerLost)
-                done_ += not isinstance(found, WorkerLost)
-                if not isinstance(found, WorkerLost):
-                    used[found[1]] = found[2]
-                if (done_ + lost) % max(count // 4, 1) == 0:
-                    memory.append(resident_memory() / 1e6)
-        own = time.process_time() - begin
-        alone.append(_alone())  # a busy machine is slower at one time than at another
-        cost = [1e3 * each for each in (np.mean(alone), sum(used.values()) / count, own / count)]
-        yield (f'| {count} | {lost} | {done_} of {count - len(last)} | '
-               f'{", ".join(f"{each:.2f}" for each in cost)} | '
-               f'{", ".join(f"{each:.0f}" for each in memory)} |')
+def scale(_: Generator, logs: int = 10_000) -> Iterator[str]:
+    """Give the cost of a task, and the memory of the coordinator."""
+    yield '| logs | CPU a log, ms: alone, worker, coordinator | memory, MB |'
+    yield '|---:|---:|---|'
+    alone = [_alone()]
+    begin = time.process_time()
+    memory, used = [], {}
+    with process_executor(2, preload=['fleet', 'processes']) as executor:
+        for number, (_, found) in enumerate(run_tasks(calibrate, range(logs), 2, executor), 1):
+            used[found[1]] = found[2]
+            if number % max(logs // 4, 1) == 0:
+                memory.append(resident_memory() / 1e6)
+    own = time.process_time() - begin
+    alone.append(_alone())  # a busy machine is slower at one time than at another
+    cost = [1e3 * each for each in (np.mean(alone), sum(used.values()) / logs, own / logs)]
+    yield (f'| {logs} | {", ".join(f"{each:.2f}" for each in cost)} | '
+           f'{", ".join(f"{each:.0f}" for each in memory)} |')
 
 
 def _alone(logs: int = 500) -> float:

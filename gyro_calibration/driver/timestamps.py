@@ -173,9 +173,9 @@ class _LatenessTest:
         self.step, self._least = 0.0, math.inf
         # least lateness of arrivals that were not late, since the start of a window
         self._least_on_time, self._window_start = math.inf, -math.inf
-        self.first_number = self._last_arrival = self._last_silence = 0.0
+        self._last_arrival = 0.0
 
-    def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
+    def is_loss_proven(self, lateness: float, bound: float, arrival: float,
                        period: float) -> bool:
         """Add an arrival; tell whether all since `late_since` have been late, by `step`, s."""
         if lateness <= bound:
@@ -185,11 +185,9 @@ class _LatenessTest:
             self._least_on_time = min(self._least_on_time, lateness)
             return False
         silence, self._last_arrival = arrival - self._last_arrival, arrival
-        # Lateness before a silence does not show losses in the silence. Silences of one length
-        # are the period of samples whose rate fell.
-        usual, self._last_silence = max(period, self._last_silence), silence
-        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * usual):
-            self.late_since, self.first_number, self._least = arrival, number, math.inf
+        # Lateness before a silence does not show losses in the silence.
+        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
+            self.late_since, self._least = arrival, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
         # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
         # to a period and falls to zero. So its step is tested, and itself after a longer time.
@@ -296,14 +294,11 @@ class SampleClock:
                 self.lost_count -= self._newly_lost
             if unit != 1:
                 self._restart_line()
-        elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, number, arrival,
-                                                    period):
+        elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, arrival, period):
             lost = unit * math.floor(self._lateness.step / (unit * period) + 0.25)
             begin, self._lateness.late_since = self._lateness.late_since, None
             assert begin is not None
-            has_slowed = ((number - self._lateness.first_number) * self._line.slope
-                          < 0.5 * (arrival - begin))
-            if lost and not has_slowed:
+            if lost:
                 self._uncertain_since = begin
                 return self._renumber(lost)
             self._restart_line()

@@ -11,22 +11,18 @@
 """
 From the records of logs to the errors of the type, the unit and the reference.
 
-They are sentences, data, models, one page that needs nothing else, and a table of the logs.
+They are sentences, data, models, and a table of the logs.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
 import math
-from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.report import element, join_markup, Markup, render_page
-from gyro_calibration.diagnosis.words import (
-    as_sentence, format_amount, format_quantity, readable_name)
+from gyro_calibration.diagnosis.words import format_amount, format_quantity, readable_name
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm, DRIVES, find_changes, find_outlying_groups, Interval, Observations, OWN_SHARE,
@@ -332,90 +328,6 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
             gyro={name: text for name, text in gyro.items() if text},
             origin={'fleet': {'units': 1 if unit else len(summary.units), 'logs': len(logs)}},
             tolerance=Tolerance(**tolerances))
-
-
-# the page, and a table for other programs
-
-def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
-    used = sum(len(found.records) for found in types)
-    title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
-             f'{len(types)} {"type" if len(types) == 1 else "types"}')
-    about = f'{len(records) - used} more logs are excluded.' if used < len(records) else None
-    names = list(dict.fromkeys(name for each in records for name in each.get('values', ())))
-    heads = ['log', 'type', 'unit', 'drive', 'date', *map(readable_name, names), 'diagnosis',
-             'remark']
-    rows = []
-    for each in records:
-        file = each['log'].rpartition('/')[2]
-        link = element('a', file, href=each['page']) if each.get('page') else file
-        cells = []
-        for name in names:
-            value = each.get('values', {}).get(name)
-            cells.append(_cell('') if value is None else _cell(format_quantity(
-                Estimate.from_half_width(value['value'], NORMAL_QUANTILE_975 * value['deviation'],
-                                         value['unit']), name), value['value']))
-        rows.append([element('td', link, data_key=file),
-                     *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *cells,
-                     _cell((each.get('diagnosis') or {}).get('verdict', '')),
-                     _cell(each['reason'])])
-    body = join_markup(
-        element('header', element('p', 'Fleet', class_='about'), element('h1', title),
-                element('p', about, class_='gained') if about else None),
-        element('main', *(part for found in types for part in _type_sections(found)),
-                element('section', element('h2', 'Logs'), _table(heads, rows))),
-        Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
-    return render_page(f'Fleet: {title}', body)
-
-
-def _type_sections(summary: _TypeSummary) -> Iterator[Markup]:
-    name, of_type = summary.name or 'Type not stated', summary.values.values()
-    per, drifts = {'age': '/year', 'temperature': '/K'}, any(each.slopes for each in of_type)
-    heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
-             *(['drift'] if drifts else [])]
-    variances = _table(heads, [
-        [_cell(readable_name(each.name)), _interval_cell(each, each.mean),
-         _interval_cell(each, each.new_unit),
-         *(_cell(each.format_component(part), each.components[part].value
-                 if part in each.components else -1.0) for part in COMPONENT_LABELS),
-         *([_cell('; '.join(each.format_interval(slope, per[over])
-                            for over, slope in each.slopes.items()))] if drifts else [])]
-        for each in of_type])
-    items = [element('li', as_sentence(text)) for text in describe_type(summary)]
-    yield element('section', element('h2', name), element('ul', *items), variances)
-
-    alarms = {'stands out': {alarm.name for each in of_type for alarm in each.outlying_units},
-              'changed': {alarm.name for each in of_type for alarm in each.changes}}
-    logs = Counter(each['unit'] for each in summary.records)
-    heads = ['unit', 'logs', *(readable_name(each.name) for each in of_type), 'remark']
-    of_units = _table(heads, [
-        [_cell(unit), _cell(str(logs[unit]), logs[unit]),
-         *(_interval_cell(each, each.units.get(unit)) for each in of_type),
-         _cell(', '.join(text for text, names in alarms.items() if unit in names))]
-        for unit in summary.units])
-    yield element('section', element('h2', f'{name}: units'), of_units)
-    if any(each.drives for each in of_type):
-        heads = ['drive', *(readable_name(each.name) for each in of_type)]
-        yield element('section', element('h2', f'{name}: drives'), _table(heads, [
-            [_cell(drive), *(_interval_cell(each, each.drives.get(drive)) for each in of_type)]
-            for drive in summary.drives]))
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
-    """Return a table to sort; one of many rows is scrolled and has a search field."""
-    head = element('tr', *(element('th', each, scope='col') for each in heads))
-    table = element('table', element('thead', head),
-                    element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
-    return element('div', table, class_=f'scroll fold{" tall" * (len(rows) > 12)}', tabindex='0')
-
-
-def _cell(text: str, key: float | None = None) -> Markup:
-    return element('td', text, data_key=text if key is None else f'{key:.9g}')
-
-
-def _interval_cell(value: _ValueSummary, interval: Interval | None) -> Markup:
-    return (_cell('') if interval is None
-            else _cell(value.format_interval(interval), interval.value))
 
 
 def log_table(records: Sequence[Mapping[str, Any]]) -> str:

@@ -130,27 +130,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     be a comma.
     `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
     """
-    blocks, numbers = [], 0
-    for block in _read_blocks(path, sensitivity, rate, columns, axis, on_progress):
-        arrays, others, notes = block
-        numbers += len(next(iter(arrays.values()))) * (len(arrays) + 10 * len(others))
-        if numbers > _MAX_LOG_VALUES:
-            raise LogError(f'{path}: has more than {_MAX_LOG_VALUES} numbers, which is above the '
-                           'limit of memory; split it')
-        blocks.append(block)
-    arrays = {quantity: np.concatenate([block[0][quantity] for block in blocks])
-              for quantity in arrays}
-    others = {name: tuple(itertools.chain.from_iterable(block[1][name] for block in blocks))
-              for name in others}
-    _replace_attitude(arrays, axis)
-    return Log(**arrays, notes=notes, others=others)
-
-
-def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None,
-                 columns: Mapping[str, str], axis: str, on_progress: Callable[[int], object] | None
-                 ) -> Iterator[tuple[dict[str, Any], dict[str, tuple[str, ...]], tuple[str, ...]]]:
-    """Give quantity -> values in SI, other columns as text, and the notes, of each block."""
-    # after each block, `on_progress` takes the number of bytes read
+    blocks: list[tuple[dict[str, Any], dict[str, tuple[str, ...]]]] = []
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
     with _convert_read_errors(path), open_regular_file(path) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
@@ -165,6 +145,9 @@ def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
+            if count * (len(arrays) + 10 * len(others)) > _MAX_LOG_VALUES:
+                raise LogError(f'has more than {_MAX_LOG_VALUES} numbers, which is above the '
+                               'limit of memory; split it')
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
             last = _refuse_unordered_time(places, arrays.get('time'), last)
@@ -172,11 +155,16 @@ def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None
                 arrays['output'] = arrays['counts'] * sensitivity
             if on_progress is not None:
                 on_progress(file.tell())
-            if count > 1:
-                yield arrays, others, table.notes
+            blocks.append((arrays, others))
         if count < 2:
             raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
                            'more')
+    arrays = {quantity: np.concatenate([part[quantity] for part, _ in blocks])
+              for quantity in arrays}
+    _replace_attitude(arrays, axis)
+    return Log(**arrays, notes=table.notes, others={
+        name: tuple(itertools.chain.from_iterable(texts[name] for _, texts in blocks))
+        for name in others})
 
 
 class ExpansionBudget:

@@ -68,8 +68,7 @@ def test_a_verb_has_help_with_an_example_and_follows_the_technology_or_says_why_
 #: A command line, and what its answer says; an unset variable of the shell is an empty argument.
 WRONG = {
     **{words: f'perhaps {near} is meant' for words, near in {
-        'compnsate log.csv': 'compensate', 'allan log.csv --unwarp': '--unwrap',
-        'fit log.csv --technology mem': 'mems', 'fit log.csv --effects bais': 'bias',
+        'fit log.csv --effects bais': 'bias',
         'allan log.csv --columns tim=t': 'time', 'allan log.csv --columns gyro=w:deg/sec': 'deg/s',
         'allan log.csv --columns gyro=gyro_dsp': 'gyro_dps',
         'compensate log.csv --model bais.yaml --out x.csv': 'bias',
