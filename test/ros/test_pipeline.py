@@ -495,36 +495,6 @@ def test_samples_that_come_late_from_one_publisher_are_lost_samples(tmp_path, sh
     assert abs(error) < 4.0 * deviation < 0.3 * len(rig.outputs) * max(share, 1e-3) * DEGREE
 
 
-@pytest.mark.parametrize('share, seed', [(0.0, 0), (0.03, 1), (0.1, 2), (0.1, 3)])
-def test_a_link_that_swaps_samples_from_the_start_on_leaves_the_heading_known(
-        tmp_path, share, seed):
-    rig, waiting = Rig(tmp_path, model=CERTAIN), []
-    sample, generator = rig.sample, np.random.default_rng(seed)
-
-    def swap(*reading):
-        if not waiting and (generator.random() < share or len(rig.truth) == 1):
-            waiting.append(reading)
-            return
-        sample(*reading)
-        while waiting:
-            sample(*waiting.pop())
-    rig.sample = swap
-    rig.go(5.0)
-    assert not rig.pipeline.conflict and not rig.journal.counts['restarts']
-    assert rig.outputs[-1].heading_variance < (1.0 * DEGREE) ** 2
-
-
-@pytest.mark.parametrize('seconds', [0.0, 3.0], ids=['from the start on', 'later'])
-@pytest.mark.parametrize('offset', [0.025, 0.03, 0.031, 0.037])
-def test_two_gyros_a_few_intervals_apart_on_one_topic_are_not_late_samples(
-        tmp_path, offset, seconds):
-    rig = rested(tmp_path, seconds=seconds)
-    for _ in range(30):
-        rig.step()
-        rig.sample(max(rig.truth) + round(1e9 * offset), 0.0)
-    assert 'jump back repeatedly' in rig.pipeline.conflict
-
-
 def test_a_queue_that_is_stamped_on_arrival_is_no_stamp_that_stands_still(tmp_path, reported):
     rig = rested(tmp_path)
     rig.go(2.0)
