@@ -28,7 +28,8 @@ from typing import Any
 
 from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.fleet.logs import find_logs, LogTask, process_log
+from gyro_calibration.fleet.logs import (
+    compile_file_pattern, find_logs, LogTask, process_log)
 from gyro_calibration.fleet.pooling import (
     DRIVES, Observations, PooledValue, POWER_ONS, SLOPES, UNITS)
 from gyro_calibration.fleet.run import process_executor, run_tasks
@@ -102,7 +103,8 @@ def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
 def _processed(folder: str, out: str) -> list[dict[str, Any]]:
     """Return the records of the drives; what `fleet` has done in `out` is not done again."""
     with tempfile.TemporaryDirectory() as new:
-        return [process_log(LogTask(entry, out or new))
+        pattern = compile_file_pattern('{drive}_unit{unit}')
+        return [process_log(LogTask(entry, out or new, file_pattern=pattern))
                 for entry in find_logs([f'{folder}/rc_car_*'])]
 
 

@@ -43,9 +43,6 @@ _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock dri
 _SETTLING_DURATION = 2.0
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-#: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz
-#: on: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
-_MIN_LATENESS = 0.5e-3
 #: Largest lateness with a correct sequence, s, above the 16 ms of a burst. Without it, stamps at
 #: 1 kHz are 5.6 ms off instead of 0.06 ms where the host is later by 10 ms for 5 s of each 15 s.
 _OUTLIER_LATENESS = 0.02
@@ -241,8 +238,7 @@ class SampleClock:
         line, number, before, numbers = self._line, self._last_number, self.lost_count, []
         for following, sample in zip(reversed(range(len(samples))), samples):
             # the largest advance to a sample that has arrived
-            margin = (0.5 * max(self.period, _MIN_LATENESS) if self.is_settled
-                      else _OUTLIER_LATENESS)
+            margin = 0.5 * self.period if self.is_settled else _OUTLIER_LATENESS
             left = (arrival + margin - line.value_at(number)) / line.slope
             advance, lost = self._counter.advance(
                 sample, max(left, 1.5 * self._counter.mean_advance) if line.points else math.inf,
@@ -285,7 +281,7 @@ class SampleClock:
         unit, period = self._counter.ambiguity, self.period
         lateness = arrival - self._line.value_at(number)
         # After a restart of the sequence, all samples are off by the same part of it.
-        bound = max(period, _MIN_LATENESS) if unit < 2 else max(3.0 * period, _OUTLIER_LATENESS)
+        bound = period if unit < 2 else max(3.0 * period, _OUTLIER_LATENESS)
         if lateness < -0.5 * bound:
             excess = unit and unit * round(-lateness / (unit * period))
             if excess and excess <= self._uncertain_losses:

@@ -11,7 +11,7 @@
 """
 The logs of a fleet: of which unit, type and drive each is, and its record.
 
-Unit, type and drive are in a table, in notes or in the names of files. The record has the
+Unit, type and drive are in a table, in the names of files, or in notes. The record has the
 calibration and the diagnosis.
 """
 
@@ -60,14 +60,9 @@ _ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 _LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
-#: Notes and names, such as "unit: 7" and rc_car_h_unit1.csv.gz.
+#: Notes, such as "unit: 7".
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)
-_FILE_NAME_PATTERNS = {
-    'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
-    'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
-    'drive': re.compile(r'(?:^|[_.-])drive[_-]?([A-Za-z0-9]+)', re.IGNORECASE)
-}
 
 
 @dataclass(frozen=True)
@@ -214,19 +209,12 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
 
 def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None) -> FleetLog:
     """Return an entry with its empty fields filled from file name or notes."""
-    # in order of precedence: table, pattern of the user, notes, usual file names
+    # in order of precedence: table, pattern of the user, notes
     stem = re.sub(f'({"|".join(map(re.escape, sorted(_LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
         entry = entry.fill_missing(found.groupdict())
-    stated, rest = {}, stem
-    for name, shape in _FILE_NAME_PATTERNS.items():
-        if found := shape.search(rest):
-            stated[name] = found[1]
-            rest = rest.replace(found[0], '')
-    if 'unit' in stated and rest.strip('_.-'):  # the rest of the name is the drive
-        stated.setdefault('drive', rest.strip('_.-'))
-    return entry.fill_missing(_read_notes(entry.log)).fill_missing(stated)
+    return entry.fill_missing(_read_notes(entry.log))
 
 
 def _read_notes(path: str) -> dict[str, str]:
