@@ -35,7 +35,7 @@ from gyro_calibration.fleet.logs import (
     compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
 from gyro_calibration.fleet.run import cluster_executor, process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
-    build_models, COMPONENT_LABELS, describe_type, log_table, summarize_types)
+    build_models, COMPONENT_LABELS, describe_type, log_table, summarize_types, TypeSummary)
 from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
@@ -107,19 +107,7 @@ def run(given: argparse.Namespace) -> Answer:
     with show_progress('units, types and references'):
         types = summarize_types(used)
     for found in types:
-        counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
-            (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
-        texts = [f'{found.name or "Type not stated, pooled as one"}: {counts}.']
-        for value in found.values.values():
-            parts = [f'{label} {value.format_component(name)}'
-                     for name, label in COMPONENT_LABELS.items() if name in value.components]
-            texts.append(f'  {value.name}: {value.format_interval(value.mean)}; '
-                         f'{", ".join(parts)}')
-            texts.append('    ' + '; '.join(
-                f'unit {to_printable(name)} {value.format_interval(interval)}'
-                for name, interval in value.units.items()))
-        texts += [f'  {text}.' for text in describe_type(found)]
-        lines += ['', *(wrap_line(each, 2 + len(each) - len(each.lstrip())) for each in texts)]
+        lines += ['', *_type_lines(found)]
     data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),
             'false_alarm_rate': FALSE_ALARM_RATE,
             'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in excluded],
@@ -140,6 +128,21 @@ def run(given: argparse.Namespace) -> Answer:
         write_atomically(Path(given.out) / name, text)
     lines += ['', f'Written to {given.out}: {", ".join(names)}.']
     return Answer(lines, data)
+
+
+def _type_lines(found: TypeSummary) -> Iterator[str]:
+    counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
+        (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
+    texts = [f'{found.name or "Type not stated, pooled as one"}: {counts}.']
+    for value in found.values.values():
+        parts = [f'{label} {value.format_component(name)}'
+                 for name, label in COMPONENT_LABELS.items() if name in value.components]
+        texts.append(f'  {value.name}: {value.format_interval(value.mean)}; {", ".join(parts)}')
+        texts.append('    ' + '; '.join(
+            f'unit {to_printable(name)} {value.format_interval(interval)}'
+            for name, interval in value.units.items()))
+    texts += [f'  {text}.' for text in describe_type(found)]
+    yield from (wrap_line(each, 2 + len(each) - len(each.lstrip())) for each in texts)
 
 
 @contextmanager

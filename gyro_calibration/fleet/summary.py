@@ -77,7 +77,7 @@ class _ValueSummary:
 
 
 @dataclass(frozen=True)
-class _TypeSummary:
+class TypeSummary:
     """The results of one type."""
 
     name: str  # or ''
@@ -88,7 +88,7 @@ class _TypeSummary:
     significance: float  # probability of a false alarm of each kind and value
 
 
-def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
+def summarize_types(records: Sequence[_LogRecord]) -> list[TypeSummary]:
     """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
@@ -108,8 +108,8 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
         units, drives = (_names(logs[kind], key) for key in ('unit', 'drive'))
-        summaries.append(_TypeSummary(kind, units, drives, logs[kind], found,
-                                      FALSE_ALARM_RATE / tests))
+        summaries.append(TypeSummary(kind, units, drives, logs[kind], found,
+                                     FALSE_ALARM_RATE / tests))
     return summaries
 
 
@@ -174,7 +174,7 @@ def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
             for name, *parts in zip(names, *vars(found).values())}
 
 
-def describe_type(summary: _TypeSummary) -> Iterator[str]:
+def describe_type(summary: TypeSummary) -> Iterator[str]:
     """Give the sentences on the origin of each value, its outliers and its changes."""
     meanings = {UNITS: 'is an error of the unit: most of its variance is between units',
                 DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
@@ -220,7 +220,7 @@ class _EffectCount:
     chance: float  # p-value of the number of logs under false alarms only, times the candidates
 
 
-def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
+def count_effects(summary: TypeSummary) -> list[_EffectCount]:
     """
     Assign the established effects of diagnoses by the numbers of logs that show them.
 
@@ -260,7 +260,7 @@ def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
     return result
 
 
-def data(summary: _TypeSummary) -> dict[str, Any]:
+def data(summary: TypeSummary) -> dict[str, Any]:
     values = {}
     for value in summary.values.values():
         keys = {UNITS: 'between_units', POWER_ONS: 'between_power_ons', DRIVES: 'between_drives',
@@ -295,7 +295,7 @@ def _interval_data(interval: Interval) -> dict[str, Any]:
             'ci95': ends if all(map(math.isfinite, ends)) else None}
 
 
-def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
+def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     """
     Give for a further unit of a type, with the name '', and for each unit: name and model.
 
