@@ -202,36 +202,33 @@ class StampDelay:
         return ''
 
 
-_STEADY_STAMPS = 24  # late ones in a row at equal intervals, which have a clock of their own
+_STEADY_STAMPS = 24  # late ones at equal intervals, which have a clock of their own
 
 
 class ArrivalOrder:
     """
     Order of the stamps of one publisher, of which some may come late: after a later one.
 
-    Three late ones in a row that increase are those of a clock that was set back. Late ones at
-    equal intervals, up to a factor of two, while others come in between are of a second gyro.
+    Three late ones in a row are those of a clock that was set back. Late ones at equal intervals,
+    up to a factor of two, while others come in between are of a second gyro.
     """
 
     def __init__(self) -> None:
-        self.has_two_clocks, self._last, self._in_time_count = False, -1, 0
-        # stamps of late ones, ns, and the number of those in time so far
-        self._late = deque[tuple[int, int]](maxlen=_STEADY_STAMPS)
+        self.has_two_clocks, self._last, self._late_in_a_row = False, -1, 0
+        self._late = deque[int](maxlen=_STEADY_STAMPS)  # stamps, ns
 
     def is_late(self, stamp: int) -> bool:
         """Add a stamp, ns, and tell whether it is late; not if its clock was set back."""
-        if stamp >= self._last:
-            self._last, self._in_time_count = stamp, self._in_time_count + 1
+        self._late_in_a_row += 1
+        if stamp >= self._last or self._late_in_a_row > 2:
+            if stamp < self._last:
+                self._late.clear()
+            self._last, self._late_in_a_row = stamp, 0
             return False
-        self._late.append((stamp, self._in_time_count))
-        late, counts = np.array(self._late).T
-        apart = np.diff(late)
-        self.has_two_clocks = bool(len(late) == _STEADY_STAMPS and counts[0] < counts[-1]
+        self._late.append(stamp)
+        apart = np.diff(self._late)
+        self.has_two_clocks = bool(len(self._late) == _STEADY_STAMPS
                                    and 0 < apart.max() < 2 * apart.min())
-        if len(late) > 2 and counts[-3] == counts[-1] and (apart[-2:] > 0).all():
-            self._last = stamp
-            self._late.clear()
-            return False
         return True
 
 

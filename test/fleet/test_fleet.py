@@ -142,7 +142,7 @@ def test_a_worker_that_is_killed_ends_the_run_and_one_without_memory_does_not():
     assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
     assert found == {number: number for number in {*numbers} - {TAKES_ALL_MEMORY}}
     with process_executor(2) as executor, pytest.raises(BrokenExecutor):
-        list(run_tasks(task, range(10), 2, executor))
+        list(run_tasks(task, [KILLS], 2, executor))
 
 
 def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
