@@ -243,17 +243,13 @@ DONE, NO_EVIDENCE = 'done', 'no evidence'
 _SCHEMA = 'gyro_calibration/fleet_log/3'
 
 
-def _duration(log: Log) -> float:
-    """Return the time from the first to the last output, s; 0 with less than 100 of them."""
-    time = np.asarray(log.time)[np.isfinite(np.asarray(log.output))]
-    return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
-
-
 def _fit_rest(log: Log) -> tuple[float, float]:
     """Return the bias of a log at rest, and its standard deviation beside its wander, rad/s."""
     output = np.asarray(log.output)
     known = np.isfinite(output)
     time = np.asarray(log.time)[known]
+    if len(time) < 100 or time[-1] - time[0] < _MIN_REST_DURATION:
+        raise DataRefused(f'rests for less than {_MIN_REST_DURATION:.0f} s: record for longer')
     # 60 spans of at least 2 s
     edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
     increments = np.diff(np.interp(edges, time, integrate(time, output[known])))
@@ -395,9 +391,6 @@ def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[flo
     if log.time is None or log.reference_rate is not None or log.reference_heading is None:
         refuse_unusable(log)
         if log.time is not None and is_at_rest(log):
-            if _duration(log) < _MIN_REST_DURATION:
-                raise DataRefused(f'rests for less than {_MIN_REST_DURATION:.0f} s: record for '
-                                  'longer')
             bias, deviation = _fit_rest(log)
             walk = (white_noise_deviation(log.output, order=1)
                     * math.sqrt(float(np.median(np.diff(log.time)))))
