@@ -71,7 +71,7 @@ setup(
     packages=find_packages(include=[
         name, f'{name}.*', f'{name}_reproduction', f'{name}_bench*'
     ]), package_data={
-        name: ['py.typed'], f'{name}.diagnosis': ['report.html'], f'{name}.fleet': ['tables.html']
+        name: ['py.typed'], f'{name}.diagnosis': ['report.html']
     }, python_requires='>=3.10,<3.15', install_requires=[
         'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'
     ], extras_require={

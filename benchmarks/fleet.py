@@ -9,11 +9,11 @@
 # under the License.
 
 """
-A fleet: predicted drives, variances, alarms, smallest effects, slow effects, scale and priors.
+A fleet: predicted drives, variances, alarms, smallest effects, scale and priors.
 
     python benchmarks/fleet.py drives FOLDER [OUT]    # rc_car_*.csv.gz of the wheeled drives
     python benchmarks/fleet.py first FOLDER [OUT]     # 20 s of each, with and without a prior
-    python benchmarks/fleet.py variances slopes alarms smallest slow scale prior
+    python benchmarks/fleet.py variances slopes alarms smallest scale prior
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from typing import Any
 
 from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.fleet.logs import find_logs, fit_slow_effects, LogTask, process_log
+from gyro_calibration.fleet.logs import (
+    compile_file_pattern, find_logs, LogTask, process_log)
 from gyro_calibration.fleet.pooling import (
     DRIVES, Observations, PooledValue, POWER_ONS, SLOPES, UNITS)
-from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.run import process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
-    build_models, count_effects, find_missing_effects, summarize_types)
+    build_models, count_effects, summarize_types)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, read_log, select_rows
@@ -102,7 +103,8 @@ def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
 def _processed(folder: str, out: str) -> list[dict[str, Any]]:
     """Return the records of the drives; what `fleet` has done in `out` is not done again."""
     with tempfile.TemporaryDirectory() as new:
-        return [process_log(LogTask(entry, out or new))
+        pattern = compile_file_pattern('{drive}_unit{unit}')
+        return [process_log(LogTask(entry, out or new, file_pattern=pattern))
                 for entry in find_logs([f'{folder}/rc_car_*'])]
 
 
@@ -238,28 +240,23 @@ def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
                    UNITS, DRIVES, POWER_ONS)) + ' |')
 
 
-def _records(generator: Generator, units: int, drives: int, effect: float = 0.0
-             ) -> list[dict[str, Any]]:
+def _records(generator: Generator, units: int, drives: int) -> list[dict[str, Any]]:
     """Return records of a fleet without outliers, with false alarms in 1 % of the diagnoses."""
     found = []
     size = {'bias': (0.4, 0.01, 0.01, 0.02), 'scale_factor_error': (0.3, 0.6, 0.1, 0.4),
             'time_offset': (0.0, 0.4, 0.02, 0.002)}
     values = {name: drawn(generator, (units, drives, *each, 0.5))[0]
               for name, each in size.items()}
-    values |= {name: drawn(generator, (units, drives, 0.0, 0.0, 0.3, 1.0, 1.0))[0]
-               for name in ('rate_ramp', 'warm_up_60s')}
     for place in range(units * drives):
         unit, drive = divmod(place, drives)
-        of = {name: {'value': float(each.value[place]) + (
-            0.0 if name in size else effect - 3.0), 'deviation': float(each.deviation[place]),
-            'unit': '1'} for name, each in values.items()}
+        of = {name: {'value': float(each.value[place]),
+                     'deviation': float(each.deviation[place]), 'unit': '1'}
+              for name, each in values.items()}
         false = ([{'effect': f'effect_{generator.integers(5)}', 'status': 'established'}]
                  if generator.random() < 0.01 else [])
         found.append({'log': str(place), 'unit': str(unit), 'type': '', 'drive': str(drive),
                       'date': f'2026-01-{drive + 1:02d}', 'temperature': None, 'noise': {},
-                      'diagnosis': {'findings': false}, 'values': {
-                          name: of[name] for name in size},
-                      'slow': {name: each for name, each in of.items() if name not in size}})
+                      'diagnosis': {'findings': false}, 'values': of})
     return found
 
 
@@ -271,10 +268,9 @@ def alarms(generator: Generator, fleets: int = 100) -> Iterator[str]:
         found = 0
         for _ in range(fleets):
             (each,) = summarize_types(_records(generator, units, count))
-            found += bool(find_missing_effects(each)) or any(
-                one.owner for one in count_effects(each)) or any(
-                    one.outlying_units or one.outlying_drives or one.changes
-                    for one in each.values.values())
+            found += any(one.owner for one in count_effects(each)) or any(
+                one.outlying_units or one.outlying_drives or one.changes
+                for one in each.values.values())
         yield (f'| {units}, {count} | {fleets} | {found} | '
                f'{100.0 * beta.ppf(0.95, found + 1, fleets - found):.1f} % |')
 
@@ -294,64 +290,23 @@ def smallest(generator: Generator, fleets: int = 20) -> Iterator[str]:
         yield f'| {units} | {np.mean(sizes):.3g} | {np.mean(sizes) * np.sqrt(units):.3g} |'
 
 
-def _log(generator: Generator, ramp: float) -> Log:
-    """Return 10 min beside an exact reference, with a bias that walks, and a ramp."""
-    times = np.arange(0.0, 600.0, 0.1)
-    rate = 0.5 * np.sin(2.0 * np.pi * times / 20.0)
-    walk = 2e-6 * np.cumsum(generator.standard_normal(len(times)))
-    output = rate + walk + ramp * times + 1e-3 * generator.standard_normal(len(times))
-    heading = np.concatenate([[0.0], np.cumsum(0.05 * (rate[1:] + rate[:-1]))])
-    return Log(time=times, output=output, reference_heading=heading)
-
-
-def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]:
-    """Give how often a ramp is found by one log and by ten, and none where it is wander."""
-    ramp = 'rate_ramp'
-    level = 0.01
-    usual = [fit_slow_effects(_log(generator, 0.0))[ramp]['deviation'] for _ in range(10)]
-    size = 1.2 * 4.8 * float(np.median(usual))
-    yield f'A ramp of 1.2 times 4.8 deviations of a usual log, {size:.2g} rad/s².'
-    yield ''
-    yield '| ramp | found in single logs | found by ten |'
-    yield '|---|---:|---:|'
-    for name, each in (('the same in all logs', size), ('half of that', 0.5 * size),
-                       ('a quarter', 0.25 * size), ('none: wander', 0.0)):
-        single, pooled_found = 0, 0
-        for _ in range(fleets):
-            found = [fit_slow_effects(_log(generator, each))[ramp] for _ in range(logs)]
-            value, sigma = (np.array([one[what] for one in found])
-                            for what in ('value', 'deviation'))
-            single += int(np.sum(np.abs(value) > 2.576 * sigma))
-            pooled = PooledValue(Observations(value, sigma, np.arange(logs), np.full(logs, -1)))
-            pooled_found += bool(pooled.p_value()[0] < level)
-        yield f'| {name} | {single} of {fleets * logs} | {pooled_found} of {fleets} |'
-
-
-def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
-    """Give the cost of a task, the memory of the coordinator, and what killed workers cost."""
-    yield ('| logs | killed workers | survived | CPU a log, ms: alone, worker, coordinator | '
-           'memory, MB |')
-    yield '|---:|---:|---:|---:|---|'
-    for count, fatal in ((logs, False), (logs // 10, True)):
-        last = {(2 * each + 1) * count // (2 * killed) for each in range(killed * fatal)}
-        given = [-1 - number if number in last else number for number in range(count)]
-        alone = [_alone()]
-        begin = time.process_time()
-        done_, lost, memory, used = 0, 0, [], {}
-        with process_executors(2, preload=['fleet', 'processes']) as create:
-            for _, found in run_tasks(calibrate, iter(given), 2, create):
-                lost += isinstance(found, WorkerLost)
-                done_ += not isinstance(found, WorkerLost)
-                if not isinstance(found, WorkerLost):
-                    used[found[1]] = found[2]
-                if (done_ + lost) % max(count // 4, 1) == 0:
-                    memory.append(resident_memory() / 1e6)
-        own = time.process_time() - begin
-        alone.append(_alone())  # a busy machine is slower at one time than at another
-        cost = [1e3 * each for each in (np.mean(alone), sum(used.values()) / count, own / count)]
-        yield (f'| {count} | {lost} | {done_} of {count - len(last)} | '
-               f'{", ".join(f"{each:.2f}" for each in cost)} | '
-               f'{", ".join(f"{each:.0f}" for each in memory)} |')
+def scale(_: Generator, logs: int = 10_000) -> Iterator[str]:
+    """Give the cost of a task, and the memory of the coordinator."""
+    yield '| logs | CPU a log, ms: alone, worker, coordinator | memory, MB |'
+    yield '|---:|---:|---|'
+    alone = [_alone()]
+    begin = time.process_time()
+    memory, used = [], {}
+    with process_executor(2, preload=['fleet', 'processes']) as executor:
+        for number, (_, found) in enumerate(run_tasks(calibrate, range(logs), 2, executor), 1):
+            used[found[1]] = found[2]
+            if number % max(logs // 4, 1) == 0:
+                memory.append(resident_memory() / 1e6)
+    own = time.process_time() - begin
+    alone.append(_alone())  # a busy machine is slower at one time than at another
+    cost = [1e3 * each for each in (np.mean(alone), sum(used.values()) / logs, own / logs)]
+    yield (f'| {logs} | {", ".join(f"{each:.2f}" for each in cost)} | '
+           f'{", ".join(f"{each:.0f}" for each in memory)} |')
 
 
 def _alone(logs: int = 500) -> float:
@@ -387,7 +342,7 @@ def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
                f'{100 * np.mean(held[1]):.0f} % |')
 
 
-PARTS = {each.__name__: each for each in (variances, slopes, alarms, smallest, slow, scale, prior)}
+PARTS = {each.__name__: each for each in (variances, slopes, alarms, smallest, scale, prior)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -19,7 +19,7 @@ are not possible `InputError`; all of them are a `ValueError` whose text says wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 import math
@@ -32,8 +32,7 @@ from gyro_calibration.calibration.selection import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import plots
 from gyro_calibration.cli.allan import find_noise_figures, NoiseFigures
-from gyro_calibration.cli.compensate import (
-    check_finite, CompensatedBlock, integrate_log, track_log)
+from gyro_calibration.cli.compensate import CompensatedLog, integrate_log, track_log
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import Fitted
 from gyro_calibration.cli.self_calibrate import calibrate_run, Run
@@ -180,7 +179,7 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     """
     _require_logs(log)
     _require_model(model)
-    return _make_headings(log, integrate_log([log], model, Threshold(0.0)))
+    return _make_headings(log, integrate_log(log, model, Threshold(0.0), 'the log'))
 
 
 def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
@@ -204,12 +203,11 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     if not model.noise.angle_random_walk:
         raise InputError('the model has no angle random walk, by which rests are found; '
                          'allan finds it in a log at rest')
-    return _make_headings(log, iter([track_log(log, model, hindsight, 'the log')]))
+    return _make_headings(log, track_log(log, model, hindsight, 'the log'))
 
 
-def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
-    (block,) = check_finite(blocks, 'the log')
-    columns = block.full_columns()
+def _make_headings(log: Log, found: CompensatedLog) -> Headings:
+    columns = found.columns
     return Headings(log, columns['rate_rad_s'], columns['rate_std_rad_s'],
                     columns.get('heading_rad'), columns.get('heading_std_rad'), columns)
 

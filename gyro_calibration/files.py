@@ -13,7 +13,7 @@ Read files within limits of size, and write files atomically.
 
 A pipe, a socket, a device or a folder is neither waited for nor replaced. A symbolic link is
 followed when it is read, and replaced when it is written; its target does not change. A file that
-is replaced keeps its mode, and its owner and group where that is allowed.
+is replaced keeps its mode.
 """
 
 from collections.abc import Iterable, Iterator
@@ -21,16 +21,13 @@ from contextlib import contextmanager, suppress
 import csv
 import difflib
 import errno
-import fcntl
 import hashlib
 import io
 import json
 import math
 import os
 from pathlib import Path
-import re
 import secrets
-import select
 import stat
 from typing import Any, BinaryIO
 
@@ -40,8 +37,6 @@ MAX_MAGNITUDE = 1e20
 #: Largest ratio of decompressed to compressed size (sensor data compress to about a tenth), and
 #: the size in bytes that is allowed at any ratio.
 MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
-#: Largest depth of nested lists, names and messages, which the stack of Python holds.
-MAX_DEPTH = 10
 
 #: File type, other than a regular file -> its name.
 _FILE_TYPE_NAMES = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
@@ -92,21 +87,13 @@ def remedy(error: OSError, path: str | Path) -> str:
     return to_printable(words.format(path=path, folder=Path(path).parent))
 
 
-def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.BufferedReader:
-    """Open a regular file, on request also a pipe with a writer; others raise `OSError`."""
+def open_regular_file(path: str | Path) -> io.BufferedReader:
+    """Open a regular file; raise `OSError` for others."""
     # Opening a device may already have an effect; and the file may be replaced between the checks.
-    _require_regular_file(path, os.stat(path).st_mode, allow_pipes)
+    _require_regular_file(path, os.stat(path).st_mode)
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
-        mode = os.fstat(handle).st_mode
-        _require_regular_file(path, mode, allow_pipes)
-        if stat.S_ISFIFO(mode):
-            waiting = select.poll()
-            waiting.register(handle, select.POLLIN)
-            if not waiting.poll(900):  # ms
-                with suppress(BlockingIOError):  # of a writer that has not written yet
-                    os.read(handle, 1)
-                    raise OSError(errno.EINVAL, 'it is a pipe without a writer', str(path))
+        _require_regular_file(path, os.fstat(handle).st_mode)
         os.set_blocking(handle, True)
         return open(handle, 'rb')
     except BaseException:
@@ -124,12 +111,11 @@ def sha256_digest(*paths: str | Path) -> str:
     return found.hexdigest()
 
 
-def _require_regular_file(path: str | Path, mode: int, allow_pipes: bool = False) -> None:
-    if not stat.S_ISREG(mode) and not (allow_pipes and stat.S_ISFIFO(mode)):
+def _require_regular_file(path: str | Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
         kind = _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), 'of another kind')
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
-        wanted = 'a file or a pipe' if allow_pipes else 'a file'
-        raise OSError(number, f'it is {kind}, where {wanted} is wanted', str(path))
+        raise OSError(number, f'it is {kind}, where a file is wanted', str(path))
 
 
 def read_bytes(path: str | Path, max_size: int) -> bytes:
@@ -163,36 +149,27 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
     Its folder is made where it is missing. After an error the old file is unchanged. Raise
     `OSError` for a path that is not a regular file, or a link to one.
     """
-    path, old = Path(path), None
+    path, old_mode = Path(path), None
+    # a long name is shortened; the temporary file of a killed writer remains
+    temporary = path.with_name(
+        f'.{os.fsdecode(os.fsencode(path.name)[:200])}.{secrets.token_hex(4)}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # a new file, or a link without a target
-            if stat.S_ISREG((here := os.lstat(path)).st_mode):
-                old = here
+            if stat.S_ISREG(mode := os.lstat(path).st_mode):
+                old_mode = mode & 0o777
             else:
                 _require_regular_file(path, os.stat(path).st_mode)
-        remove_leftovers(path)
         # A replacement is readable by its owner alone until it gets the mode of the old file; a
         # new file gets the mode that the umask allows.
-        mode = 0o644 if old is None else 0o600
-        while True:
-            temporary = str(path.parent / f'{_temporary_prefix(path)}{secrets.token_hex(4)}')
-            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-            with suppress(OSError):  # without locks, leftovers of killed writers may remain
-                # locked until it is closed or the process ends
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.fstat(handle).st_nlink:
-                break
-            os.close(handle)  # another writer removed it as a leftover before it was locked
+        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC,
+                         0o644 if old_mode is None else 0o600)
         try:
             with os.fdopen(handle, 'wb') as file:
                 yield file
                 file.flush()
-                if old is not None:
-                    for owner in ((-1, old.st_gid), (old.st_uid, -1)):
-                        with suppress(OSError):  # as far as that is allowed
-                            os.fchown(file.fileno(), *owner)
-                    os.fchmod(file.fileno(), old.st_mode & 0o777)
+                if old_mode is not None:
+                    os.fchmod(file.fileno(), old_mode)
                 os.fsync(file.fileno())
                 os.replace(temporary, path)
         except BaseException:
@@ -201,8 +178,7 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
             raise
     except OSError as error:
         if error.errno is None or error.filename is not None and not (
-                Path(error.filename) in path.parents
-                or Path(error.filename).name.startswith(_temporary_prefix(path))):
+                Path(error.filename) in path.parents or Path(error.filename) == temporary):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
@@ -232,22 +208,3 @@ def keep_aside(path: Path) -> str:
         number += 1
     path.rename(other)
     return to_printable(f'what was in {path} is now in {other}')
-
-
-def _temporary_prefix(path: Path) -> str:
-    """Return the prefix of the names of temporary files; a long name is shortened."""
-    return f'.{os.fsdecode(os.fsencode(path.name)[:200])}.'
-
-
-def remove_leftovers(path: str | Path) -> None:
-    """Remove the temporary files of killed writers, except those that are locked by a writer."""
-    path = Path(path)
-    leftover = re.compile(re.escape(_temporary_prefix(path)) + '[a-z0-9_]{8}')
-    # a folder that cannot be read or written to is reported when the file is written
-    with suppress(OSError):
-        for found in [each for each in path.parent.iterdir() if leftover.fullmatch(each.name)]:
-            with suppress(OSError):
-                if stat.S_ISREG(os.lstat(found).st_mode):
-                    with open_regular_file(found) as file:
-                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                        os.unlink(found)

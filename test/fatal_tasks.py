@@ -16,7 +16,7 @@ import signal
 import sys
 import time
 
-from gyro_calibration.fleet.run import process_executors, run_tasks
+from gyro_calibration.fleet.run import process_executor, run_tasks
 
 KILLS, TAKES_ALL_MEMORY = 3, 5
 
@@ -38,5 +38,5 @@ def begun(folder):
 
 
 if __name__ == '__main__':
-    with process_executors(1) as create:
-        list(run_tasks(begun, sys.argv[1:], 1, create))
+    with process_executor(1) as executor:
+        list(run_tasks(begun, sys.argv[1:], 1, executor))

@@ -18,11 +18,8 @@ answer to wrong bytes; any other exception is a fault, and so is a message of se
 
 
 from collections.abc import Callable, Sequence
-import contextlib
 from dataclasses import dataclass
-from functools import cache, partial
-import importlib.util
-import io
+from functools import partial
 import json
 import math
 import os
@@ -35,7 +32,6 @@ from unittest import mock
 import zlib
 
 from fake_port import SETTINGS
-from gyro_calibration.cli.main import find_verbs, make_parser
 from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import LineSplitter
@@ -44,7 +40,7 @@ from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.bias_table import BiasTable, read_bias_table, write_bias_table
 from gyro_calibration.logs.cdr import IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.logs.log import (
-    Log, LogError, QUANTITIES, read_log, read_log_blocks, write_log)
+    Log, LogError, QUANTITIES, read_log, write_log)
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
@@ -61,7 +57,6 @@ MESSAGE, SECONDS, HELD = 1000, 5.0, 1024
 #: In memory, where the machine can: a fuzzer writes a file thousands of times a second.
 _FOLDER = tempfile.TemporaryDirectory(prefix='gyro_calibration_fuzz_',
                                       dir='/dev/shm' if os.access('/dev/shm', os.W_OK) else None)
-HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 
 @dataclass(frozen=True)
@@ -232,12 +227,11 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
     path = _file(data, suffix)
     log = _read(read_log, LogError, path)
     with mock.patch('gyro_calibration.logs.log.BLOCK_ROWS', 2):
-        blocks = _read(lambda path: list(read_log_blocks(path)), LogError, path)
-    assert (log is None) == (blocks is None), 'refused as a whole or in blocks only'
+        other = _read(read_log, LogError, path)
+    assert (log is None) == (other is None), 'refused as a whole or in blocks only'
     if log is None:
         return False
-    assert np.array_equal(np.concatenate([_values(block) for block in blocks], axis=1),
-                          _values(log), equal_nan=True)
+    assert np.array_equal(_values(other), _values(log), equal_nan=True)
     assert not (np.abs(_values(log)) > MAX_MAGNITUDE).any()
     assert all(np.isfinite(values).all()
                for values in (log.time, log.temperature, log.specific_force, log.supply)
@@ -368,8 +362,7 @@ def _messages() -> list[tuple[str, str, int, bytes]]:
         for topic, kind in (('imu/data_raw', IMU), ('imu/temperature', TEMPERATURE),
                             ('table', 'geometry_msgs/msg/PoseStamped')):
             found.append((topic, kind, stamp + 1000,
-                          serialize(stamp, 'gyro', [0.1 * number] * (sum(
-                              len(codes) for _, codes in LAYOUTS[kind].runs) - 2))))
+                          serialize(stamp, 'gyro', [0.1 * number] * LAYOUTS[kind].size)))
     return found
 
 
@@ -393,73 +386,6 @@ def _database_seeds() -> list[bytes]:
              [(topic, time, data) for topic, _, time, data in _messages()],
              'PRAGMA page_size = 512').close()
     return [path.read_bytes()]
-
-
-# What people and launch files give
-
-def any_value(data: bytes) -> object:
-    """Return a value of any of the types that a parameter may be given, made of bytes."""
-    kind, rest = data[0] % 9 if data else 0, data[1:]
-    text = rest.decode('utf-8', 'surrogateescape')
-    number = struct.unpack('<d', rest[:8].ljust(8, b'\0'))[0]
-    return (None, bool(rest[:1] > b'\x7f'), int.from_bytes(rest[:40], 'little', signed=True),
-            number, text, rest, text.split('\n'), list(rest), [number, text, None])[kind]
-
-
-def check_parameters(data: bytes) -> bool:
-    from gyro_calibration.ros.driver_node import PARAMETERS as OF_DRIVER
-    from gyro_calibration.ros.pipeline import PARAMETERS
-    table = [*PARAMETERS, *OF_DRIVER]
-    parameter, value = table[(data[0] if data else 0) % len(table)], any_value(data[1:])
-    try:
-        accepted = parameter.check(value)
-    except ValueError as error:
-        _check_message(error, f'parameter {parameter.name}')
-        return False
-    assert (isinstance(accepted, (bool, int, float, str, list))
-            and not (isinstance(accepted, str) and '\0' in accepted))
-    return True
-
-
-def _parameter_seeds() -> list[bytes]:
-    values = [b'\0', b'\1\xff', b'\2\x01', b'\3' + struct.pack('<d', 0.5), b'\4rest',
-              b'\4/dev/ttyUSB0', b'\6time_s\ngyro_dps']
-    return [bytes([place]) + value for place in range(0, 60, 4) for value in values]
-
-
-_verbs, _program = cache(find_verbs), cache(make_parser)
-
-
-def check_arguments(data: bytes) -> bool:
-    """Parse arguments, or end with 0 or 2; nothing is run."""
-    words = data.replace(b'\0', b'').decode('utf-8', 'surrogateescape').split('\n')
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(
-            io.StringIO()) as said:
-        try:
-            _program(words[0] if words[0] in _verbs() else '').parse_args(words)
-        except SystemExit as end:
-            assert end.code in (0, 2), end.code
-            assert end.code == 0 or said.getvalue().endswith(' --help\n')
-            return False
-    return True
-
-
-_ARGUMENTS = (
-    'fit table.csv --out model.yaml --polynomial 3,2 --technology mems', 'turn table.csv --json',
-    'diagnose a.csv --model b.yaml --out c',
-    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --rest',
-    'allan rest.csv --rate 100 --sensitivity 1e-3',
-    'self-calibrate run.csv --turns -5 --marking 1 --reference-drift 1e-3',
-    'emulate --protocol csv --model m.yaml --speed 2 --repeat',
-    'simulate --model m.yaml --motion robot --out l.csv --seed 1 --temperature 25 '
-    '--sample-rate 100',
-    'plan --limits l.yaml --seconds 20',
-    'record --port /dev/ttyUSB0 --out x.csv', 'reproduce hong_park --seed 3', 'demo --out d',
-    '--version', 'fit --help')
-
-
-def _argument_seeds() -> list[bytes]:
-    return [words.replace(' ', '\n').encode() for words in _ARGUMENTS]
 
 
 _YAML = (b'[' * 60, b'- ' * 30, b': ', b'- ', b'{', b'}', b'[', b']', b'&a ', b'*a', b'!!int',
@@ -489,8 +415,4 @@ TARGETS: dict[str, Target] = {
     'motion profile': Target(check_profile, _profile_seeds, 1024, _CSV),
     'recording .mcap': Target(partial(check_recording, '.mcap'), _mcap_seeds, 4096),
     'recording .db3': Target(partial(check_recording, '.db3'), _database_seeds, 8192),
-    'arguments': Target(check_arguments, _argument_seeds, 256,
-                        (b'\n', b'--', b'nan', b'1e999', b'-1')),
-    **({'parameters': Target(check_parameters, _parameter_seeds, 128, weight=2.0)}
-       if HAS_ROS else {}),
 }

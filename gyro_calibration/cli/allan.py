@@ -56,7 +56,7 @@ def run(given: argparse.Namespace) -> Answer:
     whole = verb.read(argparse.Namespace(**{**vars(given), 'begin': 0.0, 'end': math.inf}))
     time = verb.require_time(given, whole)
     # in messages, times are those of --from and --to
-    log = next(verb.cut_to_range(given, [replace(whole, time=time - time[0])]))
+    log = verb.cut_to_range(given, replace(whole, time=time - time[0]))
     try:
         with show_progress('noise figures from the Allan deviation'):
             found = find_noise_figures(log)

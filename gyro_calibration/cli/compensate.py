@@ -17,9 +17,8 @@ example: gyro_calibration compensate drive.csv --model model.yaml --out compensa
 from __future__ import annotations
 
 import argparse
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 import math
 from typing import Any
@@ -34,7 +33,8 @@ from gyro_calibration.heading.integration import BlockIntegrator, Intervals, MAX
 from gyro_calibration.heading.log_compensation import (
     LogCompensation, no_plausible_row_message, plausible_rows, rows_of, smooth_track)
 from gyro_calibration.heading.tracker import TrackerSettings
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
+from gyro_calibration.logs.log import (
+    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, Mask, write_log)
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model
@@ -56,44 +56,40 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    model, found = read_model(given.model), _Totals()
+    model = read_model(given.model)
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
         raise InputError('--rest and --hindsight need no --threshold and a model with an angle '
                          'random walk; run allan to add it to the model')
-    write_log_blocks(given.out, _compensate_and_count(given, model, found))
-    data: dict[str, Any] = {'out': given.out, **found.counts,
-                            'lost_samples': found.intervals.lost_samples,
-                            'longest_gap_s': found.intervals.longest_gap,
-                            'temperature_known': 'temperature' not in found.unknown}
+    log = verb.read(given)
+    with verb.show_progress('heading'):
+        found = (track_log(log, model, given.hindsight, given.log)
+                 if given.rest or given.hindsight else integrate_log(log, model, Threshold(
+                     given.threshold * DEGREE, angle_random_walk=model.noise.angle_random_walk),
+                     given.log))
+        write_log(given.out, log, found.columns)
+    columns, known = found.columns, found.is_plausible
+    without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
+    unknown = [quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None]
+    data: dict[str, Any] = {
+        'out': given.out, 'rows': len(log), 'rows_without_output': without,
+        'rows_at_rest': int(np.nansum(columns.get('resting', 0.0))),
+        'refused_samples': int(np.count_nonzero(~known)) - without,
+        **{name: int(np.nansum(columns[name])) for name in ('temperature_clipped',
+                                                            'beyond_range')},
+        'lost_samples': found.intervals.lost_samples,
+        'longest_gap_s': found.intervals.longest_gap,
+        'temperature_known': 'temperature' not in unknown}
     lines = [f'{data["rows"]} rows compensated by {given.model}, written to {given.out}.']
-    if found.heading is not None:
-        # The deviation is zero where the model has neither noise nor covariance.
-        deviation = found.deviation if found.deviation > 0.0 else None
-        data.update(heading_rad=found.heading, heading_std_rad=deviation)
-        known = '' if deviation is None else f' +- {deviation / DEGREE:.2f}'
-        lines.append(f'Heading at the end: {found.heading / DEGREE:.2f}{known} deg.')
-        data['noise_is_known'] = model.noise != Noise()
-        if deviation is not None and not data['noise_is_known']:
-            lines.append('The model has no noise figures: noise and wander of the bias are not in '
-                         'the standard deviation; record the gyro at rest, and run allan to add '
-                         'them to the model.')
+    if 'heading_rad' in columns:
+        lines += _describe_heading(log, found, model, data)
     estimator = found.estimator
     if estimator is None:
         data['bias_is_calibrated'] = bool(model.self_calibration or model.fits_scale_and_bias[1])
     else:
         data.update(bias_is_calibrated=not estimator.is_bias_assumed,
                     bias_ambiguity_rad_s=estimator.tracker.bias_ambiguity)
-    lines += _describe_bias(found, data)
-    if found.errors:
-        sums, counts, last = zip(*found.errors)
-        mean = sum(sums) / sum(counts)
-        data.update(mean_heading_error_rad=mean, last_heading_error_rad=last[-1])
-        lines.append(f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the '
-                     f'end {last[-1] / DEGREE:.3f} deg.')
-        lines.append('Both headings start at 0 at the first row with a reference. This error '
-                     'includes its mean and a delay of the reference; the heading errors that fit '
-                     'prints exclude both.')
-    lines += [words for quantity, words in _MISSING_INPUTS.items() if quantity in found.unknown
+    lines += _describe_bias(estimator, log.moving is not None, data)
+    lines += [words for quantity, words in _MISSING_INPUTS.items() if quantity in unknown
               and model.uses_channel(quantity.removeprefix('reference_'))]
     lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
               if term.effect.not_compensated]
@@ -118,15 +114,45 @@ def run(given: argparse.Namespace) -> Answer:
     return Answer(lines, data)
 
 
-def _describe_bias(found: _Totals, data: dict[str, Any]) -> Iterator[str]:
+def _describe_heading(log: Log, found: CompensatedLog, model: GyroModel,
+                      data: dict[str, Any]) -> Iterator[str]:
+    """Give sentences on the heading at the end and its errors, and add them to the data."""
+    headings, known = found.columns['heading_rad'], found.is_plausible
+    heading, deviation = headings[known][-1], found.columns['heading_std_rad'][known][-1]
+    # The deviation is zero where the model has neither noise nor covariance.
+    is_known = bool(deviation > 0.0)
+    data.update(heading_rad=float(heading), heading_std_rad=float(deviation) if is_known else None,
+                noise_is_known=model.noise != Noise())
+    spread = f' +- {deviation / DEGREE:.2f}' if is_known else ''
+    yield f'Heading at the end: {heading / DEGREE:.2f}{spread} deg.'
+    if is_known and not data['noise_is_known']:
+        yield ('The model has no noise figures: noise and wander of the bias are not in the '
+               'standard deviation; record the gyro at rest, and run allan to add them to the '
+               'model.')
+    if log.reference_heading is None:
+        return
+    error = headings - log.reference_heading
+    error = error[np.isfinite(error)]
+    if len(error):
+        error -= error[0]
+        mean, last = float(np.abs(error).mean()), float(error[-1])
+        data.update(mean_heading_error_rad=mean, last_heading_error_rad=last)
+        yield (f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the end '
+               f'{last / DEGREE:.3f} deg.')
+        yield ('Both headings start at 0 at the first row with a reference. This error includes '
+               'its mean and a delay of the reference; the heading errors that fit prints exclude '
+               'both.')
+
+
+def _describe_bias(estimator: HeadingEstimator | None, has_wheels: bool,
+                   data: dict[str, Any]) -> Iterator[str]:
     """Give sentences on what the standard deviation does not contain of the bias."""
-    estimator = found.estimator
     if estimator is None:
         if not data['bias_is_calibrated']:
             yield ('The bias is not known from a calibration: 0 was used, and its error is not in '
                    'the standard deviation; run self-calibrate, or use --rest.')
         return
-    if estimator.is_bias_assumed and not found.has_wheels:
+    if estimator.is_bias_assumed and not has_wheels:
         yield ('The bias is not known from a calibration: the first steady rate within '
                f'{Assumptions.bias / DEGREE:g} deg/s was taken for that of a rest. If the log '
                'begins in a turn or a bend, the heading may be off by more than its standard '
@@ -159,115 +185,57 @@ _MISSING_INPUTS = {
 _INTERVAL_REMEDY = 'check the unit of time_s, or give the sample rate with --rate'
 
 
-@dataclass
-class _Totals:
-    """Counts over the blocks so far; heading and deviation of the last sample, rad."""
-
-    counts: Counter[str] = field(default_factory=Counter)
-    intervals: Intervals = field(default_factory=Intervals)
-    unknown: tuple[str, ...] = ()
-    heading: float | None = None
-    deviation: float = math.nan
-    estimator: HeadingEstimator | None = None
-    has_wheels: bool = False
-    errors: list[tuple[float, int, float]] = field(default_factory=list)
-    first_error: float = math.nan
-
-    def add(self, piece: CompensatedBlock) -> None:
-        log, columns = piece.log, piece.columns
-        self.intervals, self.estimator = piece.intervals, piece.estimator
-        self.has_wheels = log.moving is not None
-        without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
-        self.counts.update(
-            rows=len(log), rows_without_output=without,
-            rows_at_rest=int(np.sum(columns.get('resting', 0))),
-            refused_samples=len(log) - len(columns['rate_rad_s']) - without,
-            **{name: int(columns[name].sum()) for name in ('temperature_clipped', 'beyond_range')})
-        self.unknown = tuple(
-            quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None)
-        if len(columns.get('heading_rad', ())):
-            self.heading, self.deviation = (
-                float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
-            if log.reference_heading is not None:
-                error = columns['heading_rad'] - log.reference_heading[piece.is_plausible]
-                if len(error := error[np.isfinite(error)]):
-                    # both headings count from the first row with a reference
-                    self.first_error = self.first_error if self.errors else error[0]
-                    error = error - self.first_error
-                    self.errors.append((float(np.abs(error).sum()), len(error), float(error[-1])))
-
-
 @dataclass(frozen=True)
-class CompensatedBlock:
-    """A block of a log, its plausible rows, their new columns, and the intervals so far."""
+class CompensatedLog:
+    """The new columns of a log, nan in rows that are not plausible."""
 
-    log: Log
     is_plausible: Mask
-    columns: dict[str, Array]
+    columns: dict[str, Array]  # by name, each of shape (n,)
     intervals: Intervals
-    estimator: HeadingEstimator | None = None  # after the block, where rests were detected
-
-    def full_columns(self) -> dict[str, Array]:
-        """Return the new columns of all rows; nan where the row is not plausible."""
-        found = {name: np.full(len(self.is_plausible), np.nan) for name in self.columns}
-        for name, values in self.columns.items():
-            found[name][self.is_plausible] = values
-        return found
+    estimator: HeadingEstimator | None  # after the log, where rests were detected
 
 
-def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
-                          found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
-    if given.rest or given.hindsight:
-        log = verb.read(given)
-        with verb.show_progress('heading'):
-            blocks = iter([track_log(log, model, given.hindsight, given.log)])
-    else:
-        threshold = Threshold(given.threshold * DEGREE,
-                              angle_random_walk=model.noise.angle_random_walk)
-        # what is interpolated to the stamps needs the whole log
-        logs = [verb.read(given)] if model.moves_stamps else verb.read_blocks(given)
-        blocks = integrate_log(logs, model, threshold)
-    for piece in check_finite(blocks, given.log):
-        found.add(piece)
-        yield piece.log, piece.full_columns()
-    counts = found.counts
-    if counts['rows'] == counts['rows_without_output']:
-        raise DataRefused(f'{given.log}: no gyro output is finite; record again')
-    if counts['rows'] == counts['rows_without_output'] + counts['refused_samples']:
-        raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
+def _to_compensated(log: Log, known: Mask, columns: dict[str, Array], name: str,
+                    intervals: Intervals,
+                    estimator: HeadingEstimator | None = None) -> CompensatedLog:
+    """Give columns of the plausible rows to all rows; refuse one that is not finite there."""
+    found = {}
+    for column, values in columns.items():
+        # a standard deviation may be unknown, nan
+        finite = ~np.isinf(values) if '_std_' in column else np.isfinite(values)
+        if not finite.all():
+            row = np.flatnonzero(known)[int(np.argmin(finite))]
+            at = '' if log.time is None else f' at {log.time[row]:g} s'
+            raise DataRefused(
+                f'{name}: {column} is not finite for an output of '
+                f'{np.asarray(log.output)[row]:g} rad/s{at}; remove the sample, or check columns, '
+                'units and the model')
+        found[column] = np.full(len(known), np.nan)
+        found[column][known] = values
+    return CompensatedLog(known, found, intervals, estimator)
 
 
-def check_finite(pieces: Iterator[CompensatedBlock], file: str) -> Iterator[CompensatedBlock]:
-    """Refuse a sample for which the model gives no finite rate or heading."""
-    for piece in pieces:
-        for name, values in piece.columns.items():
-            # a standard deviation may be unknown, nan
-            finite = ~np.isinf(values) if '_std_' in name else np.isfinite(values)
-            if not finite.all():
-                row, log = int(np.argmin(finite)), piece.log
-                output = float(np.asarray(log.output)[piece.is_plausible][row])
-                at = '' if log.time is None else f' at {log.time[piece.is_plausible][row]:g} s'
-                raise DataRefused(
-                    f'{file}: {name} is not finite for an output of {output:g} rad/s{at}; '
-                    'remove the sample, or check columns, units and the model')
-        yield piece
-
-
-def integrate_log(logs: Iterable[Log], model: GyroModel,
-                  threshold: Threshold) -> Iterator[CompensatedBlock]:
-    """Give the blocks of a log, each with its rates and, where it has a time, its heading."""
+def integrate_log(log: Log, model: GyroModel, threshold: Threshold, name: str) -> CompensatedLog:
+    """Return the rates of a log and, where it has a time, its heading."""
+    known = plausible_rows(model, log)
+    if not known.any():
+        raise DataRefused(f'{name}: {no_plausible_row_message(model)}'
+                          if np.isfinite(np.asarray(log.output)).any() else
+                          f'{name}: no gyro output is finite; record again')
     integrator = BlockIntegrator(threshold, model.noise, uncertainty_covariance(model))
-    compensation = LogCompensation(model)
-    variance: float | None = None
-    for log in logs:
-        known = plausible_rows(model, log)
-        if variance is None:
-            # The noise of a rate depends on the interval between samples. That of the first block
-            # is used for all rates, since a lost sample does not reduce the noise of a gyro. Rows
-            # without output may lie between samples.
-            variance = 0.0 if log.time is None else model.noise.rate_variance(
-                float(np.median(np.diff(log.time[known] if known.sum() > 1 else log.time))))
-        rows = rows_of(log, known)
+    compensation, variance, blocks = LogCompensation(model), 0.0, list[dict[str, Array]]()
+    if log.time is not None:
+        # The noise of a rate depends on the interval between samples. That of the first block is
+        # used for all rates, since a lost sample does not reduce the noise of a gyro. Rows without
+        # output may lie between samples.
+        first = log.time[:BLOCK_ROWS]
+        of_output = first[known[:BLOCK_ROWS]]
+        variance = model.noise.rate_variance(
+            float(np.median(np.diff(of_output if len(of_output) > 1 else first))))
+    # in blocks, which limit the memory, unless rates are interpolated to the stamps
+    size = len(log) if model.moves_stamps else BLOCK_ROWS
+    for begin in range(0, len(log), size):
+        rows = rows_of(log, begin + np.flatnonzero(known[begin:begin + size]))
         result, sensitivity = compensation.add(rows)
         columns = {'rate_rad_s': result.rate}
         if rows.time is not None:
@@ -276,16 +244,19 @@ def integrate_log(logs: Iterable[Log], model: GyroModel,
              columns['heading_std_rad']) = integrator.add(time, result.rate, sensitivity)
         columns['rate_std_rad_s'] = np.sqrt(
             variance + quadratic_form(uncertainty_covariance(model), sensitivity))
-        if model.moves_stamps and rows.time is not None and len(rows):
+        if model.moves_stamps and rows.time is not None:
             columns = {name: np.interp(rows.time, time, values)
                        for name, values in columns.items()}
         columns |= {'temperature_clipped': result.temperature_clipped,
                     'beyond_range': result.beyond_range}
-        yield CompensatedBlock(log, known, columns, integrator.intervals)
+        blocks.append(columns)
+    return _to_compensated(log, known, {
+        column: np.concatenate([each[column] for each in blocks]) for column in columns},
+        name, integrator.intervals)
 
 
-def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> CompensatedBlock:
-    """Return the whole log as one block, with heading and bias tracked as by the node."""
+def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> CompensatedLog:
+    """Return rates and heading of a log, with heading and bias tracked as by the node."""
     known = np.abs(np.asarray(log.output)) <= model.rate_limit
     if log.time is None or known.sum() < 2:
         raise DataRefused(f'{name}: standstill detection needs two or more samples with a time; '
@@ -325,8 +296,8 @@ def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> Compens
             raise DataRefused(f'{name}: the variance of the heading is not finite; '
                               'check columns, units and the model')
         heading, variance, resting = smooth_track(estimator.tracker, time, corrected)
-    return CompensatedBlock(log, known, {
+    return _to_compensated(log, known, {
         'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
         'rate_std_rad_s': np.sqrt(rate_variance), 'resting': resting.astype(float),
-        'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals,
-        estimator)
+        'temperature_clipped': clipped, 'beyond_range': beyond}, name,
+        estimator.tracker.intervals, estimator)

@@ -160,7 +160,7 @@ class Fitted(PrintedResult):
         return plots.draw_headings(
             path, motion.time, true, {'not calibrated': true + found.residual_before,
                                       'calibrated': true + found.residual_after},
-            'course over ground' if found.method == 'course' else 'reference', is_apart=True)
+            'course over ground' if found.method == 'course' else 'reference')
 
 
 def _dwell_data(selection: SelectedEffects) -> dict[str, Any]:

@@ -16,6 +16,7 @@ example: gyro_calibration fleet drives/ --out fleet
 
 import argparse
 from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor
 from contextlib import contextmanager
 from dataclasses import replace
 import json
@@ -32,9 +33,9 @@ from gyro_calibration.diagnosis.words import wrap_line
 from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.fleet.logs import (
     compile_file_pattern, DONE, find_logs, LogTask, make_refused_record, NO_EVIDENCE, process_log)
-from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.run import cluster_executor, process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
-    build_models, COMPONENT_LABELS, describe_type, log_table, render_fleet_page, summarize_types)
+    build_models, COMPONENT_LABELS, describe_type, log_table, summarize_types, TypeSummary)
 from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
@@ -75,13 +76,22 @@ def run(given: argparse.Namespace) -> Answer:
     tasks = [LogTask(entry, folder, given.technology, pattern, generator, given.gyro_type or '',
                      given.rate) for entry in logs]
     done: dict[str, dict[str, Any]] = {}
+    workers = given.workers or (len(os.sched_getaffinity(0)) if given.scheduler is None else 64)
     try:
-        with (_make_executors(given) as (workers, create),
+        with (_make_executor(given, workers) as executor,
               show_progress(f'0 of {len(tasks)} logs') as on_progress):
-            for task, record in run_tasks(process_log, tasks, workers, create):
-                done[task.entry.log] = (make_refused_record(task.entry, str(record))
-                                        if isinstance(record, WorkerLost) else record)
+            for task, record in run_tasks(process_log, tasks, workers, executor):
+                if not isinstance(record, dict):
+                    reason = f'its worker failed ({type(record).__name__}: {str(record)[:200]})'
+                    record = make_refused_record(task.entry, reason)
+                done[task.entry.log] = record
                 on_progress(len(done) / len(tasks), f'{len(done)} of {len(tasks)} logs')
+    except BrokenExecutor:
+        suspects = [each.entry.log for each in tasks if each.entry.log not in done]
+        raise DataRefused(
+            'a worker was killed, perhaps since memory ran out, by one of '
+            f'{", ".join(suspects[:2 * workers])}: give --workers 1, or leave the log out, and '
+            'run the same command again to continue') from None
     except KeyboardInterrupt:
         raise DataRefused(f'interrupted after {len(done)} of {len(tasks)} logs; run the same '
                           'command again to continue') from None
@@ -97,26 +107,12 @@ def run(given: argparse.Namespace) -> Answer:
     with show_progress('units, types and references'):
         types = summarize_types(used)
     for found in types:
-        counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
-            (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
-        texts = [f'{found.name or "Type not stated, pooled as one"}: {counts}.']
-        for value in found.values.values():
-            parts = [f'{label} {value.format_component(name)}'
-                     for name, label in COMPONENT_LABELS.items() if name in value.components]
-            texts.append(f'  {value.name}: {value.format_interval(value.mean)}; '
-                         f'{", ".join(parts)}')
-            if not value.is_slow:
-                texts.append('    ' + '; '.join(
-                    f'unit {to_printable(name)} {value.format_interval(interval)}'
-                    for name, interval in value.units.items()))
-        texts += [f'  {text}.' for text in describe_type(found)]
-        lines += ['', *(wrap_line(each, 2 + len(each) - len(each.lstrip())) for each in texts)]
+        lines += ['', *_type_lines(found)]
     data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),
             'false_alarm_rate': FALSE_ALARM_RATE,
             'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in excluded],
             'types': [type_data(found) for found in types]}
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
-               'report.html': render_fleet_page(types, records).encode(),
                'logs.csv': log_table(records).encode()}
     names = list(content)
     for found in types:
@@ -134,19 +130,32 @@ def run(given: argparse.Namespace) -> Answer:
     return Answer(lines, data)
 
 
+def _type_lines(found: TypeSummary) -> Iterator[str]:
+    counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
+        (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
+    texts = [f'{found.name or "Type not stated, pooled as one"}: {counts}.']
+    for value in found.values.values():
+        parts = [f'{label} {value.format_component(name)}'
+                 for name, label in COMPONENT_LABELS.items() if name in value.components]
+        texts.append(f'  {value.name}: {value.format_interval(value.mean)}; {", ".join(parts)}')
+        texts.append('    ' + '; '.join(
+            f'unit {to_printable(name)} {value.format_interval(interval)}'
+            for name, interval in value.units.items()))
+    texts += [f'  {text}.' for text in describe_type(found)]
+    yield from (wrap_line(each, 2 + len(each) - len(each.lstrip())) for each in texts)
+
+
 @contextmanager
-def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
-    """Give the number of workers, and the function that makes executors of them."""
-    workers = given.workers or len(os.sched_getaffinity(0))
+def _make_executor(given: argparse.Namespace, workers: int) -> Iterator[Executor]:
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
         memory = 1e9 * given.memory if given.memory else 0.8 * machine / workers
-        with process_executors(workers, memory, ['gyro_calibration.fleet.logs']) as create:
-            yield workers, create
+        with process_executor(workers, memory, ['gyro_calibration.fleet.logs']) as executor:
+            yield executor
         return
     try:
-        with cluster_executors(given.scheduler) as create:
-            yield given.workers or 64, create
+        with cluster_executor(given.scheduler) as executor:
+            yield executor
     except ImportError:
         raise InputError('--scheduler needs distributed, which is not installed; install '
                          'gyro_calibration[fleet] or omit --scheduler') from None

@@ -30,7 +30,7 @@ from gyro_calibration import __version__
 from gyro_calibration.cli.verb import print_message
 from gyro_calibration.diagnosis.causes import register_causes
 from gyro_calibration.files import (
-    describe_error, format_json, InputError, remedy, suggest_nearest, to_printable)
+    describe_error, format_json, InputError, remedy, to_printable)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np
@@ -92,18 +92,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 class _Parser(argparse.ArgumentParser):
     """Reports wrong arguments without control characters, which names of files may contain."""
 
-    options: Sequence[str] = ()
-
     def _print_message(self, message: str, file: Any = None) -> None:
         super()._print_message(to_printable(message, allowed='\n'), file)
 
     def error(self, message: str) -> NoReturn:
-        """End with 2 and one sentence, which has the nearest right name of a wrong one."""
-        wrong = re.match(r'(?:argument .*: invalid choice: .|unrecognized arguments: )([\w-]+)',
-                         message)
-        names = re.findall(r'[\w-]+', message.partition('choose from')[2]) or self.options
-        if wrong:
-            message += suggest_nearest(wrong[1], names)
+        """End with 2 and one sentence."""
         message = re.sub(r'invalid \w+ value: (.*)', r'\1 is no number', message)
         self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')
 
@@ -135,5 +128,4 @@ def make_parser(called: str) -> argparse.ArgumentParser:
             verb.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
                               help='Python file, which is executed, with EFFECTS, a list of '
                               'further effects for models and diagnoses')
-            parser.options = re.findall(r'--[\w-]+', verb.format_usage())
     return parser

@@ -41,14 +41,13 @@ _LINE_STYLES = ('-', '--', '-.', ':')
 
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
-                  headings: Mapping[str, Array], name: str = 'reference',
-                  is_apart: bool = False) -> Any:
+                  headings: Mapping[str, Array], name: str = 'reference') -> Any:
     """
-    Draw headings, rad, against a reference, and their errors (figure 10 of Hong and Park).
+    Draw headings, rad, against a reference (figure 10 of Hong and Park).
 
-    Apart, each error has a panel on its own scale.
+    The error of each has a panel on its own scale.
     """
-    count = len(headings) if is_apart else 1
+    count = len(headings)
     figure, panels = _panels(1 + count, 1, (9, 5 + 2 * count), (1.3, *[1.7 / count] * count))
     above, *below = panels[:, 0]
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label=name)
@@ -57,10 +56,9 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
         line = {'linestyle': _LINE_STYLES[style], 'linewidth': 1.5 / (1 + 2 * repeats),
                 'color': f'C{number}'}
         above.plot(time, heading / DEGREE, **line, label=label)
-        below[number % count].plot(time, (heading - true) / DEGREE, **line)
-        if is_apart:
-            size = rms(heading - true) / DEGREE
-            below[number].set_title(f'Gyro {label}, less the {name}: rms {size:.3g} deg')
+        below[number].plot(time, (heading - true) / DEGREE, **line)
+        size = rms(heading - true) / DEGREE
+        below[number].set_title(f'Gyro {label}, less the {name}: rms {size:.3g} deg')
     above.set(ylabel='heading [deg]', title=f'Heading by the {name} and by the gyro')
     above.legend(loc='best')
     for axes in below:

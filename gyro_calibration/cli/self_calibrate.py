@@ -220,7 +220,7 @@ class Run(PrintedResult):
         return draw_headings(path, time, true - true[0], {
             'not calibrated': integrate(time, self.rate),
             'calibrated': integrate(time, (self.rate - fit.bias) / (1.0 + fit.scale_factor_error))
-        }, is_apart=True)
+        })
 
 
 def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,

@@ -136,7 +136,7 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
     used = [*names, *(['self-calibration'] if model.self_calibration else [])]
     remark = f'the model is {given.model}: {", ".join(used) or "no effects"}'
     of_fit = 'these are errors of a fit, not of a prediction'
-    if any(file.is_file() and sha256_digest(file) in str(model.origin)
+    if any(sha256_digest(file) in str(model.origin)
            for file in list_recording_files(given.log)):
         remark += f'; it was fitted to this log, so {of_fit}'
     elif 'sha256' not in str(model.origin):

@@ -28,9 +28,9 @@ from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
 from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
-    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, read_log_blocks, select_rows, unwrap_reference)
+    Array, DataRefused, DEGREE, Log, select_rows, unwrap_reference)
 from gyro_calibration.logs.recording import read_file, Topics
-from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
+from gyro_calibration.logs.ros_bag import list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
 from tqdm import tqdm
 
@@ -129,11 +129,10 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
-                        'sensor_msgs/Imu or another type with a rate; default: the only Imu')
+                        'sensor_msgs/Imu or geometry_msgs/Vector3Stamped; default: the only Imu')
     parser.add_argument('--reference-topic', metavar='TOPIC', help='topic of the reference in a '
-                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, '
-                        'geometry_msgs/PoseStamped, TwistStamped or another type with a rate '
-                        'or an orientation; default: none')
+                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, or of geometry_msgs '
+                        'PoseStamped, TwistStamped, TransformStamped and the like; default: none')
     parser.add_argument('--temperature-topic', metavar='TOPIC', help='topic of the temperature '
                         'in a recording; default: the name nearest to the topic of the gyro')
 
@@ -189,11 +188,14 @@ def read(given: argparse.Namespace) -> Log:
         topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
         log = read_file(given.log, topics, given.rate, given.sensitivity, given.names, on_progress,
                         print_message)
-    log = _orient_output(given, log)
+    if log.output is None:
+        raise InputError(f'{given.log}: has gyro_counts only; '
+                         'give the deg/s per count with --sensitivity')
+    log = replace(log, output=-log.output) if given.invert else log
     if given.unwrap and log.reference_heading is not None:
         require_time(given, log)
         log = unwrap_reference(log)
-    return next(cut_to_range(given, [log]))
+    return cut_to_range(given, log)
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
@@ -202,22 +204,16 @@ def read_each(given: argparse.Namespace) -> Iterator[Log]:
         yield read(argparse.Namespace(**{**vars(given), 'log': path}))
 
 
-def cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
-    """Give the parts of logs between --from and --to; at least one has samples."""
+def cut_to_range(given: argparse.Namespace, log: Log) -> Log:
+    """Return the part of a log between --from and --to."""
     if given.begin <= 0.0 and given.end == math.inf:
-        yield from logs
-        return
-    begin = found = None
-    for log in logs:
-        time = require_time(given, log)
-        begin = time[0] if begin is None else begin
-        rows = (time - begin >= given.begin) & (time - begin <= given.end)
-        if rows.any():
-            found = log
-            yield select_rows(log, rows)
-    if found is None:
+        return log
+    since = require_time(given, log) - require_time(given, log)[0]
+    rows = (since >= given.begin) & (since <= given.end)
+    if not rows.any():
         raise DataRefused(f'{given.log}: --from {given.begin:g} --to {given.end:g} leaves no '
                           'sample; give a range within the log')
+    return select_rows(log, rows)
 
 
 def print_message(text: object) -> None:
@@ -226,8 +222,7 @@ def print_message(text: object) -> None:
 
 def make_origin(paths: Iterable[str]) -> dict[str, Any]:
     """Return the origin of a model, for its file: logs, date, program."""
-    files = [{'name': to_printable(file.name),
-              **({'sha256': sha256_digest(file)} if os.path.isfile(file) else {})}
+    files = [{'name': to_printable(file.name), 'sha256': sha256_digest(file)}
              for path in paths for file in list_recording_files(path)]
     return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
             'program': f'gyro_calibration {__version__}'}
@@ -236,27 +231,6 @@ def make_origin(paths: Iterable[str]) -> dict[str, Any]:
 def add_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return a model of --model unchanged, or a new one with the log as its origin."""
     return model if given.model else replace(model, origin=make_origin([given.log]))
-
-
-def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the log of a verb block by block, with a progress bar."""
-    if is_recording(given.log) or given.unwrap or 'attitude' in given.names:
-        log = read(given)
-        yield from (select_rows(log, slice(begin, begin + BLOCK_ROWS))
-                    for begin in range(0, len(log), BLOCK_ROWS))
-        return
-    with _show_bytes_read(given.log) as on_progress:
-        blocks = read_log_blocks(given.log, given.sensitivity, given.rate, given.names,
-                                 given.axis, on_progress)
-        for log in cut_to_range(given, blocks):
-            yield _orient_output(given, log)
-
-
-def _orient_output(given: argparse.Namespace, log: Log) -> Log:
-    if log.output is None:
-        raise InputError(f'{given.log}: has gyro_counts only; '
-                         'give the deg/s per count with --sensitivity')
-    return replace(log, output=-log.output) if given.invert else log
 
 
 def require_folder(path: str) -> None:

@@ -43,9 +43,6 @@ _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock dri
 _SETTLING_DURATION = 2.0
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-#: Lateness that proves a loss, s: the host may wake up later than before. It decides from 2 kHz
-#: on: without it 54 samples in 60 s of 5 kHz in bursts of 30 ms seem lost, and 3 with it.
-_MIN_LATENESS = 0.5e-3
 #: Largest lateness with a correct sequence, s, above the 16 ms of a burst. Without it, stamps at
 #: 1 kHz are 5.6 ms off instead of 0.06 ms where the host is later by 10 ms for 5 s of each 15 s.
 _OUTLIER_LATENESS = 0.02
@@ -173,9 +170,9 @@ class _LatenessTest:
         self.step, self._least = 0.0, math.inf
         # least lateness of arrivals that were not late, since the start of a window
         self._least_on_time, self._window_start = math.inf, -math.inf
-        self.first_number = self._last_arrival = self._last_silence = 0.0
+        self._last_arrival = 0.0
 
-    def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
+    def is_loss_proven(self, lateness: float, bound: float, arrival: float,
                        period: float) -> bool:
         """Add an arrival; tell whether all since `late_since` have been late, by `step`, s."""
         if lateness <= bound:
@@ -185,11 +182,9 @@ class _LatenessTest:
             self._least_on_time = min(self._least_on_time, lateness)
             return False
         silence, self._last_arrival = arrival - self._last_arrival, arrival
-        # Lateness before a silence does not show losses in the silence. Silences of one length
-        # are the period of samples whose rate fell.
-        usual, self._last_silence = max(period, self._last_silence), silence
-        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * usual):
-            self.late_since, self.first_number, self._least = arrival, number, math.inf
+        # Lateness before a silence does not show losses in the silence.
+        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
+            self.late_since, self._least = arrival, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
         # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
         # to a period and falls to zero. So its step is tested, and itself after a longer time.
@@ -243,8 +238,7 @@ class SampleClock:
         line, number, before, numbers = self._line, self._last_number, self.lost_count, []
         for following, sample in zip(reversed(range(len(samples))), samples):
             # the largest advance to a sample that has arrived
-            margin = (0.5 * max(self.period, _MIN_LATENESS) if self.is_settled
-                      else _OUTLIER_LATENESS)
+            margin = 0.5 * self.period if self.is_settled else _OUTLIER_LATENESS
             left = (arrival + margin - line.value_at(number)) / line.slope
             advance, lost = self._counter.advance(
                 sample, max(left, 1.5 * self._counter.mean_advance) if line.points else math.inf,
@@ -287,7 +281,7 @@ class SampleClock:
         unit, period = self._counter.ambiguity, self.period
         lateness = arrival - self._line.value_at(number)
         # After a restart of the sequence, all samples are off by the same part of it.
-        bound = max(period, _MIN_LATENESS) if unit < 2 else max(3.0 * period, _OUTLIER_LATENESS)
+        bound = period if unit < 2 else max(3.0 * period, _OUTLIER_LATENESS)
         if lateness < -0.5 * bound:
             excess = unit and unit * round(-lateness / (unit * period))
             if excess and excess <= self._uncertain_losses:
@@ -296,14 +290,11 @@ class SampleClock:
                 self.lost_count -= self._newly_lost
             if unit != 1:
                 self._restart_line()
-        elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, number, arrival,
-                                                    period):
+        elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, arrival, period):
             lost = unit * math.floor(self._lateness.step / (unit * period) + 0.25)
             begin, self._lateness.late_since = self._lateness.late_since, None
             assert begin is not None
-            has_slowed = ((number - self._lateness.first_number) * self._line.slope
-                          < 0.5 * (arrival - begin))
-            if lost and not has_slowed:
+            if lost:
                 self._uncertain_since = begin
                 return self._renumber(lost)
             self._restart_line()

@@ -11,16 +11,13 @@
 """
 The logs of a fleet: of which unit, type and drive each is, and its record.
 
-Unit, type and drive are in a table, in notes or in the names of files. The record has
-the calibration and the diagnosis. A single log does not distinguish slow effects (a ramp, a
-warm-up, the temperature) from the wander of the bias. Each is fitted alone with scale factor error
-and bias, to the increments of the heading over spans, with the noise of `noise_grid`. An effect
-repeats over many logs, wander does not.
+Unit, type and drive are in a table, in the names of files, or in notes. The record has the
+calibration and the diagnosis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import asdict, dataclass, replace
@@ -49,12 +46,11 @@ from gyro_calibration.files import (
     write_atomically)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.columns import find_delimiter
-from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES
-from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
+from gyro_calibration.logs.log import DataRefused, Log, QUANTITIES
+from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.logs.recording import read_file
 from gyro_calibration.logs.ros_bag import list_recording_files
-from gyro_calibration.model.channels import channels_from_log
-from gyro_calibration.model.effects import BIAS, CATALOGUE
+from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -64,14 +60,9 @@ _ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 _LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
-#: Notes and names, such as "unit: 7" and rc_car_h_unit1.csv.gz.
+#: Notes, such as "unit: 7".
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)
-_FILE_NAME_PATTERNS = {
-    'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
-    'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
-    'drive': re.compile(r'(?:^|[_.-])drive[_-]?([A-Za-z0-9]+)', re.IGNORECASE)
-}
 
 
 @dataclass(frozen=True)
@@ -218,19 +209,12 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
 
 def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None) -> FleetLog:
     """Return an entry with its empty fields filled from file name or notes."""
-    # in order of precedence: table, pattern of the user, notes, usual file names
+    # in order of precedence: table, pattern of the user, notes
     stem = re.sub(f'({"|".join(map(re.escape, sorted(_LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
         entry = entry.fill_missing(found.groupdict())
-    stated, rest = {}, stem
-    for name, shape in _FILE_NAME_PATTERNS.items():
-        if found := shape.search(rest):
-            stated[name] = found[1]
-            rest = rest.replace(found[0], '')
-    if 'unit' in stated and rest.strip('_.-'):  # the rest of the name is the drive
-        stated.setdefault('drive', rest.strip('_.-'))
-    return entry.fill_missing(_read_notes(entry.log)).fill_missing(stated)
+    return entry.fill_missing(_read_notes(entry.log))
 
 
 def _read_notes(path: str) -> dict[str, str]:
@@ -251,74 +235,28 @@ def _read_notes(path: str) -> dict[str, str]:
 
 # the record of a log
 
-#: Shortest log for slow effects and for the bias at rest, s: in less, white noise hides them.
-_MIN_LOG_DURATION = 60.0
+#: Shortest log for the bias at rest, s: in less, white noise hides its wander.
+_MIN_REST_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Schema of the records; records of another one are not read.
-_SCHEMA = 'gyro_calibration/fleet_log/2'
+_SCHEMA = 'gyro_calibration/fleet_log/3'
 
 
-def _fit_spans(log: Log, time_offset: float, heading: tuple[Array, Array] | None) -> tuple[
-        Array, Callable[..., tuple[float, float]]]:
-    """Return edges of spans of a log, s, and a fit of its headings over them; none at rest."""
+def _fit_rest(log: Log) -> tuple[float, float]:
+    """Return the bias of a log at rest, and its standard deviation beside its wander, rad/s."""
     output = np.asarray(log.output)
     known = np.isfinite(output)
-    time = np.asarray(log.time)[known] - time_offset
+    time = np.asarray(log.time)[known]
+    if len(time) < 100 or time[-1] - time[0] < _MIN_REST_DURATION:
+        raise DataRefused(f'rests for less than {_MIN_REST_DURATION:.0f} s: record for longer')
     # 60 spans of at least 2 s
     edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
-    turns: list[Array] = []
-    rate = np.zeros(len(edges))
-    if heading is not None:
-        place = np.searchsorted(heading[0], edges).clip(0, len(heading[0]) - 1)
-        edges = heading[0][np.unique(place)]
-        true = np.interp(edges, *heading)
-        turns = [np.diff(true)]
-        rate = np.gradient(true, edges) if len(true) > 1 else 0.0 * true
     increments = np.diff(np.interp(edges, time, integrate(time, output[known])))
-    noise = heading_noise(edges, rate)[:None if turns else 1]
-
-    def fit(*column: Array) -> tuple[float, float]:
-        """Fit scale factor error, bias and a column; return the last value and its deviation."""
-        found = fit_noise_grid(
-            increments, np.column_stack([*turns, np.diff(edges), *column]), noise,
-            *bias_wander_columns(edges), wandering_value=len(turns))
-        return float(found.values[-1]), float(found.deviations[-1])
-
-    return edges, fit
-
-
-def _duration(log: Log) -> float:
-    """Return the time from the first to the last output, s; 0 with less than 100 of them."""
-    time = np.asarray(log.time)[np.isfinite(np.asarray(log.output))]
-    return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
-
-
-def fit_slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]]:
-    """Return the slow effects of a log in time, by name; the gyro lags its reference, if any."""
-    assert log.time is not None
-    heading = None
-    if log.reference_heading is not None and np.isfinite(log.reference_heading).sum() > 1:
-        known = np.isfinite(log.reference_heading)
-        heading = log.time[known], log.reference_heading[known]
-    elif log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        heading = log.time, integrate(log.time, bridge_gaps(log.reference_rate))
-    if _duration(log) < _MIN_LOG_DURATION:
-        return {}
-    edges, fit = _fit_spans(log, time_offset, heading)
-    if len(edges) < 10:
-        return {}
-    channels, fits = channels_from_log(log), {}
-    for name, cause, *shapes in (  # the same time constants, s, for all logs, as they are pooled
-            ('rate_ramp', 'rate_ramp'), ('warm_up_60s', 'warm_up', 60.0),
-            ('warm_up_300s', 'warm_up', 300.0), ('bias_temperature', 'bias_temperature', 25.0)):
-        effect = CATALOGUE[cause]
-        (column,) = effect.columns(channels, *shapes)
-        if np.ptp(column) > 0.0:  # False with nan
-            angle = np.interp(edges, log.time, integrate(log.time, column))
-            fits[name] = _value_record(*fit(np.diff(angle)), effect.coefficients[0].unit)
-    return {name: each for name, each in fits.items()
-            if math.isfinite(each['deviation']) and each['deviation'] > 0.0}
+    found = fit_noise_grid(increments, np.diff(edges)[:, None],
+                           heading_noise(edges, np.zeros(len(edges)))[:1],
+                           *bias_wander_columns(edges), wandering_value=0)
+    return float(found.values[0]), float(found.deviations[0])
 
 
 @dataclass(frozen=True)
@@ -352,8 +290,7 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
     ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
     ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
-    ``slow`` the same of effects that a single log does not distinguish from the wander of the
-    bias, each fitted alone; ``diagnosis`` is a summary.
+    ``diagnosis`` is a summary.
     """
     try:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
@@ -416,7 +353,6 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
         'reason': '', 'method': method, 'samples': len(log),
         'duration_s': None if log.time is None else float(log.time[-1] - log.time[0]),
         'values': values,
-        'slow': {} if log.time is None else fit_slow_effects(log, offset[0] if offset else 0.0),
         'noise': {name: float(value) for name, value in vars(model.noise).items()},
         'diagnosis': None, 'page': ''}
     if task.generator is None:
@@ -455,10 +391,7 @@ def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[flo
     if log.time is None or log.reference_rate is not None or log.reference_heading is None:
         refuse_unusable(log)
         if log.time is not None and is_at_rest(log):
-            if _duration(log) < _MIN_LOG_DURATION:
-                raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for '
-                                  'longer')
-            bias, deviation = _fit_spans(log, 0.0, None)[1]()
+            bias, deviation = _fit_rest(log)
             walk = (white_noise_deviation(log.output, order=1)
                     * math.sqrt(float(np.median(np.diff(log.time)))))
             return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),

@@ -11,23 +11,18 @@
 """
 From the records of logs to the errors of the type, the unit and the reference.
 
-They are sentences, data, models, one page that needs nothing else, and a table of the logs.
+They are sentences, data, models, and a table of the logs.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
 import math
-from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.report import (
-    Chart, draw_chart, element, join_markup, Line, Markup, render_page)
-from gyro_calibration.diagnosis.words import (
-    as_sentence, display_unit, format_amount, format_quantity, join_list, readable_name)
+from gyro_calibration.diagnosis.words import format_amount, format_quantity, readable_name
 from gyro_calibration.files import format_rows, to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm, DRIVES, find_changes, find_outlying_groups, Interval, Observations, OWN_SHARE,
@@ -51,7 +46,6 @@ class _ValueSummary:
 
     name: str
     unit: str  # of the value, in SI
-    is_slow: bool  # an effect that one log does not distinguish from the wander of the bias
     records: Sequence[_LogRecord]  # of the logs that hold it
     components: Mapping[str, Interval]  # standard deviations
     mean: Interval  # of the type
@@ -83,7 +77,7 @@ class _ValueSummary:
 
 
 @dataclass(frozen=True)
-class _TypeSummary:
+class TypeSummary:
     """The results of one type."""
 
     name: str  # or ''
@@ -94,29 +88,28 @@ class _TypeSummary:
     significance: float  # probability of a false alarm of each kind and value
 
 
-def summarize_types(records: Sequence[_LogRecord]) -> list[_TypeSummary]:
+def summarize_types(records: Sequence[_LogRecord]) -> list[TypeSummary]:
     """Return the results of each type by records of `logs.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
-    values = {}  # the names in more than one log, and whether each is a slow effect
+    values = {}  # the names in more than one log
     for kind in types:
-        names = [(name, key == 'slow') for each in logs[kind] for key in ('values', 'slow')
-                 for name in each[key]]
+        names = [name for each in logs[kind] for name in each['values']]
         values[kind] = [name for name in dict.fromkeys(names) if names.count(name) > 1]
-    # four tests of each value: outlying units, outlying drives, changes, effects of the type; and
-    # three of the effects of diagnoses: of the type, of a unit, of a drive
-    tests = 4 * sum(map(len, values.values())) + 3 * len(types)
+    # three tests of each value: outlying units, outlying drives, changes; and three of the effects
+    # of diagnoses: of the type, of a unit, of a drive
+    tests = 3 * sum(map(len, values.values())) + 3 * len(types)
     summaries = []
     for kind in types:
         found = {}
-        for value, slow in values[kind]:
+        for value in values[kind]:
             try:
-                found[value] = _summarize_value(value, slow, logs[kind], FALSE_ALARM_RATE / tests)
+                found[value] = _summarize_value(value, logs[kind], FALSE_ALARM_RATE / tests)
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
         units, drives = (_names(logs[kind], key) for key in ('unit', 'drive'))
-        summaries.append(_TypeSummary(kind, units, drives, logs[kind], found,
-                                      FALSE_ALARM_RATE / tests))
+        summaries.append(TypeSummary(kind, units, drives, logs[kind], found,
+                                     FALSE_ALARM_RATE / tests))
     return summaries
 
 
@@ -126,15 +119,14 @@ def _names(records: Sequence[_LogRecord], key: str) -> list[str]:
                   key=lambda text: (len(text) if text.isdigit() else 0, text))
 
 
-def _summarize_value(name: str, slow: bool, records: Sequence[_LogRecord],
+def _summarize_value(name: str, records: Sequence[_LogRecord],
                      significance: float) -> _ValueSummary:
-    key = 'slow' if slow else 'values'
-    records = [each for each in records if name in each[key]]
+    records = [each for each in records if name in each['values']]
     units, drives, dates = (_names(records, kind) for kind in ('unit', 'drive', 'date'))
     unit, drive, day = (
         np.array([names.index(str(each[kind])) if each[kind] else -1 for each in records])
         for kind, names in (('unit', units), ('drive', drives), ('date', dates)))
-    value, deviation = (np.array([each[key][name][what] for each in records])
+    value, deviation = (np.array([each['values'][name][what] for each in records])
                         for what in ('value', 'deviation'))
     # age, years, and temperature, K, less their means, where they vary within units
     columns = {}
@@ -164,7 +156,7 @@ def _summarize_value(name: str, slow: bool, records: Sequence[_LogRecord],
     found_drives = pooled.estimate(drive=np.arange(len(drives)),
                                    fixed=np.zeros((len(drives), len(mean))))
     return _ValueSummary(
-        name, records[0][key][name]['unit'], slow, records, pooled.components, of_type(mean),
+        name, records[0]['values'][name]['unit'], records, pooled.components, of_type(mean),
         float(pooled.p_value(fixed=mean[None])[0]), of_type(mean, units=1.0, power_ons=1.0),
         of_units(mean), of_units(0.0 * mean), of_units(mean, power_ons=1.0),
         _by_name(drives, found_drives) if DRIVES in pooled.variance_names else {},
@@ -182,7 +174,7 @@ def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
             for name, *parts in zip(names, *vars(found).values())}
 
 
-def describe_type(summary: _TypeSummary) -> Iterator[str]:
+def describe_type(summary: TypeSummary) -> Iterator[str]:
     """Give the sentences on the origin of each value, its outliers and its changes."""
     meanings = {UNITS: 'is an error of the unit: most of its variance is between units',
                 DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
@@ -192,7 +184,7 @@ def describe_type(summary: _TypeSummary) -> Iterator[str]:
         label = readable_name(value.name)
         shares = {name: value.components[name] for name in meanings if name in value.components}
         owner = max(shares, key=lambda name: shares[name].value, default='')
-        if owner and shares[owner].low > 0.0 and not value.is_slow:
+        if owner and shares[owner].low > 0.0:
             yield f'{label} {meanings[owner]}'
         for alarms, who, differs, of in (
                 (value.outlying_units, 'unit', 'differs from its type by', ''),
@@ -204,16 +196,6 @@ def describe_type(summary: _TypeSummary) -> Iterator[str]:
                 yield (f'{label}: {who} {to_printable(alarm.name)} {differs} '
                        f'{format_amount(alarm.size, value.unit, value.name)}{since}{of} '
                        f'(probability {alarm.p_value:.1g})')
-    slow = [each for each in summary.values.values() if each.is_slow]
-    if repeating := find_missing_effects(summary):
-        first, *others = repeating
-        names = join_list([readable_name(each.name) for each in others], 'or')
-        alternatives = f'; not distinguishable from {names}' if others else ''
-        yield (f'{readable_name(first.name)}: it repeats in all units, so the model of the type '
-               f'lacks it: {first.format_interval(first.mean)}{alternatives}')
-    elif slow:
-        yield (f'{join_list([readable_name(each.name) for each in slow])}: none repeats; in '
-               'single logs they are the random walk of the bias')
     for count in count_effects(summary):
         name = to_printable(count.name)
         of_type = ('the references of all drives have it' if count.effect.startswith('reference_')
@@ -223,13 +205,6 @@ def describe_type(summary: _TypeSummary) -> Iterator[str]:
                   'drive': f'assigned to drive {name}, its reference or its vehicle'}
         yield (f'{readable_name(count.effect)}: established in {count.logs} of {count.of} logs, '
                f'of {count.units} of {len(summary.units)} units: {origin[count.owner]}')
-
-
-def find_missing_effects(summary: _TypeSummary) -> list[_ValueSummary]:
-    """Return the slow effects that repeat in all units, the most significant first."""
-    slow = [each for each in summary.values.values()
-            if each.is_slow and each.p_value < summary.significance]
-    return sorted(slow, key=lambda each: each.p_value)
 
 
 @dataclass(frozen=True)
@@ -245,7 +220,7 @@ class _EffectCount:
     chance: float  # p-value of the number of logs under false alarms only, times the candidates
 
 
-def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
+def count_effects(summary: TypeSummary) -> list[_EffectCount]:
     """
     Assign the established effects of diagnoses by the numbers of logs that show them.
 
@@ -285,14 +260,14 @@ def count_effects(summary: _TypeSummary) -> list[_EffectCount]:
     return result
 
 
-def data(summary: _TypeSummary) -> dict[str, Any]:
+def data(summary: TypeSummary) -> dict[str, Any]:
     values = {}
     for value in summary.values.values():
         keys = {UNITS: 'between_units', POWER_ONS: 'between_power_ons', DRIVES: 'between_drives',
                 OWN_SHARE: 'own_share_of_errors',
                 **{name: f'between_units_over_{over}' for name, over in zip(SLOPES, value.slopes)}}
         values[value.name] = {
-            'unit': value.unit, 'slow': value.is_slow, 'logs': len(value.records),
+            'unit': value.unit, 'logs': len(value.records),
             **{keys[name]: {'estimate': part.value, 'ci95': [part.low, part.high]}
                for name, part in value.components.items()},
             'type_mean': _interval_data(value.mean), 'new_unit': _interval_data(value.new_unit),
@@ -311,7 +286,6 @@ def data(summary: _TypeSummary) -> dict[str, Any]:
     return {'type': summary.name, 'units': list(summary.units), 'drives': list(summary.drives),
             'logs': len(summary.records), 'level': summary.significance, 'values': values,
             'effects': [asdict(each) for each in count_effects(summary)],
-            'lacking': [each.name for each in find_missing_effects(summary)],
             'sentences': list(describe_type(summary))}
 
 
@@ -321,7 +295,7 @@ def _interval_data(interval: Interval) -> dict[str, Any]:
             'ci95': ends if all(map(math.isfinite, ends)) else None}
 
 
-def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
+def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     """
     Give for a further unit of a type, with the name '', and for each unit: name and model.
 
@@ -333,7 +307,7 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
         terms, variances, tolerances = [], [], {'bias': 0.0, 'scale_factor_error': 0.0}
         for name, each in summary.values.items():
             # the time offset of logs is that of their references
-            if each.is_slow or name not in CATALOGUE or name == 'time_offset':
+            if name not in CATALOGUE or name == 'time_offset':
                 continue
             effect, found = CATALOGUE[name], each.next_power_on.get(unit, each.new_unit)
             # of the normal distribution with this interval
@@ -356,111 +330,6 @@ def build_models(summary: _TypeSummary) -> Iterator[tuple[str, GyroModel]]:
             tolerance=Tolerance(**tolerances))
 
 
-# the page, and a table for other programs
-
-def render_fleet_page(types: Sequence[_TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
-    used = sum(len(found.records) for found in types)
-    title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
-             f'{len(types)} {"type" if len(types) == 1 else "types"}')
-    about = f'{len(records) - used} more logs are excluded.' if used < len(records) else None
-    names = list(dict.fromkeys(name for each in records for name in each.get('values', ())))
-    heads = ['log', 'type', 'unit', 'drive', 'date', *map(readable_name, names), 'diagnosis',
-             'remark']
-    rows = []
-    for each in records:
-        file = each['log'].rpartition('/')[2]
-        link = element('a', file, href=each['page']) if each.get('page') else file
-        cells = []
-        for name in names:
-            value = each.get('values', {}).get(name)
-            cells.append(_cell('') if value is None else _cell(format_quantity(
-                Estimate.from_half_width(value['value'], NORMAL_QUANTILE_975 * value['deviation'],
-                                         value['unit']), name), value['value']))
-        rows.append([element('td', link, data_key=file),
-                     *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *cells,
-                     _cell((each.get('diagnosis') or {}).get('verdict', '')),
-                     _cell(each['reason'])])
-    body = join_markup(
-        element('header', element('p', 'Fleet', class_='about'), element('h1', title),
-                element('p', about, class_='gained') if about else None),
-        element('main', *(part for place, found in enumerate(types)
-                          for part in _type_sections(found, f't{place}')),
-                element('section', element('h2', 'Logs'), _table(heads, rows))),
-        Markup(Path(__file__).with_name('tables.html').read_text(encoding='utf-8')))
-    return render_page(f'Fleet: {title}', body)
-
-
-def _type_sections(summary: _TypeSummary, key: str) -> Iterator[Markup]:
-    name, of_type = summary.name or 'Type not stated', summary.values.values()
-    per, drifts = {'age': '/year', 'temperature': '/K'}, any(each.slopes for each in of_type)
-    heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
-             *(['drift'] if drifts else [])]
-    variances = _table(heads, [
-        [_cell(readable_name(each.name)), _interval_cell(each, each.mean),
-         _interval_cell(each, each.new_unit),
-         *(_cell(each.format_component(part), each.components[part].value
-                 if part in each.components else -1.0) for part in COMPONENT_LABELS),
-         *([_cell('; '.join(each.format_interval(slope, per[over])
-                            for over, slope in each.slopes.items()))] if drifts else [])]
-        for each in of_type])
-    items = [element('li', as_sentence(text)) for text in describe_type(summary)]
-    yield element('section', element('h2', name), element('ul', *items), variances)
-
-    values = [each for each in of_type if not each.is_slow]
-    alarms = {'stands out': {alarm.name for each in of_type for alarm in each.outlying_units},
-              'changed': {alarm.name for each in of_type for alarm in each.changes}}
-    logs = Counter(each['unit'] for each in summary.records)
-    of_units = _table(['unit', 'logs', *(readable_name(each.name) for each in values), 'remark'], [
-        [_cell(unit), _cell(str(logs[unit]), logs[unit]),
-         *(_interval_cell(each, each.units.get(unit)) for each in values),
-         _cell(', '.join(text for text, names in alarms.items() if unit in names))]
-        for unit in summary.units])
-    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
-    drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
-              for each in of_type if each.drives]
-    for heading, charts, text, more in (
-            ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
-             of_units),
-            ('drives', drives, 'An error that all units of a drive have in common is assigned to '
-             'its reference or to the vehicle.', None)):
-        if charts or more:
-            yield element('section', element('h2', f'{name}: {heading}'),
-                          element('p', text, class_='quiet'),
-                          element('div', *map(draw_chart, charts), class_='pairs'), more)
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
-    """Return a table to sort; one of many rows is scrolled and has a search field."""
-    head = element('tr', *(element('th', each, scope='col') for each in heads))
-    table = element('table', element('thead', head),
-                    element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
-    return element('div', table, class_=f'scroll fold{" tall" * (len(rows) > 12)}', tabindex='0')
-
-
-def _cell(text: str, key: float | None = None) -> Markup:
-    return element('td', text, data_key=text if key is None else f'{key:.9g}')
-
-
-def _interval_cell(value: _ValueSummary, interval: Interval | None) -> Markup:
-    return (_cell('') if interval is None
-            else _cell(value.format_interval(interval), interval.value))
-
-
-def _interval_chart(value: _ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
-                    style: str) -> Chart:
-    unit, factor = display_unit(value.unit, value.name)
-    low, high = (np.array([getattr(each, end) for each in intervals.values()])
-                 for end in ('low', 'high'))
-    lines = [Line(kind, style, 0.5 * factor * (high + low),
-                  0.5 * factor * (high - low) / NORMAL_QUANTILE_975, draw_dots=True)]
-    return Chart(f'{key}-{value.name}-{kind}s', f'{readable_name(value.name)} by {kind}',
-                 f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
-                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(intervals)}.',
-                 kind, '', np.arange(1.0, len(intervals) + 1.0), readable_name(value.name), unit,
-                 lines, x_names=list(intervals))
-
-
 def log_table(records: Sequence[Mapping[str, Any]]) -> str:
     """Return the values of logs as CSV, one row a log, in SI."""
     rows = []
@@ -468,7 +337,7 @@ def log_table(records: Sequence[Mapping[str, Any]]) -> str:
         rows.append({key: record.get(key) for key in (
             'log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')})
-        for name, value in (record.get('values', {}) | record.get('slow', {})).items():
+        for name, value in record.get('values', {}).items():
             rows[-1] |= {name: value['value'], f'{name}_deviation': value['deviation']}
     columns = dict.fromkeys(key for row in rows for key in row)
     return format_rows([columns, *([row.get(key) for key in columns] for row in rows)])

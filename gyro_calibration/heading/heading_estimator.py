@@ -264,17 +264,6 @@ class HeadingEstimator:
                 else max(now - self._start_time, 0.0))
 
     @property
-    def current_calibration(self) -> SelfCalibration:
-        """Return the calibration at this temperature; an unknown scale has infinite variance."""
-        used = (self.current_model.self_calibration
-                or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0))))
-        assert used.covariance is not None  # an unknown one is assumed
-        variance = self.bias_variance / used.scale ** 2
-        change, _ = self._bias_change(self._time, self.temperature, 0.0)
-        return replace(used, bias=used.bias + float(change),
-                       covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
-
-    @property
     def bias_variance(self) -> float:
         """Return the variance of the corrected rate at rest by the calibration, (rad/s)²."""
         return float(quadratic_form(self.covariance, self._rest_sensitivity))

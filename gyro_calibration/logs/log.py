@@ -17,7 +17,7 @@ names each column with its unit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv
 from dataclasses import dataclass, field, replace
@@ -54,9 +54,7 @@ NORMAL_QUANTILE_975 = 1.96
 CACHE_BLOCK_SAMPLES = 1 << 15
 BLOCK_ROWS = 1 << 16  # rows in a block of a log
 MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
-#: Largest number of characters of a line; and of notes and header, of a block of lines, or of a
-#: row that spans several lines.
-_MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24
+_MAX_LINE_LENGTH = 1 << 16  # characters
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
@@ -132,78 +130,41 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     be a comma.
     `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
     """
-    blocks, numbers = [], 0
-    for block in _read_blocks(path, sensitivity, rate, columns, axis, on_progress):
-        arrays, others, notes = block
-        numbers += len(next(iter(arrays.values()))) * (len(arrays) + 10 * len(others))
-        if numbers > _MAX_LOG_VALUES:
-            raise LogError(f'{path}: has more than {_MAX_LOG_VALUES} numbers, which is above the '
-                           'limit of memory; split it')
-        blocks.append(block)
-    arrays = {quantity: np.concatenate([block[0][quantity] for block in blocks])
-              for quantity in arrays}
-    others = {name: tuple(itertools.chain.from_iterable(block[1][name] for block in blocks))
-              for name in others}
-    _replace_attitude(arrays, axis)
-    return Log(**arrays, notes=notes, others=others)
-
-
-def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-                    columns: Mapping[str, str] = {}, axis: str = 'z',
-                    on_progress: Callable[[int], object] | None = None) -> Iterator[Log]:
-    """
-    Read a log file as `read_log`, in blocks, so that memory does not grow with its length.
-
-    A block has `BLOCK_ROWS` rows; the last one may have fewer, as may blocks with texts that span
-    lines. The columns name no attitude, which needs the whole log.
-    """
-    for arrays, others, notes in _read_blocks(path, sensitivity, rate, columns, axis,
-                                              on_progress):
-        yield Log(**arrays, notes=notes, others=others)
-
-
-def _read_blocks(path: str | Path, sensitivity: float | None, rate: float | None,
-                 columns: Mapping[str, str], axis: str, on_progress: Callable[[int], object] | None
-                 ) -> Iterator[tuple[dict[str, Any], dict[str, tuple[str, ...]], tuple[str, ...]]]:
-    """Give quantity -> values in SI, other columns as text, and the notes, of each block."""
-    # after each block, `on_progress` takes the number of bytes read, unless from a pipe
+    blocks: list[tuple[dict[str, Any], dict[str, tuple[str, ...]]]] = []
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
-    with _convert_read_errors(path), open_regular_file(
-            path, allow_pipes=True) as file, io.TextIOWrapper(
+    with _convert_read_errors(path), open_regular_file(path) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig', newline='') as text:
-        lines = _iter_lines(text)
-        table, first_line = _read_header(_limit_length(lines), columns, axis)
+        lines = _iter_lines(text, ExpansionBudget(path) if compressed else None)
+        table, first_line = _read_header(lines, columns, axis)
         if table.delimiter == ' ':  # of which there may be several
             lines = (' '.join(line.split()) + '\n' for line in lines)
-        budget = ExpansionBudget(path) if compressed and file.seekable() else None
         if rate is not None:
             table.columns.pop('time', None)
-        while True:
-            block, length = list[str](), 0  # fewer lines where they are long
-            while (length < _MAX_BLOCK_LENGTH and (
-                    more := list(itertools.islice(lines, min(BLOCK_ROWS - len(block), 256))))):
-                block += more
-                length += sum(map(len, more))
-            if not block:
-                break
-            if budget:
-                budget.spend(sum(map(len, block)))
+        while block := list(itertools.islice(lines, BLOCK_ROWS)):
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
+            if count * (len(arrays) + 10 * len(others)) > _MAX_LOG_VALUES:
+                raise LogError(f'has more than {_MAX_LOG_VALUES} numbers, which is above the '
+                               'limit of memory; split it')
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
             last = _refuse_unordered_time(places, arrays.get('time'), last)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
-            if on_progress is not None and file.seekable():
+            if on_progress is not None:
                 on_progress(file.tell())
-            if count > 1:
-                yield arrays, others, table.notes
+            blocks.append((arrays, others))
         if count < 2:
             raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
                            'more')
+    arrays = {quantity: np.concatenate([part[quantity] for part, _ in blocks])
+              for quantity in arrays}
+    _replace_attitude(arrays, axis)
+    return Log(**arrays, notes=table.notes, others={
+        name: tuple(itertools.chain.from_iterable(texts[name] for _, texts in blocks))
+        for name in others})
 
 
 class ExpansionBudget:
@@ -237,27 +198,19 @@ def _convert_read_errors(path: str | Path) -> Iterator[None]:
                        'wanted a CSV file, .csv or .csv.gz') from error
 
 
-def _iter_lines(text: io.TextIOWrapper) -> Iterator[str]:
+def _iter_lines(text: io.TextIOWrapper, budget: ExpansionBudget | None) -> Iterator[str]:
     """Give the lines of a file, without empty ones at its end."""
     empty: list[str] = []
     for line in iter(partial(text.readline, _MAX_LINE_LENGTH + 1), ''):
-        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _MAX_BLOCK_LENGTH:
+        if budget:
+            budget.spend(len(line))
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < BLOCK_ROWS:
             empty.append(line)
             continue
         if len(line) > _MAX_LINE_LENGTH:
             raise csv.Error(f'a line has more than {_MAX_LINE_LENGTH} characters')
         yield from empty
         empty.clear()
-        yield line
-
-
-def _limit_length(lines: Iterator[str]) -> Iterator[str]:
-    left = _MAX_BLOCK_LENGTH
-    for line in lines:
-        left -= len(line)
-        if left < 0:
-            raise csv.Error(f'a row, or what is before the first, has more than '
-                            f'{_MAX_BLOCK_LENGTH} characters')
         yield line
 
 
@@ -327,8 +280,7 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
 def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_line: int,
                      table: _FileHeader) -> _ParsedRows:
     """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
-    reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines)),
-                        delimiter=table.delimiter)
+    reader = csv.reader(itertools.chain(lines, remaining_lines), delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
@@ -604,34 +556,29 @@ def refuse_wrapped(log: Log) -> None:
                           f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
 
 
-def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
+def write_log(path: str | Path, log: Log, more: Mapping[str, Array] = {}) -> None:
     """
     Write a log, .csv or .csv.gz, in SI columns and its other columns, atomically.
 
     `more` holds further columns: name -> array of shape (n,).
     """
-    write_log_blocks(path, [(log, more or {})])
-
-
-def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
-    """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
+    columns: dict[str, Any] = {
+        name: getattr(log, quantity) for name, (quantity, factor) in COLUMNS.items()
+        if factor == 1.0 and getattr(log, quantity) is not None}
+    texts = {name: list(map(_normalize_newlines, texts)) for name, texts in log.others.items()}
+    columns |= texts | {name: np.asarray(values, dtype=float) for name, values in more.items()}
     with (open_replacement(path) as file,
           # without a time, so that the same log gives the same file
           gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
           if str(path).endswith('.gz') else nullcontext(file) as data):
-        for number, (log, more) in enumerate(blocks):
-            columns: dict[str, Sequence[Any]] = {
-                name: getattr(log, quantity).tolist()
-                for name, (quantity, factor) in COLUMNS.items()
-                if factor == 1.0 and getattr(log, quantity) is not None}
-            columns |= {name: list(map(_normalize_newlines, texts))
-                        for name, texts in log.others.items()}
-            columns |= {name: np.asarray(values, dtype=float).tolist()
-                        for name, values in more.items()}
-            notes = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
-            head = '' if number else notes + format_rows([columns])
-            data.write((head + format_rows(zip(*columns.values()))).encode(
-                'utf-8', 'backslashreplace'))
+        text = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
+        text += format_rows([columns])
+        for begin in range(0, len(log), BLOCK_ROWS):
+            parts = (each[begin:begin + BLOCK_ROWS] for each in columns.values())
+            text += format_rows(zip(*(part if isinstance(part, list) else part.tolist()
+                                      for part in parts)))
+            data.write(text.encode('utf-8', 'backslashreplace'))
+            text = ''
 
 
 def _normalize_newlines(text: str) -> str:

@@ -42,7 +42,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION, Motion, motion_from_headings, motion_from_rates, MotionError, read_motion)
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
+from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.ros.inputs import (
     Clock, FAULT_DURATION, MAX_ANGULAR_ACCELERATION, node_time, StampDelay, Velocity)
 from gyro_calibration.ros.state_store import StateStore
@@ -81,8 +81,8 @@ class CalibrationRun:
     outputs: list[float] = field(default_factory=list)  # rad/s
     rates: list[float] = field(default_factory=list)  # after the model, rad/s
     temperatures: list[float] = field(default_factory=list)  # degC
-    #: Stamp, s, heading, rad, rate, rad/s, and time behind the gyro, s, of each odometry message.
-    odometry: list[tuple[float, float, float, float]] = field(default_factory=list)
+    #: Stamp, s, heading, rad, and rate, rad/s, of each odometry message.
+    odometry: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, time: float, output: float, rate: float, temperature: float | None) -> None:
         """Add a sample; temperature in degC, or None if unknown."""
@@ -119,29 +119,6 @@ class CalibrationRun:
     def max_duration(self) -> float:
         """Return the longest duration of the run, s."""
         return FINISH_TIMEOUT if math.isinf(self.duration) else self.duration + self.extra_duration
-
-    @property
-    def odometry_fault(self) -> str:
-        """Return a sentence on odometry of another clock, with a gap or a jump; else ''."""
-        if self.kind != ODOMETRY or len(self.odometry) < 2 or not self.times:
-            return ''
-        at, headings, rates, lateness = np.array(self.odometry).T
-        at -= self.times[0]
-        if abs(late := float(np.median(lateness))) > self.limits.max_time_offset:
-            return describe_odometry_clock(late)
-        intervals, turns = np.diff(at), np.abs(np.diff(np.unwrap(headings)))
-        gap, largest = int(intervals.argmax()), 4.0 * float(np.median(intervals))
-        if intervals[gap] > max(self.limits.max_gap, largest):
-            return (f'no message came on odom for {intervals[gap]:.1f} s, from {at[gap]:.1f} s of '
-                    'the run on: check the odometry and its connection, and run again')
-        # by neither rate the robot turned as far from one message to the next
-        excess = turns - max(np.abs(rates).max(), np.abs(self.rates).max()) * intervals
-        jump = int(excess.argmax())
-        if excess[jump] > MIN_TURN_ANGLE:
-            return (f'the heading of odom jumps by {turns[jump] / DEGREE:.0f} deg at '
-                    f'{at[jump]:.1f} s of the run, as where its node restarts or its pose is set: '
-                    'run again without that')
-        return ''
 
     @property
     def status(self) -> str:
@@ -307,10 +284,10 @@ class CalibrationSession:
             self.end(reason)
         self._command_if_due()
 
-    def add_odometry(self, time: float, heading: float, rate: float, late: float) -> None:
-        """Add a heading, rad, and a rate, rad/s, of odometry that is late for the gyro, s."""
+    def add_odometry(self, time: float, heading: float, rate: float) -> None:
+        """Add a heading, rad, and a rate, rad/s, of odometry."""
         if self.run:
-            self.run.odometry.append((time, heading, rate, late))
+            self.run.odometry.append((time, heading, rate))
         since = self._clock.steady() - self._stop_time
         alone = self._last_foreign_command < self._stop_time and not self._drive
         if (alone and _STOPPING_DURATION < since < 2.0 * _STOPPING_DURATION
@@ -439,8 +416,8 @@ class CalibrationSession:
             if run.end_reason:
                 raise DataRefused(run.end_reason)
             now = datetime.fromtimestamp(self._clock.date(), timezone.utc)
-            noise = estimator.model.noise
-            calibration, remark = fit_run(run, noise, now.isoformat(timespec='seconds'),
+            calibration, remark = fit_run(run, estimator.model.noise,
+                                          now.isoformat(timespec='seconds'),
                                           estimator.model.prior_deviations)
             if run.kind == REST:  # the scale factor error in use is kept
                 used = estimator.current_model.self_calibration
@@ -451,16 +428,13 @@ class CalibrationSession:
                 calibration = replace(
                     calibration, scale_factor_error=last.scale_factor_error,
                     covariance=((known[0][0], 0.0), (0.0, calibration.covariance[1][1])))
-            difference = describe_change(estimator.current_calibration, calibration, noise,
-                                         estimator.bias_age(now.timestamp()))
             trouble = self._store.store_calibration(calibration)
             estimator.use_calibration(self._store.model, now.timestamp())
             self._monitor.reset_biases()
             return True, '; '.join(filter(None, [
-                f'{calibration}, from {len(run.times)} samples', remark, difference, trouble]))
+                f'{calibration}, from {len(run.times)} samples', remark, trouble]))
         except DataRefused as error:
-            cause = ('' if run.end_reason else drive.describe_lateness(run.limits) if drive
-                     else run.odometry_fault)
+            cause = drive.describe_lateness(run.limits) if drive and not run.end_reason else ''
             return False, f'{cause} (the run shows: {error})' if cause else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
@@ -470,17 +444,11 @@ class CalibrationSession:
             self.run = self._drive = None
 
 
-def describe_odometry_clock(late: float) -> str:
-    """Say that the stamps of odometry are behind those of the gyro by a time, s."""
-    return (f'odom is stamped {abs(late):.1f} s {"behind" if late > 0.0 else "ahead of"} '
-            'imu/data_raw: stamp both by one clock, or synchronize those of their computers')
-
-
 def _refuse_turn_at_rest(run: CalibrationRun) -> None:
     """Refuse a rest in which odometry, if there is any, shows a turn."""
     if len(run.odometry) < 2:
         return
-    at, headings, rates, _ = np.array(run.odometry).T
+    at, headings, rates = np.array(run.odometry).T
     turned = max(float(np.mean(rates) * np.ptp(at)),
                  float(np.unwrap(headings)[-1] - headings[0]), key=abs)
     if abs(turned) > MIN_TURN_ANGLE:
@@ -498,7 +466,7 @@ def _find_motion(run: CalibrationRun) -> tuple[float, Motion]:
             f'{len(rows)} messages came on odom with an orientation and a rate in '
             f'{run.duration:.0f} s, but at least 10 are needed: check the topic, its '
             'quaternions, which have the length 1, and its twist')
-    at, headings, rates, _ = rows.T
+    at, headings, rates = rows.T
     if not (np.diff(at) > 0.0).all():
         raise DataRefused('the messages on odom do not have increasing stamps: check that one '
                           'node publishes them')

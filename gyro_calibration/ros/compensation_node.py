@@ -173,12 +173,9 @@ class CompensationNode(Node):
         """Publish the received message with its z corrected, and the heading."""
         x, y = imu.angular_velocity.x, imu.angular_velocity.y
         xx, xy, _, yx, yy, *_ = imu.angular_velocity_covariance.tolist()
-        if not math.isfinite(x + y + xx + xy + yx + yy):
+        if not math.isfinite(x + y + xx + xy + yx + yy) or min(xx, yy) < 0.0:
             x = y = xy = yx = 0.0
             xx = yy = UNMEASURED_VARIANCE
-        elif xx < 0.0 or yy < 0.0:
-            xx = yy = UNMEASURED_VARIANCE
-            xy = yx = 0.0
         elif not (xx or yy):  # all zeros: not known
             xx = yy = self._pipeline.values.assumed_bias ** 2
         acceleration = imu.linear_acceleration

@@ -29,7 +29,6 @@ from gyro_calibration.heading.integration import Intervals, RECENT_DURATION
 from gyro_calibration.heading.tracker import NOISE_TOLERANCE
 from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.logs.quality import quantization_step
-from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.inputs import (
     FAULT_DURATION, MAX_ANGULAR_ACCELERATION, MIN_ODOMETRY_TURN_RATE)
@@ -403,28 +402,3 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
         math.sqrt(measured / claimed), not (too_much or too_little), mean, sigmas,
         not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level,
         math.sqrt(of_noise + noise.mean_change_variance(duration, duration)))
-
-
-def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise,
-                    age: float) -> str:
-    """
-    Return a sentence on the change of a calibration after some time, s, beyond noise, or ''.
-
-    The noise is that of the model, for the drift of the bias; one report in a thousand is false.
-    An infinite variance is that of an unknown value.
-    """
-    if previous.covariance is None or current.covariance is None:
-        return ''
-    scale, bias = (np.diagonal(previous.covariance) + np.diagonal(current.covariance)).tolist()
-    found = []
-    change = current.scale_factor_error - previous.scale_factor_error
-    turned = current.bias - previous.bias
-    for name, size, text, variance in (
-            ('scale factor error', change, f'{100.0 * change:.3f} %', scale),
-            ('bias', turned, f'{turned / DEGREE:.4f} deg/s',
-             bias + noise.mean_change_variance(age, REST_DURATION))):
-        sigmas = float(np.abs(size) / np.sqrt(variance))
-        if math.erfc(sigmas / math.sqrt(2.0)) < 0.5e-3:
-            found.append(f'the {name} changed by {text} ({sigmas:.1f} sigma)')
-    return (f'{" and ".join(found)}, more than the model predicts; '
-            'if this occurs again, diagnose a log' if found else '')

@@ -202,57 +202,34 @@ class StampDelay:
         return ''
 
 
-#: Number of the last stamps that show their order: a burst of them may come in any order.
-_ORDERED_STAMPS = 24
+_STEADY_STAMPS = 24  # late ones at equal intervals, which have a clock of their own
 
 
 class ArrivalOrder:
     """
-    Order of the stamps of one publisher, of which others may have overtaken some: late ones.
+    Order of the stamps of one publisher, of which some may come late: after a later one.
 
-    A late stamp fits in where the stamps around it leave half of their median spacing. Of two in a
-    row that do not, though they increase, the clock was set back. Late stamps at equal intervals,
-    up to a factor of two, have a clock of their own: that of a second gyro where others come in
-    between, else one that was set back.
+    Three late ones in a row are those of a clock that was set back. Late ones at equal intervals,
+    up to a factor of two, while others come in between are of a second gyro.
     """
 
     def __init__(self) -> None:
-        self.has_two_clocks, self._in_time_count = False, 0
-        self._misfit = self._spacing = 0  # ns
-        self.missing_duration = 0  # by a clock that was set back by up to two spacings, ns
-        # the last ones that fit in, ns; the spacing is that before a burst
-        self._stamps = deque[int](maxlen=2 * _ORDERED_STAMPS)
-        # stamps of late ones, ns, and the number of those in time so far
-        self._late = deque[tuple[int, int]](maxlen=_ORDERED_STAMPS)
+        self.has_two_clocks, self._last, self._late_in_a_row = False, -1, 0
+        self._late = deque[int](maxlen=_STEADY_STAMPS)  # stamps, ns
 
     def is_late(self, stamp: int) -> bool:
         """Add a stamp, ns, and tell whether it is late; not if its clock was set back."""
-        misfit, self._misfit, self.missing_duration = self._misfit, 0, 0
-        last = max(self._stamps, default=stamp)
-        if stamp >= last:
-            if misfit and stamp - last < 0.5 * self._spacing:
-                self.missing_duration = last + 2 * self._spacing - stamp
-            self._stamps.append(stamp)
-            self._in_time_count += 1
+        self._late_in_a_row += 1
+        if stamp >= self._last or self._late_in_a_row > 2:
+            if stamp < self._last:
+                self._late.clear()
+            self._last, self._late_in_a_row = stamp, 0
             return False
-        self._late.append((stamp, self._in_time_count))
-        late, counts = np.array(self._late).T
-        apart = np.diff(late)
-        self._spacing = int(np.median(np.diff(np.sort(self._stamps)))) if len(
-            self._stamps) >= _ORDERED_STAMPS else 0
-        is_steady = len(late) == _ORDERED_STAMPS and 0 < apart.max() < 2 * apart.min()
-        self.has_two_clocks = is_steady and counts[0] < counts[-1]
-        fits = not self._spacing or min(self._stamps) < stamp and min(
-            abs(each - stamp) for each in self._stamps) > 0.5 * self._spacing
-        is_set_back = is_steady and not self.has_two_clocks or not fits and 0 < misfit < stamp
-        if is_set_back:
-            self._stamps.clear()
-            self._late.clear()
-        if fits or is_set_back:
-            self._stamps.append(stamp)
-        else:
-            self._misfit = stamp
-        return not is_set_back
+        self._late.append(stamp)
+        apart = np.diff(self._late)
+        self.has_two_clocks = bool(len(self._late) == _STEADY_STAMPS
+                                   and 0 < apart.max() < 2 * apart.min())
+        return True
 
 
 class RosTime:
@@ -316,8 +293,7 @@ class TurnComparison:
     beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
     wheels; a robot may be turned by others than the commands, or scale them. So against commands
     the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s. Odometry that turns
-    further by that mean, and faster than as many rad/s, is in deg/s.
+    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
 
     The sensitivity of the gyro is wrong where it turns further than odometry from one standstill
     to the next, twice in a row and by more than the largest scale factor error that a calibration
@@ -326,7 +302,7 @@ class TurnComparison:
 
     def __init__(self) -> None:
         # found twice in a row, each a sentence or ''; and what the last turn shows
-        self.faults, self._last_faults = (dict.fromkeys(('turn', 'unit', 'scale'), '')
+        self.faults, self._last_faults = (dict.fromkeys(('turn', 'scale'), '')
                                           for _ in range(2))
         self._source = ''
         self._stood_at, self._since_standstill = math.nan, 0.0  # by the gyro and wheels, rad
@@ -381,10 +357,6 @@ class TurnComparison:
                         or is_odometry and ratio < -0.5)
             self._check('turn', is_wrong * (f'{shown}: check the unit and the sense of rotation '
                                             f'of the gyro, and those of {source}'))
-            is_smaller = is_odometry and abs(ratio) < 1.0 / between
-            if not is_smaller or abs(self._by_wheels) > between * self._duration:
-                self._check('unit', is_smaller * (f'{shown}: check the unit of odom, as no robot '
-                                                  'turns so fast'))
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
     def _check(self, name: str, fault: str) -> None:
@@ -411,15 +383,13 @@ class AlternateTurns:
     by more than the largest scale factor error that a calibration accepts, in the same proportion
     in turns of a row whose sense changes twice: samples of another gyro, with another axis or
     without a function, have the same topic and frame. A vibration near half the sample rate has
-    the opposite proportion in the other sense. Where the stamps alternate between two intervals
-    that differ as much, two such turns in a row suffice. Turns of less than 0.025 rad/s do not
-    count, as the biases of the two may differ.
+    the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
+    biases of the two may differ.
     """
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, float]] = []  # the last ones, up to 2; s and rad/s
-        self._turned, self._between = 0.0, 0.0  # rad
-        self._duration = self._before = 0.0  # s, and the part before each sample between, s
+        self._turned = self._between = self._duration = 0.0  # rad, rad, s
         # difference over sum in turns of a row, their last sense, and how often it changed
         self._share, self._sense, self._changes = math.nan, 0.0, 0
         self.is_contradictory = False
@@ -429,31 +399,25 @@ class AlternateTurns:
         self._samples.append((time, rate))
         if len(self._samples) < 3:
             return
-        (begin, before), (place, middle), _ = self._samples
+        (begin, before), (_, middle), _ = self._samples
         self._samples, interval = self._samples[2:], time - begin
-        if not 0.0 < interval <= MAX_VELOCITY_AGE:
-            self._turned = self._between = self._duration = self._before = 0.0
-            return
-        # the mean of both neighbours is the rate between them also while the robot accelerates
-        self._turned += 0.5 * (before + rate) * interval
-        self._between += middle * interval
-        self._duration += interval
-        self._before += place - begin
-        total = self._turned + self._between
-        if abs(total) > 1.0:  # rad
-            apart = self._turned - self._between
-            allowed, share = RunLimits.max_scale_factor_error, apart / total
-            after = self._duration - self._before
-            is_uneven = abs(self._before - after) > allowed * max(self._before, after)
-            if not abs(apart) > allowed * max(abs(self._turned), abs(self._between)):
-                share = math.nan
-            is_alike = abs(share - self._share) <= allowed * abs(share)
-            self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
-            self.is_contradictory = self._changes > 1 or is_alike and is_uneven
-            self._share, self._sense = self._share if is_alike else share, total
-        elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
-            return
-        self._turned = self._between = self._duration = self._before = 0.0
+        if 0.0 < interval <= MAX_VELOCITY_AGE:
+            # the mean of both neighbours is the rate between them also while the robot accelerates
+            self._turned += 0.5 * (before + rate) * interval
+            self._between += middle * interval
+            self._duration += interval
+            total, apart = self._turned + self._between, self._turned - self._between
+            if abs(total) > 1.0:  # rad
+                allowed, share = RunLimits.max_scale_factor_error, apart / total
+                if not abs(apart) > allowed * max(abs(self._turned), abs(self._between)):
+                    share = math.nan
+                is_alike = abs(share - self._share) <= allowed * abs(share)
+                self._changes = is_alike * (self._changes + (total * self._sense < 0.0))
+                self.is_contradictory = self._changes > 1
+                self._share, self._sense = self._share if is_alike else share, total
+            elif self._duration * MIN_ODOMETRY_TURN_RATE <= 1.0:
+                return
+        self._turned = self._between = self._duration = 0.0
 
 
 class Wheels:

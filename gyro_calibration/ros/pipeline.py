@@ -43,8 +43,8 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, describe_odometry_clock, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION,
-    MIN_TURN_ANGLE, REST, ROS_TIME_PAUSED)
+    CalibrationSession, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION, MIN_TURN_ANGLE, REST,
+    ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
 from gyro_calibration.ros.inputs import (
@@ -177,7 +177,6 @@ class Pipeline:
         self._frozen_stamp: tuple[float, float] | None = None
         # that the gyro is dead, or may be so
         self.repeat_fault = self.repeat_suspicion = ''
-        self.heading_loss, self._last_variance = '', 0.0  # why the heading is unknown; rad²
         self.repeat_detector = RepeatedOutputDetector(noise)
         self._pulse_detector, self._outlier_count = PulseDetector(), 0
         self.clock_fault = self._suspected_clock_fault = ''
@@ -276,7 +275,7 @@ class Pipeline:
         if math.isfinite(heading) and math.isfinite(rate):
             self._compare_turns(ODOMETRY, time, rate,
                                 not velocity.is_moving and not self._is_odometry_contradictory)
-            self.session.add_odometry(time, heading, rate, late)
+            self.session.add_odometry(time, heading, rate)
 
     def _compare_turns(self, source: str, time: float, rate: float, stands: bool = False) -> None:
         """Compare the heading with a rate by odometry or commands, and add an unknown turn."""
@@ -308,6 +307,15 @@ class Pipeline:
                 + bool(self.repeat_suspicion) * math.tau ** 2)
 
     @property
+    def heading_loss(self) -> str:
+        """Return that the heading is unknown, in a sentence; else ''."""
+        if not self._noise_is_known or self.heading_variance < math.tau ** 2:
+            return ''
+        event = self.journal.event or 'the errors of scale factor and bias have added up'
+        return (f'the heading is unknown (the last event: {event}): call reset_heading where it '
+                'is to be zero')
+
+    @property
     def _is_odometry_contradictory(self) -> bool:
         return self._clock.steady() - self._contradiction_time <= 600.0  # s
 
@@ -330,7 +338,8 @@ class Pipeline:
                 'imu/data_raw advanced faster or slower for a time than before: check that the '
                 'driver stamps by a clock and loses no samples, then reset the heading'),
             'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came) * (
-                describe_odometry_clock(late)),
+                f'odom is stamped {abs(late):.1f} s {"behind" if late > 0.0 else "ahead of"} '
+                'imu/data_raw: stamp both by one clock, or synchronize those of their computers'),
             'odometry': self._is_odometry_contradictory * (
                 'odom turns by its headings while its rate is zero: check its twist, without '
                 'which it does not show that the robot stands'),
@@ -372,8 +381,6 @@ class Pipeline:
             if self._order.has_two_clocks:
                 self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
             return None
-        if missing := self._order.missing_duration:
-            self.estimator.tracker.add_unknown_turn(1e-9 * missing * abs(self.estimator.rate))
         self._detect_several_gyros(stamp, frame, now, silence)
         if 0.0 < (interval := 1e-9 * (stamp - self._last_stamp)) <= self.values.maximum_gap:
             self._intervals.add(interval)
@@ -421,11 +428,8 @@ class Pipeline:
         lasts, text = now - first, f'{stamp / NSEC_PER_SEC:.3f} s'
         if time == self._last_time:
             self._frozen_stamp = first, max(fastest, abs(output))
-            self.journal.event = (
-                f'the stamp stands still at {text}; the sample is not used: check that the driver '
-                'stamps its samples' if lasts > FAULT_DURATION else
-                f'several samples have the stamp {text}, as where a driver stamps a queue on its '
-                'arrival; only the first of them is used: stamp when the gyro measures')
+            self.journal.event = (f'several samples have the stamp {text}, and only the first is '
+                                  'used: check that the driver stamps each when the gyro measures')
             return True
         self._frozen_stamp = None
         if lasts > FAULT_DURATION:
@@ -521,16 +525,6 @@ class Pipeline:
                                 estimator.rate, tracker.rate_variance + spread)
         if not math.isfinite(sum(found[1:])):
             return None
-        before, self._last_variance = self._last_variance, found.heading_variance
-        if not known or self._last_variance < math.tau ** 2:
-            self.heading_loss = ''
-        elif before < math.tau ** 2:
-            cause = (next(filter(None, (*self.faults.values(), self.journal.event)),
-                          'the gyro may have missed a turn')
-                     if self._last_variance - before > 0.5 * math.tau ** 2 else
-                     'the errors of scale factor and bias have added up since the last reset')
-            self.heading_loss = (f'the heading is unknown ({cause}): call reset_heading where it '
-                                 'is to be zero')
         if estimator.restart_count != self._known_beginnings:  # another calibration is in use
             self._known_beginnings = estimator.restart_count
             self._recent_rates.clear()

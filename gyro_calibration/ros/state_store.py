@@ -23,7 +23,7 @@ from pathlib import Path
 
 from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.files import (
-    describe_error, file_version, keep_aside, remedy, remove_leftovers, to_printable)
+    describe_error, file_version, keep_aside, remedy, to_printable)
 from gyro_calibration.heading.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
 from gyro_calibration.model.gyro_model import (
     GyroModel, have_same_effects, SelfCalibration, with_self_calibration)
@@ -44,13 +44,11 @@ class StateStore:
     def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior,
                  max_bias: float = RunLimits.max_bias):
         """
-        Read the files, use those without a fault, and remove temporary files of killed runs.
+        Read the files, and use those without a fault.
 
         A model with a bias beyond the largest one, rad/s, is a fault.
         """
         self._max_bias = max_bias
-        for file in (calibration_file, bias_file):
-            remove_leftovers(file)
         self._calibration_file, self._bias_file = calibration_file, bias_file
         self.problem = self.calibration_hint = ''
         self.table_written_time: float | None = None

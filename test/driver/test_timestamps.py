@@ -252,19 +252,6 @@ def test_after_a_sequence_that_began_anew_stamps_are_soon_right_to_a_burst(
     assert (np.diff(run.stamps) > 0.0).all()
 
 
-@pytest.mark.parametrize(('nominal', 'before', 'after', 'error'), [
-    (1000.0, 1000, 100, 0.002), (1000.0, 100, 1000, 0.002), (100.0, 100, 5, 0.02),
-    (100.0, 500, 5, 0.02), (100.0, 10, 2, 0.02)])
-def test_a_gyro_that_becomes_slower_or_faster_has_lost_nothing(nominal, before, after, error):
-    """Also one at 5 Hz, where samples are as rare as silences."""
-    first, second = true_times(before, 0.0, 20.0), true_times(after, 0.0, 20.0)
-    times = np.concatenate([first, first[-1] + second])
-    for seed in range(3):
-        run = play(SampleClock(nominal), times, arrivals_of(times, np.random.default_rng(seed)))
-        assert not run.clock.lost_count and (np.diff(run.stamps) > 0.0).all()
-        assert abs(run.stamps - times).max() < 0.5 and run.error(30.0) < error
-
-
 @pytest.mark.parametrize('by', [-HOUR, HOUR])
 def test_another_clock_is_followed_slowly_and_at_once_where_it_was_set(by):
     node, others = NodeTimeConverter(), []

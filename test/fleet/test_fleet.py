@@ -10,6 +10,7 @@
 
 """A fleet: the unit of each log, workers that are killed, the verb on good and bad input."""
 
+from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from datetime import date, timedelta
 import json
@@ -27,10 +28,9 @@ from gyro_calibration.fleet.logs import (
     compile_file_pattern, describe_log, find_logs, FleetLog, LogTask, process_log)
 from gyro_calibration.fleet.pooling import (
     find_changes, find_outlying_groups, Observations, PooledValue)
-from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.run import process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
-    build_models, count_effects, data, describe_type, log_table, render_fleet_page,
-    summarize_types)
+    build_models, count_effects, data, describe_type, log_table, summarize_types)
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -39,6 +39,7 @@ import numpy as np
 import pytest
 
 DEGREE = np.pi / 180.0
+BY_NAME = '--pattern', '{drive}_unit{unit}'
 
 
 def drive(bias, seed):
@@ -56,8 +57,8 @@ def run(*arguments):
 @pytest.fixture
 def pool(tmp_path, capsys):
     """Return a function that runs the verb and gives its answer, and the reasons by file."""
-    def pool(logs):
-        assert run(logs, '--out', tmp_path / 'out') == 0
+    def pool(logs, *words):
+        assert run(logs, '--out', tmp_path / 'out', *words) == 0
         found = json.loads(capsys.readouterr().out)
         return found, {os.path.basename(each['log']): each['reason']
                        for each in found['no_evidence']}
@@ -125,7 +126,6 @@ def test_notes_and_names_say_what_a_table_does_not(tmp_path):
         found = describe_log(FleetLog(str(tmp_path / name)), named)
         return found.unit, found.type, found.drive, found.date, found.temperature
     assert of('keyed.csv') == ('SN-12', 'DOT', '', '2026-03-01', 21.5)
-    assert of('rc_car_h_unit3.csv') == ('3', '', 'rc_car_h', '', None)
     assert of('rc_car_h_unit3.csv', compile_file_pattern('{type}_{drive}_unit{unit}')) == (
         '3', 'rc', 'car_h', '', None)
     assert of('aimless.csv') == ('', '', '', '', None)
@@ -135,13 +135,14 @@ def test_notes_and_names_say_what_a_table_does_not(tmp_path):
 
 # workers
 
-def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
-    with process_executors(2, 1e9) as create:
-        found = dict(run_tasks(task, range(10), 2, create))
-    lost = found.pop(KILLS)
-    assert isinstance(lost, WorkerLost) and 'killed' in str(lost)
+def test_a_worker_that_is_killed_ends_the_run_and_one_without_memory_does_not():
+    with process_executor(2, 1e9) as executor:
+        numbers = [*range(KILLS), *range(KILLS + 1, 10)]
+        found = dict(run_tasks(task, numbers, 2, executor))
     assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
-    assert found == {number: number for number in {*range(10)} - {KILLS, TAKES_ALL_MEMORY}}
+    assert found == {number: number for number in {*numbers} - {TAKES_ALL_MEMORY}}
+    with process_executor(2) as executor, pytest.raises(BrokenExecutor):
+        list(run_tasks(task, [KILLS], 2, executor))
 
 
 def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
@@ -172,7 +173,7 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, po
     (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n'
                                       + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
-    found, reasons = pool(logs)
+    found, reasons = pool(logs, *BY_NAME)
     assert found['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
     assert 'a_unit2.csv' in reasons.pop('copy.csv')
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
@@ -190,7 +191,7 @@ def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(t
     for unit in (1, 2, 3):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
     (logs / 'b_unit2.csv').write_bytes((logs / 'a_unit1.csv').read_bytes())
-    found, reasons = pool(logs)
+    found, reasons = pool(logs, *BY_NAME)
     assert set(reasons) == {'a_unit1.csv', 'b_unit2.csv'}
     assert 'of unit 1' in reasons['b_unit2.csv'] and 'of unit 2' in reasons['a_unit1.csv']
     assert found['types'][0]['units'] == ['2', '3']
@@ -237,18 +238,22 @@ def test_names_may_hold_any_characters(tmp_path):
         'T.yaml', 'T-unit-ä.yaml', 'T-unit-ö.yaml', 'T-unit-a_b.yaml', 'T-unit-a_b_.yaml'}
 
 
-def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize('error, words', [
+    (KeyboardInterrupt, 'interrupted after 0 of 1 logs; run the same command'),
+    (BrokenExecutor, 'a worker was killed')])
+def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch, error, words):
     def interrupted(*_):
-        raise KeyboardInterrupt
+        raise error
     monkeypatch.setattr('gyro_calibration.cli.fleet.run_tasks', interrupted)
     (tmp_path / 'a.csv').touch()
     assert run(tmp_path, '--out', tmp_path / 'out') == 1
-    assert 'interrupted after 0 of 1 logs; run the same command' in capsys.readouterr().err
+    assert words in capsys.readouterr().err
 
 
 def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
     write_log(tmp_path / 'a_unit1.csv', drive(0.01, 0))
-    one = LogTask(FleetLog(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'))
+    one = LogTask(FleetLog(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'),
+                  file_pattern=compile_file_pattern('{drive}_unit{unit}'))
     first, stamp, kept = (process_log(one), one.record_path.stat().st_mtime_ns,
                           one.record_path.read_bytes())
     assert first == process_log(one) and one.record_path.stat().st_mtime_ns == stamp
@@ -317,8 +322,8 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
             and change.size == pytest.approx(3.0, abs=0.5))
 
 
-def records(ramp=0.0):
-    """Return records of five units on four drives, in which a ramp repeats or only wanders."""
+def records():
+    """Return records of five units on four drives."""
     generator = np.random.default_rng(9)
     off = 0.1 * np.arange(4)
 
@@ -329,32 +334,28 @@ def records(ramp=0.0):
          'date': '', 'temperature': None, 'diagnosis': None, 'page': '',
          'noise': {'angle_random_walk': 1e-4},
          'values': {'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
-                    'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
-         'slow': {'rate_ramp': of(ramp + generator.standard_normal(), 1.0, 'rad/s²')}}
+                    'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')}}
         for unit in range(5) for drive in range(4)]
 
 
-@pytest.mark.parametrize(('ramp', 'said'), [(0.0, 'none repeats'), (12.0, 'the type lacks it')])
-def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
-    (found,) = summarize_types(records(ramp))
+def test_each_value_is_laid_to_the_unit_or_the_reference():
+    (found,) = summarize_types(records())
     told = '; '.join(describe_type(found))
     assert 'bias is an error of the unit' in told
     assert 'time offset is an error of the reference' in told
-    assert said in told and 'differs from its type' not in told
+    assert 'differs from its type' not in told
     json.dumps(data(found), allow_nan=False)
 
 
 @pytest.mark.parametrize('unit', ['0', '4'])
 def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
     """As where one gyro rested only: by name the first one or the last."""
-    logs = [{**each, 'values': {'bias': each['values']['bias']}, 'slow': {}}
+    logs = [{**each, 'values': {'bias': each['values']['bias']}}
             if each['unit'] == unit else each for each in records()]
     (found,) = summarize_types(logs)
     assert set(found.values['bias'].units) == {*'01234'}
     assert set(found.values['time_offset'].units) == {*'01234'} - {unit}
-    assert set(data(found)['values']['rate_ramp']['units']) == {*'01234'} - {unit}
     assert set(dict(build_models(found))) == {'', *'01234'}
-    assert unit in render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
 
 
 def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
@@ -378,7 +379,7 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
     """Over age all drift alike."""
     generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
     slopes = 1e-4 * (2.0 + generator.standard_normal(8))
-    logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '', 'slow': {},
+    logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '',
              'date': str(date(2026, 1, 1) + timedelta(365.25 * age)), 'temperature': temperature,
              'values': {'bias': {'value': unit + slope * temperature + 2e-3 * age
                                  + 1e-4 * generator.standard_normal(), 'deviation': 1e-5,
@@ -395,8 +396,6 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
     ends = np.array([shown['units'][str(unit)]['slopes']['temperature']['ci95']
                      for unit in range(8)])
     assert np.sum((ends[:, 0] < slopes) & (slopes < ends[:, 1])) >= 6
-    text = render_fleet_page([found], [{**each, 'reason': ''} for each in logs])
-    assert '>drift</th>' in text
 
 
 # models
@@ -443,20 +442,7 @@ def _bias(model):
     return model.terms[place].values[0], np.sqrt(model.covariance[place, place])
 
 
-# pages, tables, clusters
-
-def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
-    logs = [{**each, 'unit': f'<{each["unit"]}>', 'page': 'logs/a.html', 'reason': ''}
-            for each in records()]
-    left = {'log': 'x/<b>.csv', 'type': '', 'unit': '', 'drive': '', 'date': '',
-            'reason': 'holds no gyro'}
-    text = render_fleet_page(summarize_types(logs), [*logs, left])
-    assert all(f'<td data-key="&lt;{unit}&gt;">&lt;{unit}&gt;</td>' in text for unit in range(5))
-    assert 'href="logs/a.html"' in text and 'holds no gyro' in text and '<b>' not in text
-    assert 'class="sortable"' in text and '1 more logs are excluded' in text
-    # drives stand by name below charts, at whole places only
-    assert '>k</text>' in text and '>1.5</text>' not in text
-
+# the table
 
 def test_a_table_holds_a_row_for_each_log():
     logs = records()

@@ -16,8 +16,7 @@ import math
 
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.logs.log import (
-    DEGREE, Log, log_from_table, LogError, read_log, read_log_blocks, select_rows, unwrap_heading,
-    write_log)
+    DEGREE, Log, log_from_table, LogError, read_log, select_rows, unwrap_heading, write_log)
 from gyro_calibration.logs.stamps import fit_stamp_grid
 import numpy as np
 import pytest
@@ -81,10 +80,6 @@ REFUSED = {
     'a header of lines': ('"a\nb",time_s\n1,1\n2,2\n', 'no gyro column among a\\nb,time_s;'),
     'an endless line': ('gyro_dps\n' + '1,' * 40000 + '\n1\n',
                         'a line has more than 65536 characters'),
-    'an endless row': ('gyro_dps,place\n1,"' + ('a' * 100 + '\nb","') * 240_000 + '\n',
-                       'has more than 16777216 characters'),
-    'endless notes': (('#' + 'a' * 60_000 + '\n') * 300 + 'gyro_dps\n1\n2\n',
-                      'before the first, has more than 16777216 characters'),
 }
 
 
@@ -92,10 +87,9 @@ REFUSED = {
 def test_what_is_no_log_is_refused_with_file_row_and_column(tmp_path, monkeypatch, text, message):
     path = written(tmp_path, text)
     monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', 2)
-    for read in (read_log, lambda path: list(read_log_blocks(path))):
-        with pytest.raises(LogError) as refused:
-            read(path)
-        assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
+    with pytest.raises(LogError) as refused:
+        read_log(path)
+    assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
 
 
 def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
@@ -105,7 +99,7 @@ def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeyp
         file.write(b'gyro_dps\n')
         file.write(b'0\n' * 1_000_000)
     with pytest.raises(LogError, match='decompresses to more than 100 times .*; decompress it'):
-        list(read_log_blocks(path))
+        read_log(path)
 
 
 def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch):
@@ -114,7 +108,6 @@ def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch
                    'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
     with pytest.raises(LogError, match='more than 100 numbers.*; split it'):
         read_log(path)
-    assert len(list(read_log_blocks(path))[0]) == 51
 
 
 def test_texts_of_a_log_are_read_back_whatever_ends_their_lines(tmp_path):
@@ -150,25 +143,18 @@ def test_a_log_is_read_back_as_it_was_written(tmp_path, name):
     assert (tmp_path / f'again_{name}').read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_blocks_are_the_log_piece_by_piece(tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', 3)
-    rows = ''.join(f'{second / 10},{second % 7},"lap, {second}\n of many"\n'
-                   for second in range(11))
-    path = written(tmp_path, f'# note\ntime_s,gyro_dps,lap\n{rows}\n\n')
-    whole, blocks = read_log(path), list(read_log_blocks(path))
-    assert [len(block) for block in blocks] == [2, 2, 2, 2, 2, 1], 'a row here is two lines'
-    assert np.concatenate([block.output for block in blocks]).tolist() == whole.output.tolist()
-    assert np.concatenate([block.time for block in blocks]).tolist() == whole.time.tolist()
-    assert sum((block.others['lap'] for block in blocks), ()) == whole.others['lap'] == tuple(
-        f'lap, {n}\n of many' for n in range(11))
-    assert {block.notes for block in blocks} == {('note',)}
-    # a row may be longer than a block, and at a rate the time goes on from block to block
-    path = written(tmp_path, 'gyro_counts,lap\n1,"a\n\n\n\n\nb"\n2,c\n3,"d\n\n\n\n"\n')
-    monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', 2)
-    blocks = list(read_log_blocks(path, sensitivity=0.5, rate=100.0))
-    assert [block.others['lap'] for block in blocks] == [('a\n\n\n\n\nb', 'c'), ('d\n\n\n\n',)]
-    assert [block.output.tolist() for block in blocks] == [[0.5, 1.0], [1.5]]
-    assert [block.time.tolist() for block in blocks] == [[0.0, 0.01], [0.02]]
+@pytest.mark.parametrize('text', [
+    ''.join(f'{second},"lap, {second}\n of many"\n' for second in range(11)) + '\n\n',
+    '1,"a\n\n\n\n\nb"\n2,c\n3,"d\n\n\n\n"\n'])
+def test_a_log_is_the_same_in_blocks_of_any_length(tmp_path, monkeypatch, text):
+    """Also where a row is longer than a block; at a rate the time goes on from block to block."""
+    path = written(tmp_path, f'# note\ngyro_counts,lap\n{text}')
+    whole = read_log(path, sensitivity=0.5, rate=100.0)
+    for rows in (2, 3):
+        monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', rows)
+        log = read_log(path, sensitivity=0.5, rate=100.0)
+        assert (log.output.tolist(), log.time.tolist(), log.others, log.notes) == (
+            whole.output.tolist(), whole.time.tolist(), whole.others, ('note',))
 
 
 def test_of_other_columns_with_one_name_none_is_lost(tmp_path):

@@ -463,7 +463,7 @@ def test_odometry_that_cannot_be_used_is_refused(tmp_path, spoil, reason):
 
 @pytest.mark.parametrize('spoil, reason', [
     (lambda time, heading: heading + 0.15 * (time > 6.0), 'differs by .* deg from the odometry'),
-    (lambda time, heading: heading - 2.0 * (time > 6.0), 'odom jumps by 11. deg at 6.0 s'),
+    (lambda time, heading: heading - 2.0 * (time > 6.0), 'does not follow the odometry'),
     (lambda time, heading: heading * (time < 6.0), 'of the odometry|the gyro .* the odometry'),
     (lambda time, heading: heading / DEGREE, 'the odometry in deg and read as rad'),
     (lambda time, heading: -heading, 'the other way than the odometry'),
@@ -480,14 +480,12 @@ def test_what_is_wrong_with_odometry_is_not_said_of_a_profile(tmp_path, spoil, r
     assert not success and re.search(reason, message) and 'profile' not in message, message
 
 
-@pytest.mark.parametrize('late, is_missing, reason', [
-    (-5.0, lambda time: False, 'odom is stamped 5.0 s ahead of imu/data_raw'),
-    (3600.0, lambda time: False, 'odom is stamped 3600.0 s behind imu/data_raw'),
-    (0.0, lambda time: 2.0 < time < 9.0, 'no message came on odom for 7.0 s, from 2.0 s'),
-    (0.0, lambda time: 4.5 < time < 6.5, '')],
+@pytest.mark.parametrize('late, is_missing, succeeds', [
+    (-5.0, lambda time: False, False), (3600.0, lambda time: False, False),
+    (0.0, lambda time: 2.0 < time < 9.0, False), (0.0, lambda time: 4.5 < time < 6.5, True)],
     ids=['ahead', 'behind', 'a gap with two turns', 'a gap at rest'])
-def test_a_clock_or_gap_of_odometry_is_named_as_the_cause_of_a_refusal(
-        tmp_path, late, is_missing, reason):
+def test_odometry_of_another_clock_or_without_the_turns_is_refused(
+        tmp_path, late, is_missing, succeeds):
     rig = rested(tmp_path, calibration_reference=ODOMETRY)
     begin, odometry = rig.clock.now, rig.odometry
     rig.odometry = lambda stamp, reading: is_missing(rig.clock.now - begin) or odometry(
@@ -495,8 +493,7 @@ def test_a_clock_or_gap_of_odometry_is_named_as_the_cause_of_a_refusal(
     turn_to_and_fro(rig, 13.5)
     assert ('odom is stamped' in rig.pipeline.faults['odometry_clock']) == bool(late)
     success, message = rig.session.conclude()
-    assert reason in message and success != bool(reason), message
-    assert 'line and rate' not in message, 'of the gyro'
+    assert success == succeeds, message
 
 
 @pytest.mark.parametrize('turns', [
@@ -578,9 +575,7 @@ def test_calibrate_bias_keeps_the_scale_factor_error(tmp_path):
     assert rig.calibrate()[0]
     before = stored(rig)
     rig.robot.bias = 0.02
-    success, message = rig.calibrate(REST)
-    assert success and 'the bias changed by' in message, message
-    assert 'more than the model predicts' in message, message
+    assert rig.calibrate(REST)[0]
     assert stored(rig).bias == pytest.approx(0.02, abs=4e-4)
     assert stored(rig).scale_factor_error == before.scale_factor_error
     assert stored(rig).standard_deviations[0] == pytest.approx(before.standard_deviations[0])

@@ -51,7 +51,9 @@ KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temper
     ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
     ({'baud': -1}, 'parameter baud is -1, but must be from 0 to 4000000 bit/s'),
     ({'sample_rate': 'often'}, "parameter sample_rate is 'often', but must be a number"),
+    ({'sample_rate': 1 << 70}, 'parameter sample_rate is 118.*, but must be a number'),
     ({'axis': 'w'}, "parameter axis is 'w', but must be x, y or z"),
+    ({'port': '/dev/\0'}, 'parameter port is .*, but must be without a zero byte'),
     ({'frame_id': ''}, "parameter frame_id is '', but must be not empty, for example 'gyro'")])
 def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
     with pytest.raises(ValueError, match=sentence) as refused:

@@ -16,7 +16,6 @@ import signal
 import sys
 
 from gyro_calibration import files
-from gyro_calibration.files import open_replacement, remove_leftovers, write_atomically
 from gyro_calibration.heading.bias_table import MIN_WRITE_INTERVAL, Prior
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.ros.state_store import StateStore
@@ -171,20 +170,6 @@ def test_a_kill_at_any_line_leaves_the_old_file_or_the_new_one(remember, tmp_pat
         (tmp_path / 'calibration.yaml').write_bytes(old)
     new = (tmp_path / 'calibration.yaml').read_bytes()
     assert new != old and set(found) == {old, new}
-
-
-def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(tmp_path):
-    path = tmp_path / 'model.yaml'
-    (tmp_path / '.model.yaml.abcd1234').write_text('half')
-    (tmp_path / '.model.yaml.swp').write_text('of an editor')
-    (tmp_path / '.other.yaml.abcd1234').write_text('of another file')
-    with open_replacement(path) as file:
-        file.write(b'new')
-        write_atomically(path, b'of another process, in between')
-        remove_leftovers(path)
-    assert path.read_bytes() == b'new'
-    assert sorted(os.listdir(tmp_path)) == ['.model.yaml.swp', '.other.yaml.abcd1234',
-                                            'model.yaml']
 
 
 def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_writes(remember):
