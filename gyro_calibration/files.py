@@ -37,6 +37,8 @@ MAX_MAGNITUDE = 1e20
 #: Largest ratio of decompressed to compressed size (sensor data compress to about a tenth), and
 #: the size in bytes that is allowed at any ratio.
 MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
+#: Largest depth of nested lists, names and messages, which the stack of Python holds.
+MAX_DEPTH = 10
 
 #: File type, other than a regular file -> its name.
 _FILE_TYPE_NAMES = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',

@@ -156,8 +156,6 @@ class _DiskFull(OSError):
 class _Recorder:
     """A new file that grows by complete pieces, and is removed at the end if it has none."""
 
-    end = b''  # what closes a file with pieces, also after one that failed
-
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
         # size of the complete pieces, bytes, and whether one could not be written
@@ -186,6 +184,10 @@ class _Recorder:
         """Write what was added as a piece; a silence or the end makes it due."""
         raise NotImplementedError
 
+    def end(self) -> bytes:
+        """Return what closes a file with pieces, also after one that failed."""
+        return b''
+
     def close(self) -> None:
         """Write what remains, unless a piece failed, and close the file."""
         try:
@@ -193,7 +195,7 @@ class _Recorder:
                 self.flush(is_due=True)
             if self.size:
                 with suppress(_DiskFull) if self.is_full else nullcontext():
-                    self.append(self.end)
+                    self.append(self.end())
         finally:
             self._file.close()
             if not self.size:
@@ -202,8 +204,6 @@ class _Recorder:
 
 class McapRecorder(_Recorder):
     """Messages in an MCAP file; `variance` is that of the rate of a sample, (rad/s)²."""
-
-    end = MCAP_END
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
@@ -219,6 +219,10 @@ class McapRecorder(_Recorder):
     def flush(self, is_due: bool = False) -> None:
         if piece := self.writer.pack_chunk():
             self.append(piece)
+
+    def end(self) -> bytes:
+        """Return the summary, on a full disk a short end that readers understand."""
+        return MCAP_END if self.is_full else self.writer.pack_summary()
 
 
 class CsvRecorder(_Recorder):
@@ -401,7 +405,7 @@ class _TopicSession:
                              f'{", ".join(topic for topic, _ in roles)}; name one for each')
         self._messages, self._samples, self._damaged, self._is_waiting = 0, 0, 0, True
         self._received: dict[str, str] = {}  # role -> topic
-        self._previous, self._intervals = 0, Intervals()  # stamp, ns
+        self._previous, self._intervals, self._clock_steps = (0, 0), Intervals(), 0
         self._given, self._stop, self._start_time = given, stop, time.monotonic()
         self.recorder = McapRecorder(given.out if self._is_mcap else f'{given.out}.mcap',
                                      lambda: _recording_notes(topics=', '.join(self._roles)))
@@ -443,8 +447,13 @@ class _TopicSession:
                 self._damaged += 1
                 return
             self._samples += 1
-            interval, self._previous = stamp - self._previous, stamp
-            if 0 < interval < stamp:  # not the first, nor a late one
+            before, self._previous = self._previous, (stamp, message.received)
+            interval = stamp - before[0]
+            # a message may be late, and a recording may be played faster
+            was_set = not (-NSEC_PER_SEC < interval
+                           < message.received - before[1] + 10 * NSEC_PER_SEC)
+            self._clock_steps += was_set and before[0] > 0
+            if interval > 0 and not was_set:
                 self._intervals.add(interval / NSEC_PER_SEC)
 
     def conclude(self) -> tuple[dict[str, Any], list[str]]:
@@ -460,4 +469,6 @@ class _TopicSession:
             os.unlink(recording)
         remarks = ([f'{self._damaged} messages of the gyro could not be read.']
                    if self._damaged else [])
+        if self._clock_steps:
+            remarks.append(f'The clock of the stamps was set {self._clock_steps} times.')
         return {'messages': self._messages}, remarks

@@ -12,14 +12,17 @@
 Serialized ROS 2 messages of gyros, temperatures and references, without ROS.
 
 A message is in the common data representation (CDR): four bytes state the byte order, then come
-the fields, each aligned to its own size. All messages here have a header, some a second text, the
-frame of the child, and then numbers of 64 bits.
+the fields, each aligned to its own size. The message definition, which recordings contain, lists
+the fields. It is parsed here into a table of formats; nothing in it is run.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+import re
 import struct
 
+from gyro_calibration.files import MAX_DEPTH
 from gyro_calibration.logs.log import Number
 import numpy as np
 
@@ -44,7 +47,29 @@ def z_axis_covariance(variance: float) -> tuple[float, ...]:
 
 NOT_REPORTED_COVARIANCE = (NOT_REPORTED, *8 * (0.0,))
 
+#: Largest number of fields, and length of a definition in characters.
+_MAX_FIELDS, _MAX_DEFINITION_LENGTH = 5000, 100_000
 _DEFINITION_SEPARATOR = '=' * 80
+_STRUCT_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
+                 'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
+                 'float32': 'f', 'float64': 'd', 'string': 's'}
+_FIELD_PATTERN = re.compile(r'(?P<kind>[\w/]+)(?:<=\d+)?(?:\[(?P<most><=)?(?P<count>\d{0,9})\])?'
+                            r' +(?P<name>\w+) *(?P<constant>=?)')
+
+#: Quantity -> fields that may hold it; the first one present is used. `{}` is the axis.
+_QUANTITY_FIELDS = {
+    **{f'orientation.{each}': tuple(f'{where}{each}' for where in (
+        'orientation.', 'pose.pose.orientation.', 'pose.orientation.', 'transform.rotation.',
+        'quaternion.')) for each in 'xyzw'},
+    'orientation variance': ('orientation_covariance.0',),
+    'rate': ('angular_velocity.{}', 'twist.twist.angular.{}', 'twist.angular.{}', 'vector.{}'),
+    'rate variance': ('angular_velocity_covariance.0',),
+    'force': ('linear_acceleration.{}',),
+    'force variance': ('linear_acceleration_covariance.0',),
+    'temperature': ('temperature',),
+}
+_IMU_RATE = 'angular_velocity.x'
+
 _NESTED_DEFINITIONS = {
     'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec',
     'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id',
@@ -52,63 +77,123 @@ _NESTED_DEFINITIONS = {
        for name, axes in (('Point', 'xyz'), ('Vector3', 'xyz'), ('Quaternion', 'xyzw'))},
     'geometry_msgs/Pose': 'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation',
     'geometry_msgs/Twist': 'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular',
-    'geometry_msgs/Transform': 'geometry_msgs/Vector3 translation\n'
-    'geometry_msgs/Quaternion rotation',
     'geometry_msgs/PoseWithCovariance': 'geometry_msgs/Pose pose\nfloat64[36] covariance',
     'geometry_msgs/TwistWithCovariance': 'geometry_msgs/Twist twist\nfloat64[36] covariance',
 }
-
-
-@dataclass(frozen=True)
-class _MessageLayout:
-    """The content of a message type after its header."""
-
-    fields: str  # as in a message definition
-    size: int  # number of the numbers
-    #: Quantity -> place of its number, or of its first one: of a rotation x, y, z, w follow each
-    #: other, of a rate and a specific force x, y, z.
-    places: Mapping[str, int]
-    has_child_frame: bool = False
-
-
-#: Message type -> layout.
-LAYOUTS = {
-    IMU: _MessageLayout("""geometry_msgs/Quaternion orientation
+_MESSAGE_FIELDS = {
+    IMU: """geometry_msgs/Quaternion orientation
 float64[9] orientation_covariance
 geometry_msgs/Vector3 angular_velocity
 float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance""", 37, {
-        'rotation': 0, 'rotation variance': 4, 'rate': 13, 'rate variance': 16, 'force': 25,
-        'force variance': 28}),
-    TEMPERATURE: _MessageLayout('float64 temperature\nfloat64 variance', 2, {'temperature': 0}),
-    ODOMETRY: _MessageLayout("""string child_frame_id
+float64[9] linear_acceleration_covariance""",
+    TEMPERATURE: 'float64 temperature\nfloat64 variance',
+    ODOMETRY: """string child_frame_id
 geometry_msgs/PoseWithCovariance pose
-geometry_msgs/TwistWithCovariance twist""", 85, {'rotation': 3, 'rate': 46}, True),
-    POSE: _MessageLayout('geometry_msgs/Pose pose', 7, {'rotation': 3}),
-    TWIST: _MessageLayout('geometry_msgs/Twist twist', 6, {'rate': 3}),
-    **{f'geometry_msgs/msg/{name}': layout for name, layout in {
-        'PoseWithCovarianceStamped': _MessageLayout('geometry_msgs/PoseWithCovariance pose', 43,
-                                                    {'rotation': 3}),
-        'TransformStamped': _MessageLayout(
-            'string child_frame_id\ngeometry_msgs/Transform transform', 7, {'rotation': 3}, True),
-        'QuaternionStamped': _MessageLayout('geometry_msgs/Quaternion quaternion', 4,
-                                            {'rotation': 0}),
-        'TwistWithCovarianceStamped': _MessageLayout('geometry_msgs/TwistWithCovariance twist',
-                                                     42, {'rate': 3}),
-        'Vector3Stamped': _MessageLayout('geometry_msgs/Vector3 vector', 3, {'rate': 0})}.items()}}
+geometry_msgs/TwistWithCovariance twist""",
+    POSE: 'geometry_msgs/Pose pose',
+    TWIST: 'geometry_msgs/Twist twist',
+}
 
-#: Message type -> definition as ROS 2 writes it, for recorders.
+
+#: Message type -> definition as ROS 2 writes it, for recordings without definitions and recorders.
 DEFINITIONS: dict[str, str] = {}
-for _kind, _layout in LAYOUTS.items():
-    DEFINITIONS[_kind] = f'std_msgs/Header header\n{_layout.fields}\n'
+for _kind, _fields in _MESSAGE_FIELDS.items():
+    DEFINITIONS[_kind] = f'std_msgs/Header header\n{_fields}\n'
     for _name, _part in reversed(_NESTED_DEFINITIONS.items()):
         if f'{_name} ' in DEFINITIONS[_kind]:
             DEFINITIONS[_kind] += f'{_DEFINITION_SEPARATOR}\nMSG: {_name}\n{_part}\n'
 
 
 class MessageError(ValueError):
-    """Bytes are not a message of the expected type."""
+    """Bytes are not a message of the expected type, or a definition is not valid."""
+
+
+@dataclass(frozen=True)
+class _MessageLayout:
+    """The layout in bytes of a message type, with the quantities of a gyro or reference."""
+
+    #: Runs of contiguous numbers: size in bytes of an element of the text or sequence before the
+    #: run, 0 for the first run; and formats of the numbers.
+    runs: tuple[tuple[int, str], ...]
+    quantities: Mapping[str, int]  # name -> index among the numbers
+
+
+@cache
+def parse_layout(definition: str, axis: str = 'z') -> _MessageLayout:
+    """Return the layout of a message type by its definition, with the rate about an axis."""
+    if len(definition) > _MAX_DEFINITION_LENGTH:
+        raise MessageError(f'it has more than {_MAX_DEFINITION_LENGTH} characters')
+    parts: dict[str, list[re.Match[str]]] = {}
+    for part in f'MSG: /\n{definition}'.split(f'{_DEFINITION_SEPARATOR}\n'):
+        name, _, text = part.partition('\n')
+        fields = [found for line in text.split('\n')
+                  if (found := _FIELD_PATTERN.match(line.partition('#')[0].strip()))]
+        name = name.removeprefix('MSG: ').strip()
+        # Definitions name messages of the same package without the package.
+        parts[name] = parts[name.rpartition('/')[2] or name] = [
+            field for field in fields if not field['constant']]
+    names, runs = list[str](), [['', '']]
+    for number, (name, code) in enumerate(_flatten_fields(parts, '/', '', 0)):
+        if number > _MAX_FIELDS:
+            raise MessageError(f'it has more than {_MAX_FIELDS} parts')
+        if name and code:
+            names.append(name)
+            runs[-1][1] += code
+        elif code:
+            runs.append([code, ''])
+    # drivers nest an Imu in a message of their own
+    nested = [name.removesuffix(_IMU_RATE) for name in names if name.endswith(f'.{_IMU_RATE}')]
+    inside = nested[0] if len(nested) == 1 and _IMU_RATE not in names else ''
+    stamp = ['header.stamp.sec', 'header.stamp.nanosec']
+    if names[:2] not in (stamp, [inside + name for name in stamp]):
+        raise MessageError('it does not begin with a header')
+    places = {name.removeprefix(inside): place - 2 for place, name in enumerate(names)
+              if name.startswith(inside)}
+    quantities = {quantity: places[found] for quantity, fields in _QUANTITY_FIELDS.items()
+                  for found in [field.format(axis) for field in fields
+                                if field.format(axis) in places][:1]}
+    return _MessageLayout(tuple((struct.calcsize(before), codes) for before, codes in runs),
+                          quantities)
+
+
+def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
+                    depth: int) -> Iterator[tuple[str, str]]:
+    """Give names and formats of numbers; texts and sequences have no name, messages no format."""
+    # Fields after a sequence of texts or of messages are left out: their offset is not fixed.
+    for field in parts[part]:
+        kind, count, name = field['kind'], field['count'], f'{path}{field["name"]}'
+        code = _STRUCT_CODES.get(kind, '')
+        if field['most'] or count == '':
+            if code in ('', 's'):
+                return
+            yield '', code
+            continue
+        if not code and (kind not in parts or depth == MAX_DEPTH):
+            raise MessageError(f'{kind} in it is not defined')
+        for number in range(int(count or 1)):
+            each = name if count is None else f'{name}.{number}'
+            yield '' if code == 's' else each, code
+            if not code:
+                yield from _flatten_fields(parts, kind, f'{each}.', depth + 1)
+
+
+#: Message type -> layout, with the rate about z.
+LAYOUTS = {kind: parse_layout(text) for kind, text in DEFINITIONS.items()}
+
+
+@cache
+def _padded_struct(order: str, codes: str, offset: int) -> struct.Struct:
+    """Return the format of numbers with padding, from an offset modulo 8 bytes on."""
+    text = [order]
+    for code in codes:
+        size = struct.calcsize(code)
+        text.append(f'{-offset % size}x{code}')
+        offset += -offset % size + size
+    return struct.Struct(''.join(text))
+
+
+_UNPACK_LENGTH = {order: struct.Struct(f'{order}I').unpack_from for order in '<>'}
 
 
 def parse(data: bytes, layout: _MessageLayout) -> tuple[int, tuple[float, ...]]:
@@ -116,23 +201,27 @@ def parse(data: bytes, layout: _MessageLayout) -> tuple[int, tuple[float, ...]]:
     if data[:2] not in (b'\0\0', b'\0\1'):
         raise MessageError(f'a message begins with {data[:4].hex()}, which is not plain CDR')
     order = '<' if data[1] else '>'
+    numbers: tuple[float, ...] = ()
+    place = 4
     try:
-        seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, 4)
-        place = 16 + length
-        if layout.has_child_frame:
-            place += -place % 4
-            place += 4 + struct.unpack_from(f'{order}I', data, place)[0]
-        place += (4 - place) % 8
-        numbers = struct.unpack_from(f'{order}{layout.size}d', data, place)
+        for size, codes in layout.runs:
+            if size:
+                place += -place % 4 + 4
+                length = _UNPACK_LENGTH[order](data, place - 4)[0]
+                place += (-(place - 4) % size if length else 0) + length * size
+            if codes:
+                run = _padded_struct(order, codes, (place - 4) % 8)
+                numbers += run.unpack_from(data, place)
+                place += run.size
     except (struct.error, OverflowError) as error:
-        raise MessageError(f'a message of {len(data)} bytes is shorter than its type '
+        raise MessageError(f'a message of {len(data)} bytes is shorter than its definition '
                            'requires') from error
-    return seconds * NSEC_PER_SEC + nanoseconds, numbers
+    return int(numbers[0]) * NSEC_PER_SEC + int(numbers[1]), numbers[2:]
 
 
 def parse_frame(data: bytes) -> str:
     """Return the frame of the header with which a valid message begins."""
-    length = struct.unpack_from('<I' if data[1] else '>I', data, 12)[0]
+    length = _UNPACK_LENGTH['<' if data[1] else '>'](data, 12)[0]
     return data[16:16 + length].rstrip(b'\0').decode(errors='replace')
 
 

@@ -11,14 +11,16 @@
 """
 Conversion of a ROS 2 recording to a `Log` at the stamps of the gyro.
 
-The gyro is an Imu, or a vector where its topic is named; temperature and reference are
-interpolated at its stamps. Times are the stamps of the headers; times of receipt are used only
-where headers have no stamps. Notes list this and all other corrections.
+The gyro is an Imu; temperature and reference are interpolated at its stamps. Other message types
+with a rate, an orientation or a temperature are used where their topic is named. Times are the
+stamps of the headers; times of receipt are used only where headers have no stamps. Notes list this
+and all other corrections.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 import os.path
 from pathlib import Path
@@ -27,7 +29,6 @@ from typing import Any
 
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
-from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
     Array, Log, LogError, mask_invalid, read_log, unwrap_heading)
 from gyro_calibration.logs.ros_bag import (
@@ -35,12 +36,14 @@ from gyro_calibration.logs.ros_bag import (
 import numpy as np
 from numpy.typing import NDArray
 
-_REFERENCE_TYPES = tuple(kind for kind, layout in cdr.LAYOUTS.items()
-                         if {'rate', 'rotation'} & set(layout.places))
-#: Role of a topic -> the option that names it, and its possible message types.
-_ROLES = {'gyro': ('--topic', (cdr.IMU, 'geometry_msgs/msg/Vector3Stamped')),
-          'temperature': ('--temperature-topic', (cdr.TEMPERATURE,)),
-          'reference': ('--reference-topic', _REFERENCE_TYPES)}
+_REFERENCE_TYPES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
+#: Role of a topic -> the option that names it, its possible message types, and the quantities of
+#: which a message of another type must have one.
+_ROLES = {
+    'gyro': ('--topic', (cdr.IMU,), {'rate'}),
+    'temperature': ('--temperature-topic', (cdr.TEMPERATURE,), {'temperature'}),
+    'reference': ('--reference-topic', _REFERENCE_TYPES, {'rate', 'orientation.w'}),
+}
 
 #: Largest step back of stamps by messages out of order, s; at a larger one a clock was set.
 _MAX_STEP_BACK = 1.0
@@ -61,7 +64,7 @@ class Topics:
 
 def topic_type_fault(role: str, topic: str, kind: str) -> str:
     """Return why the message type of a topic does not fit its role; '' if it does."""
-    option, kinds = _ROLES[role]
+    option, kinds, _ = _ROLES[role]
     return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_join_names(kinds, "or")}'
 
 
@@ -76,15 +79,11 @@ class _Topic:
     `rows` has stamp and time of receipt, ns, and the known quantities by name.
     """
 
-    def __init__(self, name: str, kind: str, axis: str):
+    def __init__(self, name: str, kind: str, definition: str, axis: str):
         self.name, self.kind, self.damaged_count = name, kind, 0
         self.frames = set[str]()  # the first two in the headers
-        self._layout = cdr.LAYOUTS[kind]
-        self._places = {name: place + (AXES.index(axis) if name in ('rate', 'force') else 0)
-                        for name, place in self._layout.places.items()}
-        if (first := self._places.pop('rotation', None)) is not None:
-            self._places |= {part: first + place for place, part in enumerate('xyzw')}
-        self._struct = struct.Struct(f'=qq{len(self._places)}d')
+        self._layout = cdr.parse_layout(definition, axis)
+        self._struct = struct.Struct(f'=qq{len(self._layout.quantities)}d')
         self._data = bytearray()
         self.rows: Any = None  # in order of receipt, or of stamps
 
@@ -95,17 +94,20 @@ class _Topic:
         try:
             stamp, numbers = cdr.parse(message.data, self._layout)
             self._data += self._struct.pack(stamp, message.received, *(
-                numbers[place] for place in self._places.values()))
+                numbers[place] for place in self._layout.quantities.values()))
         except (MessageError, struct.error):
             self.damaged_count += 1
             return
         if len(self.frames) < 2:
             self.frames.add(cdr.parse_frame(message.data))
 
-    def sort_by_receipt(self) -> None:
+    def in_order_of_receipt(self) -> _Topic:
+        """Return a copy with its own rows."""
+        found = copy(self)
         rows = np.frombuffer(self._data, [('stamp', 'i8'), ('received', 'i8'), *(
-            (quantity, 'f8') for quantity in self._places)])
-        self.rows = rows[np.argsort(rows['received'], kind='stable')]
+            (quantity, 'f8') for quantity in self._layout.quantities)])
+        found.rows = rows[np.argsort(rows['received'], kind='stable')]
+        return found
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -113,12 +115,12 @@ class _Topic:
 
     def values(self, quantity: str) -> Array:
         """Return the values of a quantity, shape (n,); zeros where there is none."""
-        return (self.rows[quantity].copy() if quantity in self._places
+        return (self.rows[quantity].copy() if quantity in self._layout.quantities
                 else np.zeros(len(self.rows)))
 
     def is_reported(self, quantity: str) -> bool:
         """Return whether the messages have a quantity and do not declare it unknown."""
-        return quantity in self._places and not (
+        return quantity in self._layout.quantities and not (
             self.values(f'{quantity} variance') == cdr.NOT_REPORTED).all()
 
     @property
@@ -161,7 +163,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     for message in read_messages(path, contents, on_progress):
         if message.topic not in found:
             axis = 'z' if _is_same_topic(message.topic, topics.reference) else topics.axis
-            found[message.topic] = _Topic(message.topic, message.kind, axis)
+            found[message.topic] = _Topic(
+                message.topic, message.kind, contents.definitions[message.kind], axis)
         found[message.topic].add(message)
     try:
         log = _LogBuilder(Path(path).name, topics, contents, found).build(rate)
@@ -188,8 +191,14 @@ class _LogBuilder:
             raise LogError(f'several gyros, {_join_names(found)}; select one with --topic')
         elif not found:
             reasons = ''.join(f' ({note})' for note in self._contents.notes)
-            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; record '
-                           'the topic of the gyro as this type')
+            others = self._topics_of_type({
+                kind for kind, definition in self._contents.definitions.items()
+                if kind not in _REFERENCE_TYPES
+                and 'rate' in cdr.parse_layout(definition).quantities})
+            remedy = (f'select {_join_names(others, "or")} with --topic' if others
+                      else 'record the topic of the gyro')
+            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; '
+                           f'{remedy}')
         gyro = self._read(self._found[found[0]])
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.name} declares that it reports no angular velocity; name '
@@ -206,11 +215,7 @@ class _LogBuilder:
         temperature = temperature and self._read(temperature)
         reference = None
         if self._topics.reference is not None:
-            reference = self._find_topic(self._topics.reference, 'reference')
-            if reference is gyro:
-                raise LogError(f'{gyro.name} cannot be its own reference; name another by '
-                               '--reference-topic')
-            self._read(reference)
+            reference = self._read(self._find_topic(self._topics.reference, 'reference'))
         elif possible := self._topics_of_type(set(_REFERENCE_TYPES) - {cdr.IMU}):
             self._notes.append('no reference was asked for; --reference-topic may be '
                                f'{_join_names(possible)}')
@@ -241,6 +246,9 @@ class _LogBuilder:
             temperature.use_times(use_stamps and temperature.has_stamps)
             arrays['temperature'] = self._interpolate_temperature(temperature, begin, time)
         if reference is not None:
+            if reference.name == gyro.name:
+                raise LogError(f'{gyro.name} cannot be its own reference; name another by '
+                               '--reference-topic')
             reference.use_times(use_stamps)
             arrays |= self._interpolate_reference(reference, begin, time, output)
         return Log(time=time if rate is None else np.arange(len(time)) / rate, **arrays,
@@ -252,8 +260,11 @@ class _LogBuilder:
         if topic is None:
             raise LogError(f'no topic {wanted}{self._list_topics()}; name one of them by '
                            f'{_ROLES[role][0]}')
-        if fault := topic_type_fault(role, topic, self._contents.topics[topic]):
-            raise LogError(fault)
+        kind = self._contents.topics[topic]
+        definition = self._contents.definitions.get(kind)
+        found = cdr.parse_layout(definition).quantities if definition else {}
+        if not _ROLES[role][2] & set(found) and (wrong := topic_type_fault(role, topic, kind)):
+            raise LogError(wrong)
         if not len(self._found.get(topic, ())):
             raise LogError(f'{topic} has no message that can be read; record again')
         return self._found[topic]
@@ -274,8 +285,7 @@ class _LogBuilder:
             raise LogError(f'messages of the frames {_join_names(sorted(topic.frames))} are on '
                            f'{topic.name}, as of several sensors: record each on a topic of its '
                            'own, or split the recording where the frame changes')
-        topic.sort_by_receipt()
-        return topic
+        return topic.in_order_of_receipt()
 
     def _order_samples(self, gyro: _Topic, rate: float | None) -> None:
         """Sort samples by their stamps, leave out duplicates, and refuse unusable times."""
@@ -336,11 +346,11 @@ class _LogBuilder:
         if rate is not None:
             rate = np.where(np.isfinite(rate), rate, np.nan)
         heading = None
-        x, y, z, w = map(topic.values, 'xyzw')
-        variance = topic.values('rotation variance')
+        x, y, z, w = (topic.values(f'orientation.{each}') for each in 'xyzw')
+        variance = topic.values('orientation variance')
         # declared unknown by an Imu, or left at its default
-        if topic.is_reported('w') and not (
-                topic.is_reported('rotation variance') and (
+        if topic.is_reported('orientation.w') and not (
+                topic.is_reported('orientation variance') and (
                     (variance == cdr.NOT_REPORTED).all()
                     or not (x.any() or y.any() or z.any() or variance.any())
                     and (w == 1.0).all())):

@@ -18,6 +18,7 @@ size. Existing libraries have no such limits and refuse truncated files: rosbags
 3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
 """
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, ExitStack, suppress
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from itertools import chain, repeat
 import os
 from pathlib import Path
 import re
+import shutil
 import sqlite3
 import struct
 import sys
@@ -38,7 +40,7 @@ from urllib.parse import quote
 import zlib
 
 from gyro_calibration.files import describe_error, open_regular_file, remedy, to_printable
-from gyro_calibration.logs.cdr import DEFINITIONS, LAYOUTS
+from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
 from gyro_calibration.logs.columns import excerpt
 from gyro_calibration.logs.log import ExpansionBudget, LogError
 
@@ -66,17 +68,25 @@ class Message:
 class Contents:
     """Contents of a recording as far as it was read."""
 
-    topics: dict[str, str] = field(default_factory=dict)  # topic -> message type
+    #: Topic -> message type; type with known quantities -> definition.
+    topics: dict[str, str] = field(default_factory=dict)
+    definitions: dict[str, str] = field(default_factory=dict)
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     skipped_parts: int = 0  # number of parts that are damaged or too large
 
-    def add_topic(self, topic: str, kind: str, encoding: str) -> tuple[str, str] | None:
+    def add_topic(self, topic: str, kind: str, encoding: str,
+                  definition: str) -> tuple[str, str] | None:
         """Store a topic; return it with its type, or None where it has no known quantities."""
         topic, kind = excerpt(topic), excerpt(kind)
         self.topics[topic] = kind
-        return (topic, kind) if encoding == 'cdr' and kind in LAYOUTS else None
+        if kind not in self.definitions and encoding == 'cdr':
+            with suppress(MessageError):
+                definition = DEFINITIONS.get(kind, definition)
+                if parse_layout(definition).quantities:
+                    self.definitions[kind] = definition
+        return (topic, kind) if encoding == 'cdr' and kind in self.definitions else None
 
 
 def _to_short_line(text: object) -> str:
@@ -242,7 +252,7 @@ class _McapReader:
 
     def __init__(self, contents: Contents, budget: ExpansionBudget):
         self._contents, self._budget = contents, budget
-        self._schemas: dict[int, str] = {}  # number -> message type
+        self._schemas: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[str, str] | None] = {}
 
     def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
@@ -265,12 +275,15 @@ class _McapReader:
                 if channel := self._channels.get(number):
                     yield Message(*channel, received, _decompress_message(body[22:], self._budget))
             elif code == _RecordCode.SCHEMA:
-                self._schemas[struct.unpack_from('<H', body)[0]] = _read_text(body, 2)[0]
+                kind, place = _read_text(body, 2)
+                definition, _ = _read_text(body, _read_text(body, place)[1])
+                self._schemas[struct.unpack_from('<H', body)[0]] = kind, definition
             elif code == _RecordCode.CHANNEL:
                 number, schema = struct.unpack_from('<HH', body)
                 topic, place = _read_text(body, 4)
+                kind, definition = self._schemas.get(schema, ('unknown', ''))
                 self._channels[number] = self._contents.add_topic(
-                    topic, self._schemas.get(schema, 'unknown'), _read_text(body, place)[0])
+                    topic, kind, _read_text(body, place)[0], definition)
             elif code == _RecordCode.METADATA:
                 name, place = _read_text(body, 0)
                 place += 4
@@ -304,59 +317,101 @@ def _pack_sized(data: bytes | str) -> bytes:
 
 
 class McapWriter:
-    """
-    Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk.
-
-    There is no index, which the recording of a killed program lacks too: readers scan the file.
-    """
+    """Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk."""
 
     def __init__(self, library: str = '', notes: Callable[[], Mapping[str, str]] = dict):
         """Take the name of the program, and the notes, which are called for with the header."""
-        self._library, self._notes, self._has_header = library, notes, False
-        self._records, self._times = bytearray(), list[int]()  # of the next chunk
-        self._schemas, self._channels = dict[str, int](), dict[str, int]()
+        self._library, self._notes = library, notes
+        self._offset = 0
+        self._records = bytearray()
+        self._schemas: dict[str, tuple[int, bytes]] = {}
+        self._channels: dict[str, tuple[int, bytes]] = {}
+        self._indexes: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+        self._counts: Counter[int] = Counter()
+        self._spans: list[tuple[int, int]] = []
+        self._chunk_indexes: list[bytes] = []
+        self._metadata_index = b''
+
+    def _pack_header(self) -> bytes:
+        """Return the beginning of a file: header with the program, and the notes."""
+        head = _MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'),
+                                     _pack_sized(self._library))
+        name = _pack_sized(METADATA_NAME)
+        pairs = b''.join(map(_pack_sized, chain.from_iterable(self._notes().items())))
+        metadata = _pack_record(_RecordCode.METADATA, name, _pack_sized(pairs))
+        self._metadata_index = _pack_record(_RecordCode.METADATA_INDEX,
+                                            struct.pack('<QQ', len(head), len(metadata)), name)
+        return head + metadata
 
     def add(self, message: Message) -> None:
         """Add a message of a type of `DEFINITIONS` to the next chunk."""
         kind, topic, received = message.kind, message.topic, message.received
         if kind not in self._schemas:
-            self._schemas[kind] = len(self._schemas) + 1
-            self._records += _pack_record(
-                _RecordCode.SCHEMA, struct.pack('<H', self._schemas[kind]), _pack_sized(kind),
-                _pack_sized('ros2msg'), _pack_sized(DEFINITIONS[kind]))
+            schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H', len(self._schemas) + 1),
+                                  _pack_sized(kind), _pack_sized('ros2msg'),
+                                  _pack_sized(DEFINITIONS[kind]))
+            self._schemas[kind] = len(self._schemas) + 1, schema
+            self._records += schema
         if topic not in self._channels:
-            self._channels[topic] = len(self._channels) + 1
-            self._records += _pack_record(
-                _RecordCode.CHANNEL, struct.pack('<HH', self._channels[topic],
-                                                 self._schemas[kind]),
-                _pack_sized(topic), _pack_sized('cdr'), _pack_sized(b''))
-        self._times.append(received)
-        head = struct.pack('<HIQQ', self._channels[topic], 0, received, received)
+            ends = len(self._channels) + 1, self._schemas[kind][0]
+            channel = _pack_record(_RecordCode.CHANNEL, struct.pack('<HH', *ends),
+                                   _pack_sized(topic), _pack_sized('cdr'), _pack_sized(b''))
+            self._channels[topic] = ends[0], channel
+            self._records += channel
+        number = self._channels[topic][0]
+        self._indexes[number].append((received, len(self._records)))
+        head = struct.pack('<HIQQ', number, 0, received, received)
         self._records += _pack_record(_RecordCode.MESSAGE, head, message.data)
 
     def pack_chunk(self) -> bytes:
         """
-        Return the messages since the last chunk as a chunk; b'' without any.
+        Return the messages since the last chunk as a chunk with index; b'' without any.
 
         The first one follows the header.
         """
-        if not self._times:
+        if not self._indexes:
             return b''
-        begin = b''
-        if not self._has_header:
-            self._has_header = True
-            pairs = b''.join(map(_pack_sized, chain.from_iterable(self._notes().items())))
-            begin = (_MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'),
-                                           _pack_sized(self._library))
-                     + _pack_record(_RecordCode.METADATA, _pack_sized(METADATA_NAME),
-                                    _pack_sized(pairs)))
+        header = b'' if self._offset else self._pack_header()
+        self._offset += len(header)
+        times = [time for index in self._indexes.values() for time, _ in index]
+        self._spans.append((min(times), max(times)))
         records = bytes(self._records)
-        head = struct.pack('<QQQI', min(self._times), max(self._times), len(records),
-                           zlib.crc32(records))
+        head = struct.pack('<QQQI', *self._spans[-1], len(records), zlib.crc32(records))
+        chunk = _pack_record(_RecordCode.CHUNK, head, _pack_sized(''),
+                             struct.pack('<Q', len(records)), records)
+        indexes, offsets = b'', b''
+        for number, index in self._indexes.items():
+            offsets += struct.pack('<HQ', number, self._offset + len(chunk) + len(indexes))
+            pairs = b''.join(struct.pack('<QQ', *pair) for pair in sorted(index))
+            indexes += _pack_record(_RecordCode.MESSAGE_INDEX, struct.pack('<H', number),
+                                    _pack_sized(pairs))
+            self._counts[number] += len(index)
+        self._chunk_indexes.append(
+            _pack_record(_RecordCode.CHUNK_INDEX,
+                         struct.pack('<QQQQ', *self._spans[-1], self._offset, len(chunk)),
+                         _pack_sized(offsets), struct.pack('<Q', len(indexes)), _pack_sized(''),
+                         struct.pack('<QQ', len(records), len(records))))
         self._records.clear()
-        self._times.clear()
-        return begin + _pack_record(_RecordCode.CHUNK, head, _pack_sized(''),
-                                    struct.pack('<Q', len(records)), records)
+        self._indexes.clear()
+        self._offset += len(chunk + indexes)
+        return header + chunk + indexes
+
+    def pack_summary(self) -> bytes:
+        """Return the end of a file: the summary with the index of all chunks."""
+        data_end = _pack_record(_RecordCode.DATA_END, struct.pack('<I', 0))
+        sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
+        span = (min((span[0] for span in self._spans), default=0),
+                max((span[1] for span in self._spans), default=0))
+        counts = b''.join(struct.pack('<HQ', *pair) for pair in self._counts.items())
+        statistics = _pack_record(
+            _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
+            struct.pack('<QQ', *span), _pack_sized(counts))
+        summary = b''.join([*(record for _, record in self._schemas.values()),
+                            *(record for _, record in self._channels.values()),
+                            statistics, *self._chunk_indexes, self._metadata_index])
+        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, self._offset + len(data_end), 0)
+        checked = struct.pack('<I', zlib.crc32(summary + footer))
+        return data_end + summary + footer + checked + _MAGIC
 
 
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
@@ -372,9 +427,13 @@ _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
-    with _open_database(source) as database:
+    with _open_database(source) as (database, tables):
         try:
-            channels = {number: contents.add_topic(str(topic), str(kind), encoding)
+            definitions = dict(database.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions')
+                if 'message_definitions' in tables else ())
+            channels = {number: contents.add_topic(str(topic), str(kind), encoding,
+                                                   str(definitions.get(kind, '')))
                         for number, topic, kind, encoding in database.execute(
                             'SELECT id, name, type, serialization_format FROM topics')}
         except _DATABASE_ERRORS as error:
@@ -399,41 +458,53 @@ def _read_database(source: Path, path: Path, contents: Contents,
 
 
 @contextmanager
-def _open_database(source: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database read-only."""
-    # With the journal of a killed writer, else without it. Computed columns are not read: their
-    # cost is not limited by the size of the file.
-    reason: Exception | None = None
-    for mode in ('mode=ro', 'mode=ro&immutable=1'):
-        try:
-            database = sqlite3.connect(f'file:{quote(str(source.resolve()))}?{mode}', uri=True)
-        except _DATABASE_ERRORS as error:
-            reason = error
-            continue
-        with closing(database):
+def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
+    """Open a database read-only, and give it with the names of its tables of stored columns."""
+    # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
+    # count corrected. Computed columns are not read: their cost is not limited by the size of the
+    # file.
+    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
+        reason: Exception | None = None
+        for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
+            file = source
+            if mode == 'copy':
+                file, mode = Path(shutil.copy(source, folder)), 'mode=ro'
+                with open(file, 'r+b') as copy:
+                    head = copy.read(100)
+                    if len(head) == 100:
+                        size = int.from_bytes(head[16:18], 'big')
+                        size = 1 << 16 if size == 1 else max(size, 1)
+                        copy.seek(28)
+                        copy.write((file.stat().st_size // size).to_bytes(4, 'big'))
             try:
-                database.text_factory = partial(str, encoding='utf-8', errors='replace')
-                # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite.
-                # A query is ended after a million steps plus ten per byte.
-                thousands = repeat(0, source.stat().st_size // 100 + 1000)
-                database.set_progress_handler(partial(next, thousands, 1), 1000)
-                if sys.version_info >= (3, 11):
-                    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
-                database.execute('PRAGMA trusted_schema = OFF')
-                tables = {name for name, text in database.execute(
-                    "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-                    if name in ('topics', 'messages')
-                    and str(text).upper().startswith('CREATE TABLE')
-                    and not any(hidden for *_, hidden in database.execute(
-                        f'PRAGMA table_xinfo({name})'))}
+                database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
-            if len(tables) < 2:
-                raise LogError('is a database, but not a ROS 2 recording with tables of stored '
-                               'columns; name a recording')
-            yield database
-            return
+            with closing(database):
+                try:
+                    database.text_factory = partial(str, encoding='utf-8', errors='replace')
+                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
+                    # SQLite. A query is ended after a million steps plus ten per byte.
+                    thousands = repeat(0, file.stat().st_size // 100 + 1000)
+                    database.set_progress_handler(partial(next, thousands, 1), 1000)
+                    if sys.version_info >= (3, 11):
+                        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
+                    database.execute('PRAGMA trusted_schema = OFF')
+                    tables = {name for name, text in database.execute(
+                        "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+                        if name in ('topics', 'messages', 'message_definitions')
+                        and str(text).upper().startswith('CREATE TABLE')
+                        and not any(hidden for *_, hidden in database.execute(
+                            f'PRAGMA table_xinfo({name})'))}
+                except _DATABASE_ERRORS as error:
+                    reason = error
+                    continue
+                if not {'topics', 'messages'} <= tables:
+                    raise LogError('is a database, but not a ROS 2 recording with tables of '
+                                   'stored columns; name a recording')
+                yield database, tables
+                return
     raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '
                    'name a recording, or record again')
 

@@ -21,13 +21,13 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.files import MAX_MAGNITUDE, read_bytes, suggest_nearest, to_printable
+from gyro_calibration.files import (
+    MAX_DEPTH, MAX_MAGNITUDE, read_bytes, suggest_nearest, to_printable)
 import numpy as np
 import yaml
 
 #: Largest file, bytes: twice the size of a model with the covariance of 150 values.
 _MAX_SETTINGS_BYTES = 1_000_000
-_MAX_DEPTH = 10  # of nested lists and names, which the stack of Python holds
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
@@ -136,8 +136,8 @@ class _Loader(yaml.BaseLoader):
             _refuse_node('an anchor or alias is not read; write out what it stands for', event)
         if event.tag is not None:
             _refuse_node('a tag is not read; leave it out', event)
-        if self._depth == _MAX_DEPTH:
-            _refuse_node(f'more than {_MAX_DEPTH} levels are nested', event)
+        if self._depth == MAX_DEPTH:
+            _refuse_node(f'more than {MAX_DEPTH} levels are nested', event)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1

@@ -204,7 +204,10 @@ def test_rosbags_and_mcap_read_what_is_recorded(tmp_path):
         assert [message.log_time for _, channel, message in reader.iter_messages()
                 if channel.topic == '/imu/temperature'] == times
         file.seek(0)
-        reader = reading.make_reader(file, validate_crcs=True)
+        reader = reading.SeekingReader(file, validate_crcs=True)
+        said = reader.get_summary().statistics
+        assert (said.message_count, said.chunk_count, said.message_start_time,
+                said.message_end_time) == (600, 4, times[0], times[-1])
         assert reader.get_header().profile == 'ros2'
         metadata, = reader.iter_metadata()
         assert metadata.metadata == notes()

@@ -240,13 +240,21 @@ def test_a_time_constant_has_the_interval_of_the_profile_of_its_likelihood(seed)
     assert 15.0 < low < 40.0 < high < 100.0
 
 
-def test_a_cause_that_its_own_fit_does_not_show_at_the_level_is_implausible():
-    log, rate = turning_log(2, lambda time, _: 0.003), CauseTerm('clock_rate')
+def test_a_cause_that_its_own_fit_does_not_show_at_the_level_is_suspected(monkeypatch):
+    log, name = turning_log(2, lambda time, _: 0.003), 'clock_rate'
     log = replace(log, output=np.interp(log.time * (1.0 + 3e-5), log.time, log.output))
-    fit = fit_spans(lay_out_spans(log, 'motion_capture'), [rate])
-    chance = fit.p_value(fit.value_slice(rate).start)
-    assert noisy_reference._implausibility(fit, rate, 2.0 * chance) < 1.0
-    assert noisy_reference._implausibility(fit, rate, 0.5 * chance) == math.inf
+    fit = fit_spans(lay_out_spans(log, 'motion_capture'))
+    with_rate = fit_spans(fit.spans, [CauseTerm(name)])
+    chance = float(2.0 * student.sf(
+        abs(with_rate.values[3]) / np.sqrt(with_rate.covariance[3, 3]), with_rate.freedom[3]))
+    assert chance < 0.01
+    candidate = span_candidate(name)
+    monkeypatch.setattr(noisy_reference, 'search_causes', lambda search: (candidate,))
+    monkeypatch.setattr(noisy_reference, 'confirm_causes', lambda search, causes: Selection(
+        causes, [{name: 0.0}], (), ()))
+    for level, is_established in ((0.5 * chance, False), (2.0 * chance, True)):
+        (cause,) = select_causes(fit, level, lambda share, words: None)[1]
+        assert cause.is_established == is_established
 
 
 @pytest.mark.parametrize('name, size, step', [

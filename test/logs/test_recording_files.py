@@ -17,7 +17,7 @@ import shutil
 import sys
 
 from gyro_calibration.logs.cdr import (
-    DEFINITIONS, IMU, LAYOUTS, MessageError, parse, serialize, TEMPERATURE)
+    IMU, LAYOUTS, MessageError, parse, parse_layout, serialize, TEMPERATURE)
 from gyro_calibration.logs.log import LogError, read_log, select_rows
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording
@@ -25,8 +25,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import motion_by_name, simulate
 import numpy as np
 import pytest
-from recordings import (
-    BEGIN, chunk, database, DELAY, file_of, KINDS, MCAP, Messages, of_log, rosbags, write)
+from recordings import BEGIN, chunk, database, DELAY, file_of, KINDS, MCAP, Messages, of_log, write
 
 RATE = 100.0
 
@@ -101,31 +100,89 @@ def test_messages_of_any_alignment_are_parsed_as_rosbags_writes_them_and_read_by
             parse(data, LAYOUTS[IMU])
 
 
-def built(make, kind, numbers):
-    """Return a message of a type whose numbers are taken from an iterator."""
-    from rosbags.interfaces import Nodetype
-    values = []
-    for name, (node, inner) in make.store.fielddefs[kind][1]:
-        if name == 'header':
-            values.append(make.header(12.5))
-        elif node == Nodetype.NAME:
-            values.append(built(make, inner, numbers))
-        elif node == Nodetype.ARRAY:
-            values.append(np.array([next(numbers) for _ in range(inner[1])]))
-        else:
-            values.append('child' if inner[0] == 'string' else next(numbers))
-    return make.store.types[kind](*values)
+CUSTOM = """# a gyro of its own maker
+uint8 GOOD=1
+std_msgs/Header header
+bool good
+float32[] history
+string<=20 name
+Part[2] parts
+float64[<=3] more
+geometry_msgs/Vector3 angular_velocity
+int16 temperature
+string[] words
+float64 behind
+================================================================================
+MSG: my_msgs/Part
+int8 first
+uint64 second
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
 
 
-@pytest.mark.parametrize('kind', LAYOUTS)
-def test_each_type_is_parsed_and_defined_as_ros_has_it(make, kind):
-    _, typesys = rosbags()
-    numbers = list(map(float, range(LAYOUTS[kind].size)))
-    message = built(make, kind, iter(numbers))
-    assert parse(bytes(make.store.serialize_cdr(message, kind)), LAYOUTS[kind]) == (
-        BEGIN + 12_500_000_000, tuple(numbers))
-    defined = typesys.get_types_from_msg(DEFINITIONS[kind], kind)
-    assert defined[kind] == make.store.fielddefs[kind]
+@pytest.mark.parametrize('little', [True, False], ids=['little endian', 'big endian'])
+def test_a_message_of_any_kind_is_parsed_by_its_definition(make, little):
+    pytest.importorskip('rosbags')
+    from rosbags.typesys import get_types_from_msg
+    make.store.register(
+        {kind: fields for kind, fields in get_types_from_msg(CUSTOM, 'my_msgs/msg/Gyro').items()
+         if kind.startswith('my_msgs')})
+    custom, part = (make.store.types[f'my_msgs/msg/{name}'] for name in ('Gyro', 'Part'))
+    for frame, history in (('', []), ('gyro', [1.0, 2.0, 3.0])):
+        message = custom(make.header(12.5, frame), True, np.array(history, np.float32), 'a name',
+                         [part(1, 2), part(3, 4)], np.array(history), make.vector(0.25), 31,
+                         ['x'], 7.0)
+        layout = parse_layout(CUSTOM)
+        stamp, numbers = parse(
+            bytes(make.store.serialize_cdr(message, 'my_msgs/msg/Gyro', little_endian=little)),
+            layout)
+        assert (stamp, {name: numbers[place] for name, place in layout.quantities.items()}) == (
+            BEGIN + 12_500_000_000, {'rate': 0.25, 'temperature': 31})
+
+
+@pytest.mark.parametrize('definition', [
+    '', 'float64 angular_velocity', 'std_msgs/Header header\n', 'x' * 200_000, CUSTOM[:700],
+    'A a\n' + ''.join(f'{80 * "="}\nMSG: p/{name}\n{inner}[999999999] a\n'
+                      for name, inner in ('AB', 'BC', 'CA')),
+    'A a\n' + 80 * '=' + '\nMSG: p/A\nA a\n', 'Header header\nfloat64[999999999] a\n'])
+def test_a_definition_of_nothing_or_without_end_is_refused_at_once(definition):
+    with pytest.raises(MessageError):
+        parse_layout(definition)
+
+
+@pytest.mark.parametrize('first', ['std_msgs/Header header\nstring raw\n', ''],
+                         ids=['own header', 'header of the Imu'])
+def test_an_imu_in_the_message_of_a_driver_serves_where_its_topic_is_named(
+        make, tmp_path, turning, monkeypatch, first):
+    pytest.importorskip('rosbags')
+    from rosbags.typesys import get_types_from_msg
+    kind = 'my_msgs/msg/Driver'
+    make.store.register(get_types_from_msg(f'{first}sensor_msgs/Imu imu\nint16 status\n', kind))
+    time, rate, _ = turning
+
+    def message(at, value):
+        own = (make.header(at), 'raw') if first else ()
+        return make.store.types[kind](*own, make.imu(at, value, force=9.8), 1)
+    monkeypatch.setattr(Messages, '__init__', lambda self, _: vars(self).update(vars(make)))
+    path = write(tmp_path / 'bag', {'driver': [(at, message(at, r)) for at, r in zip(time, rate)]})
+    log = read_recording(path, Topics('driver'))
+    np.testing.assert_array_equal(log.output, rate)
+    np.testing.assert_allclose(log.time, time, atol=1e-9)
+    assert log.specific_force[5] == 9.8
+    with pytest.raises(LogError, match='select driver with --topic'):
+        read_recording(path)
 
 
 def write_chunks(path, compression, count, chunked=True):
@@ -197,6 +254,17 @@ def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
                for note in log.notes)
 
 
+def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
+    time = np.arange(2000) / RATE
+    path = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)}))
+    data = path.read_bytes()
+    path.write_bytes(data[:len(data) * 2 // 3])
+    log = read_recording(path)
+    assert 100 < len(log) < 2000
+    np.testing.assert_array_equal(log.output, time[:len(log)])
+    assert any('read up to there' in note for note in log.notes)
+
+
 def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
     messages = [('/imu', BEGIN + number,
                  serialize(BEGIN + number * 10 ** 7, 'gyro', 37 * [float(number)]))
@@ -219,6 +287,14 @@ def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
     (tmp_path / 'bomb.mcap').write_bytes(MCAP + chunk(bomb, name, 1000))
     with pytest.raises(LogError, match='no message of sensor_msgs/msg/Imu'):
         read_recording(tmp_path / 'bomb.mcap')
+
+
+def test_a_compressed_file_may_not_grow_without_bound(tmp_path, monkeypatch):
+    zstandard = pytest.importorskip('zstandard')
+    monkeypatch.setattr('gyro_calibration.logs.ros_bag.MAX_RECORD_BYTES', 1 << 23)
+    (tmp_path / 'bomb.db3.zstd').write_bytes(zstandard.compress(bytes(1 << 26)))
+    with pytest.raises(LogError, match='times its size'):
+        read_recording(tmp_path / 'bomb.db3.zstd')
 
 
 def test_a_compressed_recording_says_which_package_it_needs(make, tmp_path, monkeypatch):
@@ -265,7 +341,7 @@ REFUSED = {
                                       r'and /t \(sensor_msgs/msg/Temp'),
     'no reference': (lambda make, time: {'/imu': gyro(make, time, time), '/t': degc(make)},
                      Topics(reference='t'), '/t is sensor_msgs/msg/Temperature; '
-                                            '--reference-topic wants sensor_msgs/msg/Imu, '),
+                                            '--reference-topic wants nav_msgs/msg/Odometry, '),
     'its own reference': (lambda make, time: {'/imu': gyro(make, time, time)},
                           Topics('imu', reference='imu'), 'cannot be its own reference'),
     'no gyro': (lambda make, time: {'/t': degc(make)}, Topics(),
