@@ -52,9 +52,7 @@ FILES = {'decoder': ('driver/protocols/protocol.py',),
          'model': ('model/model_file.py', 'model/settings_file.py'),
          'bias table': ('heading/bias_table.py', 'model/settings_file.py'),
          'motion profile': ('model/motion.py',),
-         'recording': ('logs/recording.py', 'logs/ros_bag.py', 'logs/cdr.py'),
-         'parameters': ('ros/compensation_node.py', 'ros/driver_node.py'),
-         'arguments': ('cli/verb.py',)}
+         'recording': ('logs/recording.py', 'logs/ros_bag.py', 'logs/cdr.py')}
 
 
 @dataclass
@@ -134,8 +132,6 @@ def _instrumented():
     with contextlib.redirect_stderr(io.StringIO()), atheris.instrument_imports(
             include=['gyro_calibration', 'yaml'], exclude=exclude):
         import fuzzed
-        if fuzzed.HAS_ROS:
-            import gyro_calibration.ros.driver_node  # noqa: F401  here, so that it is watched
     return fuzzed.TARGETS
 
 

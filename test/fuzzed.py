@@ -362,7 +362,8 @@ def _messages() -> list[tuple[str, str, int, bytes]]:
         for topic, kind in (('imu/data_raw', IMU), ('imu/temperature', TEMPERATURE),
                             ('table', 'geometry_msgs/msg/PoseStamped')):
             found.append((topic, kind, stamp + 1000,
-                          serialize(stamp, 'gyro', [0.1 * number] * LAYOUTS[kind].size)))
+                          serialize(stamp, 'gyro', [0.1 * number] * (sum(
+                              len(codes) for _, codes in LAYOUTS[kind].runs) - 2))))
     return found
 
 

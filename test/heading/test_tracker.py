@@ -255,7 +255,8 @@ def test_short_rests_that_wheels_show_measure_the_bias_of_another_power_on(bias,
     assert np.abs(errors).max() < 4.0, errors
 
 
-@pytest.mark.parametrize('rest, noise_factor, bias', [(2.0, 1.0, 0.07), (10.0, 12.0, 0.5)], ids=['short', 'fan'])
+@pytest.mark.parametrize('rest, noise_factor, bias', [
+    (2.0, 1.0, 0.07), (10.0, 12.0, 0.5)], ids=['short', 'fan'])
 def test_a_small_bias_of_another_power_on_is_found_by_short_rests_and_while_a_fan_runs(
         rest, noise_factor, bias):
     """0.07 deg/s is not shown by a window of 0.5 s alone; the drive begins in motion."""
