@@ -553,8 +553,9 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
                    f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '
                    'agree',
-                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}; or, if '
-                   f'the stamps are right, {correct_units}', known)
+                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
+                   + ' (the stamps are in ms)' * (slower == 1e3)
+                   + f'; or, if the stamps are right, {correct_units}', known)
     elif name is not None:
         yield Gate('unit', False, f'{evidence}, and {name} is {UNIT_FACTORS[name]:.5g}',
                    correct_units, known)

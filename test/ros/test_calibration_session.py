@@ -465,7 +465,7 @@ def test_odometry_that_cannot_be_used_is_refused(tmp_path, spoil, reason):
     (lambda time, heading: heading + 0.15 * (time > 6.0), 'differs by .* deg from the odometry'),
     (lambda time, heading: heading - 2.0 * (time > 6.0), 'does not follow the odometry'),
     (lambda time, heading: heading * (time < 6.0), 'of the odometry|the gyro .* the odometry'),
-    (lambda time, heading: heading / DEGREE, 'the odometry in deg and read as rad'),
+    (lambda time, heading: heading / DEGREE, 'the odometry in deg/s and read as rad/s'),
     (lambda time, heading: -heading, 'the other way than the odometry'),
     (lambda time, heading: 0.0, 'the odometry does not turn')],
     ids=['a slip', 'a jump', 'a reset', 'deg', 'sense', 'no turn'])
