@@ -38,7 +38,7 @@ from gyro_calibration.calibration.reference_kind import find_reference_kind, is_
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_headings, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, refuse_unit_error, split_run)
+    fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects, TECHNOLOGY_PRIORS)
 from gyro_calibration.calibration.self_calibration import (
@@ -57,7 +57,7 @@ from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import (
-    Motion, motion_from_headings, motion_from_log)
+    Motion, motion_from_headings, motion_from_log, motion_from_rates)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -281,7 +281,8 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
     Return a log with a single reference over time, and remarks on what was left out.
 
     Of a heading and a rate it is the heading, unless this is known for less than half as long, or
-    the rate is preferred and both turn alike. A remark states where they contradict each other.
+    the rate is preferred and both turn alike. Where they contradict each other, and one is further
+    from the gyro than a scale factor error of 10 %, it is the other if that leaves less than half.
     """
     rate, heading = (None if each is None or not np.isfinite(each).any() else each
                      for each in (log.reference_rate, log.reference_heading))
@@ -306,6 +307,16 @@ def choose_reference(log: Log, prefer_rate: bool = False) -> tuple[Log, list[str
         elif ((turned.any() or not alike)
               and abs(scale - 1.0) >= max(1e-3, math.sqrt(max(unexplained, 0.0)))):
             contradiction = f'turns {scale:.3f} times as far as'
+        if contradiction and log.output is not None:
+            rows = np.isfinite(log.output[known])
+            gyro = split_run(time[rows], log.output[known][rows])
+            left = []  # shares of the squares of what the gyro turned
+            for each in (motion_from_rates(time, rate[known]), motion):
+                delay = fit_profile(gyro, each, COURSE_TREATMENT.largest_delay)[2]
+                off = gyro.gyro_angle - gyro.reference_angle(each, delay)
+                left.append(float(np.var(off)) / max(float(np.var(gyro.gyro_angle)), 1e-300))
+            if max(left) > max((UNIT_TOLERANCE - 1.0) ** 2, 2.0 * min(left)):
+                by_rate = left[0] < left[1]
     remarks = [f'The reference heading is known in {counts[1]} samples only; the rate, known in '
                f'{counts[0]}, is used.'] if by_rate and 2 * counts[1] < counts[0] else []
     if contradiction:
@@ -536,6 +547,10 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     """Calibrate by the dwells of logs, by their paths, or by the heading of one (`api.fit`)."""
     for log in logs.values():
         _refuse_own_reference(log)
+    chosen = {path: choose_reference(log) for path, log in logs.items()}
+    # the rate alone, where the gyro shows that the heading is wrong
+    alone = {path: each for path, (each, _) in chosen.items() if each.reference_heading is None}
+    logs, remarks = {**logs, **alone}, [each for path in alone for each in chosen[path][1]]
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
     if method == 'dwells' or method is None and (others or any(
             log.time is None or log.reference_rate is not None or log.reference_heading is None
@@ -552,6 +567,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                         raise type(error)(f'{name}: {error}') from None
                     raise
             table = join_dwells(parts)
+            table = replace(table, remarks=(*remarks, *table.remarks))
             if is_settled or len(table) >= _MIN_DWELLS or any(
                     log.time is None for log in logs.values()):
                 return (SelectedEffects(fit_effects(table, effects), (), ()) if effects
@@ -570,7 +586,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     if log.reference_heading is not None:
         return found
     return replace(found, remarks=(
-        'the log has a reference rate, which is constant '
+        *remarks, 'the log has a reference rate, which is constant '
         f'{_MIN_DWELLS - 1} times at most, or for up to {100.0 * FEW_DWELLS_SHARE:g} % of the '
         'time; so the rate is integrated, and headings are compared. For other effects than bias '
         'and scale factor error, hold each rate for some seconds', *found.remarks))

@@ -439,22 +439,26 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
     difference = turned - moving
     seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
+    if len(seconds) < 2:
+        return log, []
     bias = float(np.median(np.diff(difference[seconds]) / np.diff(log.time[seconds])))
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
-    kept, lost = heading.copy(), list[tuple[float, float, float]]()
+    step, kept = quantization_step(heading[known]), heading.copy()
+    lost = list[tuple[float, float, float]]()
     for rows in runs:
         first, last = rows[[0, -1]].tolist()
         span = float(log.time[last] - log.time[first])
         unseen = turned[last] - turned[first] - bias * span
+        after = known[min(np.searchsorted(known, last) + 1, len(known) - 1)]
+        jump = heading[after] - heading[last] - (turned[after] - turned[last])
+        if abs(unseen) <= step or abs(jump - unseen) >= abs(jump):
+            continue
         starts = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1] - span, 500))
         ends = np.minimum(np.searchsorted(log.time, log.time[starts] + span), len(log) - 1)
         changes = difference[ends] - difference[starts] - bias * span
-        usual = robust_deviation(changes[np.isfinite(changes)])
-        after = known[min(np.searchsorted(known, last) + 1, len(known) - 1)]
-        jump = heading[after] - heading[last] - (turned[after] - turned[last])
-        if (abs(unseen) > quantization_step(heading[known]) + 2.0 * bound * usual
-                and abs(jump - unseen) < abs(jump)):
+        changes = changes[np.isfinite(changes)]
+        if len(changes) and abs(unseen) > step + 2.0 * bound * robust_deviation(changes):
             kept[rows[1:]] = np.nan
             lost.append((float(log.time[first]), float(log.time[last]), abs(unseen)))
     if not lost:

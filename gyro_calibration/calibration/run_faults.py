@@ -26,7 +26,7 @@ _TRIAL_STEP = 0.1
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
 MAX_UNEXPLAINED_SHARE = 0.1
 
-#: Units that are confused, in rad/s, the usual ones first.
+#: Units that are confused, in rad/s.
 _UNITS = {'deg/s': DEGREE, 'rad/s': 1.0, 'mdeg/s': 1e-3 * DEGREE, 'mrad/s': 1e-3,
           'revolutions/s': 2.0 * math.pi, 'revolutions/min': math.pi / 30.0,
           'deg/h': DEGREE / 3600.0}
@@ -48,7 +48,10 @@ def refuse_unit_error(scale: float, reference: str) -> None:
     found = [each for each in causes if 1.0 / UNIT_TOLERANCE < size / each[0] < UNIT_TOLERANCE]
     if not found:
         return
-    _, gyro, other = found[0]
+    # units that are usual in columns first, then the nearest factor
+    _, gyro, other = min(found, key=lambda each: (
+        'revolutions' in each[1] or 'deg/h' in each[1] or 'sensitivity' in each[1],
+        abs(math.log(size / each[0]))))
     sign_note = ', and turns the other way' if scale < 0.0 else ''
     cause = f'either {gyro}, or {other}' if reference else gyro
     if reference == 'reference' and size > 1.0:

@@ -329,8 +329,9 @@ def _refuse_fit(fit: ScaleBiasFit, motion: Motion, limits: RunLimits, white_nois
     if excess_angle > limits.max_stretch_residual and sigmas > _MIN_SLIP_SIGMAS:
         raise DataRefused(format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas))
     if abs(fit.time_offset) > limits.max_time_offset + MAX_TRACKING_LAG:
-        raise DataRefused(f'the gyro is {fit.time_offset:.2f} s behind the {motion.name}: begin '
-                          f'with it, or correct the time of the {motion.name}')
+        side = 'behind' if fit.time_offset > 0.0 else 'ahead of'
+        raise DataRefused(f'the gyro is {abs(fit.time_offset):.2f} s {side} the {motion.name}: '
+                          f'begin with it, or correct the time of the {motion.name}')
     if abs(s) > limits.max_scale_factor_error and deviation <= limits.max_scale_deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '

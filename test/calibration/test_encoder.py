@@ -173,16 +173,6 @@ def test_references_that_contradict_each_other_are_remarked(factor, late, said):
     assert remark.startswith(f'The reference rate turns {said}') == bool(said), remark
 
 
-def test_a_wrong_heading_beside_a_right_rate_is_refused_by_dwells():
-    generator, time = np.random.default_rng(71), np.arange(9000) / 50.0
-    rates = 60.0 * DEGREE * generator.uniform(-1.0, 1.0, 30)
-    rate = uniform_filter1d(np.repeat(rates, 300), 25)
-    output = (1.0 + S) * rate + B + 0.02 * DEGREE * generator.standard_normal(len(time))
-    with pytest.raises(DataRefused, match='the gyro turns the other way than the reference'):
-        calibrate({'': Log(time=time, output=output, reference_rate=rate,
-                           reference_heading=-np.cumsum(rate) / 50.0)})
-
-
 @pytest.mark.parametrize('size', [0.5, 100.0, 1e6])
 def test_single_wrong_values_of_the_reference_are_left_out(size):
     heading = CLEAN.reference_heading.copy()
@@ -356,3 +346,26 @@ def test_a_late_rate_that_is_seldom_steady_is_compared_as_a_heading(seed):
     found = calibrate({'': log})
     assert abs(found.fit.scale_factor_error - 0.002) < 3.0 * math.sqrt(found.fit.covariance[0, 0])
     assert abs(found.fit.bias - 0.4 * DEGREE) < 3.0 * math.sqrt(found.fit.covariance[1, 1])
+
+
+@pytest.mark.parametrize('factor, noise', [(1.0 / DEGREE, 0.0), (0.0, 0.1 * DEGREE)],
+                         ids=['deg/s', 'noise alone'])
+def test_of_references_that_contradict_each_other_the_gyro_shows_the_right_one(factor, noise):
+    rate = factor * SWING.rate_at(NOISY.time)
+    rate += noise * np.random.default_rng(66).standard_normal(len(rate))
+    heading = np.where(NOISY.time < 40.0, NOISY.reference_heading, np.nan)
+    found = calibrate_encoder(replace(NOISY, reference_rate=rate, reference_heading=heading))
+    assert 'the heading is used' in found.remarks[0]
+    assert found.fit.scale_factor_error == pytest.approx(S, abs=5e-4)
+
+
+def test_a_wrong_heading_beside_a_right_rate_is_not_used_in_dwells():
+    generator, time = np.random.default_rng(71), np.arange(9000) / 50.0
+    rates = 60.0 * DEGREE * generator.uniform(-1.0, 1.0, 30)
+    rate = uniform_filter1d(np.repeat(rates, 300), 25)
+    output = (1.0 + S) * rate + B + 0.02 * DEGREE * generator.standard_normal(len(time))
+    found = calibrate({'': Log(time=time, output=output, reference_rate=rate,
+                               reference_heading=-np.cumsum(rate) / 50.0)})
+    assert 'turns -1.000 times as far' in found.calibration.dwells.remarks[0]
+    values = {parameter.name: value for _, parameter, value, _ in found.model.estimates()}
+    assert values['scale_factor_error'] == pytest.approx(S, abs=5e-4)
