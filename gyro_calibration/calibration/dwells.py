@@ -110,10 +110,12 @@ def _mark_limited(log: Log, dwells: Dwells) -> Mask:
     Return which dwells are at the limit of the output of their log, shape (n,).
 
     A line through the others is beyond it at each of their rates, and leaves far less than a line
-    and one more effect of the rate through all.
+    and one more effect of the rate through all; or they alone have no noise.
     """
-    extreme, step = mark_extremes(require_output(log))
+    output = require_output(log)
+    extreme, step = mark_extremes(output)
     limited = np.array([extreme[rows].mean() > 0.5 for rows in dwells.rows])
+    constant = np.array([np.ptp(output[rows]) == 0.0 for rows in dwells.rows])
     rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
     line = np.column_stack([np.ones(len(rate)), rate])
     if limited.sum() < 2 or len(np.unique(rate[~limited])) < 3:
@@ -128,7 +130,8 @@ def _mark_limited(log: Log, dwells: Dwells) -> Mask:
                   for effect in (np.abs(rate), rate ** 2, rate ** 3))
     left = float(np.sum(off[~limited] ** 2)) + len(rate) * step ** 2 / 12.0
     is_beyond = -np.sign(dwells.output[limited]) * off[limited] > 0.0
-    return limited & bool(is_beyond.all() and instead > OUTLIER_THRESHOLD * left)
+    return limited & bool(is_beyond.all() and (
+        (limited == constant).all() or instead > OUTLIER_THRESHOLD * left))
 
 
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:

@@ -262,6 +262,17 @@ def test_stretches_at_the_limit_of_a_coarse_output_are_left_out():
             assert (fastest < limit) == clipped == ('at the limit' in ' '.join(found.remarks))
 
 
+def test_a_limit_that_two_speeds_do_not_distinguish_from_an_effect_is_one_without_noise():
+    rates = np.array([0.0, 100.0, 200.0, 0.0, -100.0, -200.0, 0.0]) * DEGREE
+    output = np.repeat(1.002 * rates, 1000)
+    output += 0.02 * DEGREE * np.random.default_rng(1).standard_normal(len(output))
+    found = extract_dwells(Log(
+        time=np.arange(len(output)) * 0.01, reference_rate=np.repeat(rates, 1000),
+        output=np.clip(output, -185.0 * DEGREE, 185.0 * DEGREE)))
+    assert np.abs(found.rate).max() == pytest.approx(100.0 * DEGREE)
+    assert 'at the limit' in ' '.join(found.remarks)
+
+
 # Recordings
 
 def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):
