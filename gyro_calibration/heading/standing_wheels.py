@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 
 from gyro_calibration.heading.kalman import RateIntegral
-from gyro_calibration.heading.stationary import chi_squared_quantile
+from gyro_calibration.heading.stationary import scatters_as_noise
 from gyro_calibration.heading.steady_rates import (
     CHANGE_PROBABILITY, TURN_ON_RATIOS, TURN_ON_SHARES)
 from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
@@ -120,10 +120,12 @@ class StandingWheels:
     def _repeats(self, turn: RateIntegral, noise: Noise) -> bool:
         """Tell whether the last standstill had the same rate, as far as white noise shows."""
         one, other = self._earlier, turn
-        return one.duration > 0.0 and _is_steady(one, noise) and _is_steady(other, noise) and (
-            one.angle / one.duration - other.angle / other.duration) ** 2 < (
-                NORMAL_QUANTILE_975 ** 2 * (noise.rate_variance(one.duration)
-                                            + noise.rate_variance(other.duration)))
+        if not one.duration or not all(  # a body may sway
+                scatters_as_noise(each, noise, 1.0 - CHANGE_PROBABILITY) for each in (one, other)):
+            return False
+        return (one.angle / one.duration - other.angle / other.duration) ** 2 < (
+            NORMAL_QUANTILE_975 ** 2 * (noise.rate_variance(one.duration)
+                                        + noise.rate_variance(other.duration)))
 
     def largest_change(self, repeats: bool) -> float:
         """Return the change of the bias, rad/s, that a rate may show that repeats, or does not."""
@@ -182,11 +184,3 @@ class StandingWheels:
         if self._turn_on_probability < (1.0 - CHANGE_PROBABILITY) ** 2:
             self._turn_on_probability = 0.0
         return self._turn_on_probability > CHANGE_PROBABILITY
-
-
-def _is_steady(turn: RateIntegral, noise: Noise) -> bool:
-    """Tell whether the blocks of an integral scatter as white noise, and no body sways."""
-    scatter = turn.block_square_sum - turn.angle ** 2 / turn.duration
-    freedom = turn.block_count - 1
-    return freedom < 1 or scatter < noise.angle_random_walk ** 2 * chi_squared_quantile(
-        freedom, 1.0 - CHANGE_PROBABILITY)

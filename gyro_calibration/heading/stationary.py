@@ -93,8 +93,16 @@ def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
+def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     return float(chdtri(degrees_of_freedom, chance))
+
+
+def scatters_as_noise(turn: RateIntegral, noise: Noise, chance: float) -> bool:
+    """Tell whether the blocks of an integral scatter as white noise, which exceeds by chance."""
+    freedom = turn.block_count - 1
+    return freedom < 1 or (
+        turn.block_square_sum - turn.angle ** 2 / turn.duration
+        <= noise.angle_random_walk ** 2 * _chi_squared_quantile(freedom, chance))
 
 
 class EnergyDetector:
@@ -124,18 +132,18 @@ class EnergyDetector:
         self._blocks = self._blocks[:, :0]
         self._results.clear()
 
-    def add(self, block: Block, stands: bool | None) -> bool | None:
+    def add(self, block: Block, wheels: bool | None) -> bool | None:
         """
         Add a block; tell whether the window contains only noise; None until it is full.
 
-        Given is whether the wheels stand, None where unknown.
+        Given is whether wheels moved in the block, None where unknown.
         """
         if not self._results:
-            self.look_ahead(np.array([astuple(block)]).T, [stands])
+            self.look_ahead(np.array([astuple(block)]).T, [wheels])
         quiet, self.noise_factor, self.sudden_limit = self._results.popleft()
         return quiet
 
-    def _next_noise_factor(self, factor: float, stands: bool | None, duration: float,
+    def _next_noise_factor(self, factor: float, stands: bool, duration: float,
                            count: float, energy: float, differences: float) -> float:
         """Return the noise of the samples by the quietest tenth of the windows, after a block."""
         # Vibration in a straight drive is not noise; it contributes less to differences of
@@ -148,7 +156,7 @@ class EnergyDetector:
         if len(self._ratios) < _MIN_WINDOWS:
             return factor
         quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._ratios))
-        quietest *= (count - 1) / chi_squared_quantile(round(count) - 1, 0.9)
+        quietest *= (count - 1) / _chi_squared_quantile(round(count) - 1, 0.9)
         return math.sqrt(min(max(quietest, 1.0), math.inf if stands else _MAX_NOISE_FACTOR ** 2))
 
     def _sample_limit(self, interval: float, variance: float) -> float:
@@ -157,7 +165,7 @@ class EnergyDetector:
         return (mean_threshold_sigmas(round(interval, 9), self._sample_false_alarms)
                 * math.sqrt(variance))
 
-    def look_ahead(self, blocks: Array, stands: Sequence[bool | None]) -> None:
+    def look_ahead(self, blocks: Array, wheels: Sequence[bool | None]) -> None:
         """Compute the results of the next k blocks, as for `add`, given as `Block`, (5, k)."""
         sums, kept = np.hstack([self._blocks, blocks]), self._blocks.shape[1]
         sums = np.vstack([sums, sums[2] ** 2 / sums[1]])
@@ -174,11 +182,11 @@ class EnergyDetector:
         energy = (squares - total * total / count) / np.maximum(freedom, 1.0)
         variance = self._noise.rate_variance(1.0) / interval
         factors, factor = [], self.noise_factor
-        for stand, is_full, *values in zip(stands, *(each.tolist() for each in (
+        for moved, is_full, *values in zip(wheels, *(each.tolist() for each in (
                 full, blocks[0], count, energy / variance,
                 0.5 * differences / count / variance))):
-            if is_full and stand is not False:
-                factor = self._next_noise_factor(factor, stand, *values)
+            if is_full and not moved:
+                factor = self._next_noise_factor(factor, moved is False, *values)
             factors.append(factor)
         variance *= np.square(factors)
         # motion is slower than the samples, so that means over blocks show it far better
@@ -356,12 +364,12 @@ class EvenSamples:
         self.block_retentions = np.multiply.reduceat(self._pending_retention, self.block_starts)
         self.epochs = list[Epoch]()
 
-    def wheels_of(self, number: int) -> tuple[bool, bool | None]:
-        """Return whether wheels moved in a block, and whether they move at its last sample."""
+    def wheels_of(self, number: int) -> bool | None:
+        """Return whether wheels moved in a block; None if unknown at its last sample."""
         if self.wheels is None:
-            return False, None
+            return None
         moved = self.wheels[self.block_starts[number]:self.block_stops[number]]
-        return True in moved, moved[-1]
+        return True in moved or moved[-1]
 
     def _integrate_sensitivity(self, rows: Array) -> Array:
         before = np.concatenate([self.used_sensitivity[:1], rows[:-1]])
@@ -432,8 +440,3 @@ class EvenSamples:
         block = np.searchsorted(places, rows, side='right') - 1
         found[rows, 1] += (variances[block]
                            + white[block] * (until[rows] - until[places[block]]))
-
-
-def are_standing(driven: bool, wheels: bool | None) -> bool | None:
-    """Tell whether wheels stand in a block, by whether they moved in it, and move at its end."""
-    return False if driven else None if wheels is None else not wheels

@@ -40,7 +40,7 @@ import math
 from gyro_calibration.heading.integration import TIME_TOLERANCE
 from gyro_calibration.heading.kalman import HEADING_INDEX, HeadingState, RateIntegral
 from gyro_calibration.heading.stationary import (
-    chi_squared_quantile, MAX_SCATTER_RATIO, MEAN_LAGS, PRIOR_COUNTS, SCATTER_RATIOS,
+    MAX_SCATTER_RATIO, MEAN_LAGS, PRIOR_COUNTS, SCATTER_RATIOS, scatters_as_noise,
     WINDOW_DURATION)
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import Noise
@@ -148,9 +148,9 @@ class SteadyRates:
         # a turn is beyond what a bias may differ by, from that of the last steady rate
         before_it = self._way_rate if self._is_calibrated and self._way_rate < math.inf else 0.0
         self._way += (rate - before_it) ** 2 >= sigmas ** 2 * (usual + white / still.duration)
-        last, freedom = self._last, still.block_count - 1
-        is_steady = is_rest or freedom <= 0 or still.block_square_sum - still.angle * rate <= (
-            white * chi_squared_quantile(freedom, 2.0 * float(ndtr(-sigmas))))
+        last = self._last
+        is_steady = is_rest or scatters_as_noise(
+            still, before.noise, 2.0 * float(ndtr(-sigmas)))
         if is_steady and last is not None and self._agree(last.turn, still):
             still, count, errors = last.turn + still, last.step_count + 1 + is_rest, last.errors
         else:

@@ -31,7 +31,7 @@ from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, STANDSTILL, TrackStep, WALK_INDEX)
 from gyro_calibration.heading.standing_wheels import StandingWheels, WHEEL_DELAY
 from gyro_calibration.heading.stationary import (
-    are_standing, Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES,
+    Block, BLOCK_DURATION, BLOCK_RATIOS, CORRECTION_TIME, ENDING_RATES,
     EnergyDetector, Epoch, EvenSamples, MEAN_LAGS, mean_threshold_sigmas, median_ratio,
     RestScatter, Samples, SlowTurn, Snapshot, sum_ratios, update_scatter, WINDOW_DURATION)
 from gyro_calibration.heading.steady_rates import SteadyRates
@@ -332,7 +332,7 @@ class HeadingTracker:
                 self._revert_to_motion(0.0)
             self._wheels_moved = self._wheels_moved or bool(wheels)
             if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
-                self._end_block(self._wheels_moved, wheels)
+                self._end_block(self._wheels_moved or wheels)
         elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
             self._close_block()
             if self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
@@ -413,7 +413,7 @@ class HeadingTracker:
             if number == piece.whole_blocks.start and piece.whole_blocks:
                 here = range(number, piece.whole_blocks.stop)
                 self._energy.look_ahead(piece.block_sums[:, number:here.stop],
-                                        [are_standing(*piece.wheels_of(each)) for each in here])
+                                        [piece.wheels_of(each) for each in here])
             if number in piece.whole_blocks and self._take_block(piece, number):
                 if self._state_version != piece.epochs[-1].state_version:
                     piece.close_epoch(until - 1)
@@ -451,13 +451,13 @@ class HeadingTracker:
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
         begin, end = piece.block_starts[number], piece.block_stops[number]
-        driven, wheels = piece.wheels_of(number)
+        wheels = piece.wheels_of(number)
         rows = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
         if self.is_resting:
             rates = (piece.rate[begin:end] - self._wander_rate
                      + rows[begin:end] @ self._calibration_errors)
             limit = math.hypot(self._energy.sudden_limit, self._bias_margin)
-            if driven or rates.max() > limit or rates.min() < -limit:
+            if wheels or rates.max() > limit or rates.min() < -limit:
                 return False
         part = self._block_integral
         part.duration, part.angle = (float(piece.block_sums[0, number]),
@@ -480,7 +480,7 @@ class HeadingTracker:
         self._last_sample = time, rate, rate, rows[end - 1]
         self._interval, self._last_time = float(piece.intervals[end - 1]), time
         self._still_sensitivity = None if piece.still is None else piece.still[end - 1]
-        self._end_block(driven, wheels)
+        self._end_block(wheels)
         if not -math.inf < self.heading < math.inf:
             self._rebuild_state()
         return True
@@ -521,11 +521,11 @@ class HeadingTracker:
         self._pending_correction -= settled
         self.heading += corrected + settled
 
-    def _end_block(self, driven: bool, wheels: bool | None) -> None:
-        """Decide on rest or motion; whether wheels moved in the block, and at its last sample."""
-        quiet = self._energy.add(self._block, are_standing(driven, wheels))
-        if driven:
-            quiet, wheels = False, True
+    def _end_block(self, wheels: bool | None) -> None:
+        """Decide on rest or motion, by whether wheels moved in the block; None if unknown."""
+        quiet = self._energy.add(self._block, wheels)
+        if wheels:
+            quiet = False
         self._block, self._wheels_moved = Block(), False
         part = self._close_block()
         if wheels is not False:
