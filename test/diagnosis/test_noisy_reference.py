@@ -23,7 +23,8 @@ from gyro_calibration.calibration.spans import CauseTerm, lay_out_spans
 from gyro_calibration.diagnosis import noisy_reference
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import select_causes, span_candidate
+from gyro_calibration.diagnosis.noisy_reference import (
+    _cluster_robust_chance, select_causes, span_candidate)
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.search import Selection
 from gyro_calibration.diagnosis.words import terminal_lines
@@ -745,6 +746,16 @@ def test_an_output_without_numbers_is_refused():
     wheels(6, lag=0.25)[0]], ids=['exact', 'exact, asymmetric', 'late, as after a command'])
 def test_a_rate_that_is_exact_or_that_a_motion_follows_late_is_no_odometry(log):
     assert classify_reference(log).kind == 'rate_command'
+
+
+def test_columns_that_depend_on_each_other_are_evidence_once():
+    generator = np.random.default_rng(0)
+    x, clusters = generator.standard_normal((400, 1)), [np.arange(400) // 20]
+    off = 0.2 * x[:, 0] + generator.standard_normal(400)
+    once, twice = (_cluster_robust_chance(each, off, clusters, slice(0, 0))
+                   for each in (x, x @ [[1.0, -2.0]]))
+    assert once == pytest.approx(twice, rel=1e-9)
+    assert once[0] < 0.01
 
 
 @pytest.mark.parametrize('spans', [lay_out_spans(drive(3), 'course'),
