@@ -144,6 +144,8 @@ def _diagnose_in_time(logs: Sequence[Log], generator: np.random.Generator,
                 *mismatch.remarks, *[f'This is of {shown[place]} alone.'] * (len(logs) > 1)))
         all_gates += passed
     references = [classify_reference(log, reference_kind) for log in logs]
+    if reference_kind is None:
+        references = _agree_on_kind(logs, references, shown)
     logs, slips = zip(*(_bridge_jumps(log, each.kind, remarks)
                         for log, each in zip(logs, references)))
     limiting_logs = [place for place, log in enumerate(logs)
@@ -162,6 +164,23 @@ def _diagnose_in_time(logs: Sequence[Log], generator: np.random.Generator,
         found, logs=tuple(names), gates=tuple(all_gates),
         findings=(*findings, *(each for each in slips if each is not None)),
         remarks=(*dict.fromkeys(remarks), *found.remarks)))
+
+
+def _agree_on_kind(logs: Sequence[Log], references: Sequence[Reference],
+                   names: Sequence[str]) -> list[Reference]:
+    """
+    Return references of one kind if that of a log is known by errors that others may hide.
+
+    This is a course or odometry, and all references are headings, or rates.
+    """
+    erring = [place for place, each in enumerate(references)
+              if each.kind in ('course', 'odometry')]
+    if not erring or len({(log.reference_heading is None, log.reference_rate is None)
+                          for log in logs}) > 1:
+        return [*references]
+    shown = references[erring[0]]
+    return [each if each.kind == shown.kind else replace(
+        shown, evidence=f'as in {names[erring[0]]}: {shown.evidence}') for each in references]
 
 
 def _refuse_different_references(logs: Sequence[Log], references: Sequence[Reference],

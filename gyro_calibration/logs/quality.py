@@ -64,11 +64,13 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
     """
     Return the standard deviation of the white part of a signal, by its differences.
 
-    Those with nan are left out. Their order is 3 in motion, and 1 at rest, which shows filtered
-    noise best.
+    Those with nan are left out; if each has one, the samples with nan. Their order is 3 in motion,
+    and 1 at rest, which shows filtered noise best.
     """
     off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]
+    if not off.size:
+        off = np.abs(np.diff(values[np.isfinite(values)], order))
     # A high quantile, since most differences of a coarsely quantized output are zero.
     return (float(np.quantile(off, 0.9)) / -float(ndtri(0.05))
             / math.sqrt(math.comb(2 * order, order)) if off.size else math.inf)

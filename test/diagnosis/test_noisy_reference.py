@@ -687,6 +687,12 @@ def test_the_errors_of_a_heading_by_odometry_are_no_effects_of_the_gyro(seed):
     assert not established(found) and not found.unexplained
     exact = integrated(wheels(seed, slip=0.0, noise=0.0)[0])
     assert classify_reference(exact).kind == 'motion_capture'
+    # 21 s alone do not show them
+    short = select_rows(integrated(wheels(seed + 10)[0]), slice(0, 1050))
+    assert classify_reference(short).kind == 'motion_capture'
+    together = diagnose([short, integrated(wheels(seed)[0])], np.random.default_rng(0))
+    assert together.reference.kind == 'odometry' and 'as in log 2' in together.reference.evidence
+    assert not established(together), terminal_lines(together)
 
 
 def test_odometry_that_never_rests_is_known_by_errors_that_add_up_in_turns():
@@ -752,7 +758,7 @@ def test_columns_that_depend_on_each_other_are_evidence_once():
     generator = np.random.default_rng(0)
     x, clusters = generator.standard_normal((400, 1)), [np.arange(400) // 20]
     off = 0.2 * x[:, 0] + generator.standard_normal(400)
-    once, twice = (_cluster_robust_chance(each, off, clusters, slice(0, 0))
+    once, twice = (_cluster_robust_chance(each, off, clusters, slice(-1, None))
                    for each in (x, x @ [[1.0, -2.0]]))
     assert once == pytest.approx(twice, rel=1e-9)
     assert once[0] < 0.01

@@ -11,7 +11,8 @@
 """The quality of samples: steps and limits of outputs whose truth is known."""
 
 from gyro_calibration.logs.log import DataRefused, DEGREE
-from gyro_calibration.logs.quality import quantization_step, refuse_saturated
+from gyro_calibration.logs.quality import (
+    quantization_step, refuse_saturated, white_noise_deviation)
 import numpy as np
 import pytest
 
@@ -23,6 +24,12 @@ def turns(generator, senses, noise):
              for rate in generator.uniform(40.0, 90.0) * np.array(senses)]
     rate = np.concatenate([*parts, rest]) + generator.normal(0.0, 0.5)
     return DEGREE * (rate + noise * generator.standard_normal(len(rate)))
+
+
+def test_the_white_noise_of_samples_that_have_no_neighbours_is_known():
+    values = np.full(3000, np.nan)
+    values[::3] = np.random.default_rng(0).standard_normal(1000)
+    assert white_noise_deviation(values) == pytest.approx(1.0, rel=0.1)
 
 
 @pytest.mark.parametrize('senses', [[1.0], [-1.0], [1.0, -1.0]])
