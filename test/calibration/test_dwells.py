@@ -146,7 +146,6 @@ def references(generator):
 @pytest.mark.parametrize('every, sign', [(1, 1.0), (10, 1.0), (100, -1.0)])
 @pytest.mark.parametrize('reference', ['rate', 'heading', 'fine encoder', 'coarse encoder'])
 def test_every_rate_of_a_table_is_found(reference, every, sign, generator):
-    """At 100, 10 and 1 Hz, also by a gyro that runs the other way."""
     (name, given), = references(generator)[reference].items()
     log = run(generator)
     found = find_dwells(Log(output=sign * log.output[::every], time=TIME[::every],
@@ -248,18 +247,6 @@ def test_a_log_that_swings_or_is_noise_is_refused_with_the_other_way(rate, gener
                       {'reference_heading': encoder(2.0, generator, heading)}):
         with pytest.raises(DataRefused, match='straight line to 0.5 deg.*--method likelihood'):
             find_dwells(run(generator, rate=swing, **reference))
-
-
-def test_stretches_at_the_limit_of_a_coarse_output_are_left_out():
-    for seed in range(20):
-        draw = np.random.default_rng(seed)
-        limit, step = draw.uniform(70.0, 88.0) * DEGREE, draw.uniform(0.1, 1.0) * DEGREE
-        for clipped in (False, True):
-            log = run(draw, 0.01 * draw.uniform(0.1, 1.0))
-            output = np.clip(log.output, -limit, limit) if clipped else log.output
-            found = extract_dwells(replace(log, output=step * np.round(output / step)))
-            fastest = np.abs(found.rate).max()
-            assert (fastest < limit) == clipped == ('at the limit' in ' '.join(found.remarks))
 
 
 def test_a_limit_that_two_speeds_do_not_distinguish_from_an_effect_is_one_without_noise():

@@ -11,7 +11,6 @@
 """The verb diagnose: what it prints and writes, and its messages where data do not suffice."""
 
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import replace
 import io
 import json
 import os
@@ -52,23 +51,6 @@ def log(hidden, tmp_path):
     write_log(tmp_path / 'drive.csv', log_of(hidden))
     return log_of(hidden)
 
-
-@pytest.fixture
-def diagnose(run, tmp_path):
-    """Return a function that diagnoses a log into `found`; it returns code, output, errors."""
-    def diagnose(log, *words):
-        write_log(tmp_path / 'given.csv', log)
-        return run('diagnose', tmp_path / 'given.csv', *words, '--out', tmp_path / 'found')
-    return diagnose
-
-
-def answer_of(answer):
-    code, text, errors = answer
-    assert code == 0, errors
-    return json.loads(text)
-
-
-# files and output
 
 def test_the_files_hold_what_they_say(diagnosed):
     folder, (code, text, errors) = diagnosed
@@ -113,33 +95,11 @@ def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
     for name, log in zip(names, hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white',
                                      runs=2, **SHORT)):
         write_log(tmp_path / name, log_of(log))
-    answer = answer_of(run('diagnose', *(tmp_path / name for name in names), '--json'))
+    code, text, errors = run('diagnose', *(tmp_path / name for name in names), '--json')
+    assert code == 0, errors
+    answer = json.loads(text)
     assert [name.rpartition('/')[2] for name in answer['logs']] == names
     assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
-
-
-# data that allow no answer
-
-def one_sentence(errors):
-    return (len(errors.strip().splitlines()) == 1 and 'Traceback' not in errors
-            and len(errors.strip()) > 20)
-
-
-def test_what_allows_no_answer_is_refused_in_one_sentence(log, diagnose, tmp_path):
-    code, text, errors = diagnose(replace(log, reference_rate=None, moving=None))
-    assert code == 1 and not text and 'no reference' in errors and one_sentence(errors)
-    assert not (tmp_path / 'found').exists()
-
-
-def test_a_model_of_other_units_is_the_finding_alone(log, diagnose, tmp_path):
-    (tmp_path / 'wrong.yaml').write_text('effects: {scale_factor_error: {scale_factor_error: '
-                                         '56.3}}\n')
-    code, text, _ = diagnose(log, '--model', tmp_path / 'wrong.yaml', '--json')
-    found = json.loads(text)
-    (finding,) = found['findings']
-    assert code == 0 and found['verdict'] == 'mismatched' and finding['effect'] == 'model'
-    assert 'write it in rad/s' in finding['remedy']
-    assert {gate['name']: gate['passed'] for gate in found['gates']}['model'] is False
 
 
 @pytest.mark.parametrize('taken', ['found', 'found/model.yaml'], ids=['folder', 'file'])
@@ -150,6 +110,6 @@ def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, r
         (tmp_path / taken).mkdir(parents=True)
     before = sorted(tmp_path.rglob('*'))
     code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
-    assert code != 0 and not text and one_sentence(errors)
+    assert code != 0 and not text and errors.count('\n') == 1
     assert sorted(tmp_path.rglob('*')) == before
     assert taken != 'found' or (tmp_path / taken).read_text() == 'mine'

@@ -434,7 +434,6 @@ def reliable(**how):
 
 
 def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(ros, record, wait_until, tmp_path):
-    """The recording also has the definitions of its messages, which others understand."""
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom')
     both = [record('record', '--reference-topic', 'odom', *more, '--out', tmp_path / name,

@@ -222,7 +222,6 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, poo
 
 
 def test_names_may_hold_any_characters(tmp_path):
-    """Also bytes that are no text, and units whose names differ by letters of any language."""
     names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a b': 'x'}
     for seed, name in enumerate(names.values()):
         write_log(tmp_path / f'{name}.csv', drive(0.01, seed))
@@ -349,7 +348,6 @@ def test_each_value_is_laid_to_the_unit_or_the_reference():
 
 @pytest.mark.parametrize('unit', ['0', '4'])
 def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
-    """As where one gyro rested only: by name the first one or the last."""
     logs = [{**each, 'values': {'bias': each['values']['bias']}}
             if each['unit'] == unit else each for each in records()]
     (found,) = summarize_types(logs)
@@ -376,7 +374,6 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
 
 
 def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
-    """Over age all drift alike."""
     generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
     slopes = 1e-4 * (2.0 + generator.standard_normal(8))
     logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '',

@@ -244,7 +244,6 @@ def test_a_gyro_whose_first_zeros_end_in_a_turn_has_missed_a_part_of_it(
 
 
 def test_the_error_of_a_coarse_output_is_in_the_variance(tmp_path):
-    """Turns at constant rates, each of which is rounded to one code of 0.5 deg/s."""
     step, errors = 0.5 * DEGREE, []
     for part in range(8):
         rig = Rig(_folder(tmp_path, str(part)), model=CERTAIN.replace('0.01}', '0.0}'))
@@ -460,7 +459,6 @@ def test_velocities_of_the_last_second_show_whether_the_robot_moves(received, no
 
 @pytest.mark.parametrize('shift', [-0.3, -0.005, 0.3])
 def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, shift):
-    """A second publisher whose samples differ in stamp; both look like one stream."""
     rig = rested(tmp_path, stationary_method='none')
     rig.robot.command(0.7)
     for _ in range(500):
@@ -522,7 +520,6 @@ def test_every_other_sample_of_another_gyro_is_a_warning_and_the_heading_claims_
 
 
 def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
-    """As of a relay that joins two topics: the stamps increase, and the graph shows one node."""
     rig = Rig(tmp_path, model='')
     for _ in range(100):
         rig.feed([0.5])
