@@ -58,8 +58,6 @@ def errors(found):
     return (found.output - SCALE * found.rate - BIAS) / found.deviation
 
 
-# Rate tables
-
 def test_the_rows_of_a_rate_table_are_its_dwells_and_their_order_tells_the_named_sweeps(data):
     log = read_log(data / 'fog_rate_table' / 'table.csv')
     found = extract_dwells(log)
@@ -123,8 +121,6 @@ def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
     with pytest.raises(DataRefused, match=message):
         extract_dwells(log)
 
-
-# Logs in time
 
 def test_joined_logs_keep_their_sweeps_and_places_apart():
     parts = [extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
@@ -259,8 +255,6 @@ def test_a_limit_that_two_speeds_do_not_distinguish_from_an_effect_is_one_withou
     assert np.abs(found.rate).max() == pytest.approx(100.0 * DEGREE)
     assert 'at the limit' in ' '.join(found.remarks)
 
-
-# Recordings
 
 def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):
     found = find_dwells(read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz'))

@@ -146,8 +146,6 @@ def test_on_the_recorded_table_sine_and_cubic_are_hardly_distinguished_and_a_rat
     assert selection.calibration.left_out_rms < 0.05 * DEGREE
 
 
-# Another campaign
-
 @pytest.mark.parametrize('sine', [True, False], ids=['open-loop', 'MEMS'])
 @pytest.mark.parametrize('gyros', [4, pytest.param(40, marks=pytest.mark.evidence)])
 def test_the_stated_deviation_is_that_of_another_campaign(sine, gyros):

@@ -33,8 +33,6 @@ def turning(rate=0.5, frequency=100.0):
     return (Sample(rate, 31.5, k / frequency) for k in itertools.count())
 
 
-# With real ports
-
 def held():
     """Return how many threads and file descriptors this process has."""
     return threading.active_count(), len(os.listdir('/proc/self/fd'))
@@ -56,8 +54,6 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
     assert found == pytest.approx([0.01 * number for number in range(100)])
 
 
-# Recognizing
-
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_auto_finds_the_protocol_and_reports_it(name):
     world = World(15.0, baud=find_protocol(name).baud)
@@ -75,8 +71,6 @@ def test_auto_asks_for_what_the_protocol_needs():
     assert problem.startswith(
         'csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
 
-
-# Finding and waiting
 
 def test_a_gyro_is_found_again_under_another_name(tmp_path):
     """As in /dev/serial/by-id, where the name holds the serial number of the adapter."""
@@ -120,9 +114,6 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     doubling = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
     assert waits == pytest.approx([*doubling, *5 * [5.0], *doubling, 5.0])
     assert reading.connection.waited_duration == pytest.approx(31.3 + 10.0, abs=0.2)
-
-
-# Silence
 
 
 @pytest.mark.parametrize('period', [1.5, 10.0])
@@ -176,8 +167,6 @@ def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
     assert reading.problems == [NOTHING]
 
 
-# Counts and stamps
-
 def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     world = World(5.0)
     world.gyro('csv')
@@ -191,8 +180,6 @@ def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)
     assert reading.connection.counts.lost_samples == 0
 
-
-# The port alone
 
 @pytest.fixture
 def terminal():
@@ -256,8 +243,6 @@ def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
     assert (speed, port.baud, port.read()) == (termios.B115200, 115200, b'sense')
     port.close()
 
-
-# The mean of several samples in place of each
 
 PERIOD = 1e-3
 EPOCH = 1.7e9

@@ -30,7 +30,7 @@ from gyro_calibration.fleet.pooling import (
     find_changes, find_outlying_groups, Observations, PooledValue)
 from gyro_calibration.fleet.run import process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
-    build_models, count_effects, data, describe_type, log_table, summarize_types)
+    build_models, count_effects, data, describe_type, summarize_types)
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -64,8 +64,6 @@ def pool(tmp_path, capsys):
                        for each in found['no_evidence']}
     return pool
 
-
-# the unit of each log
 
 def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     (tmp_path / 'fleet.csv').write_text('log,unit,drive,date,temperature\n'
@@ -133,8 +131,6 @@ def test_notes_and_names_say_what_a_table_does_not(tmp_path):
         compile_file_pattern('rc_car')
 
 
-# workers
-
 def test_a_worker_that_is_killed_ends_the_run_and_one_without_memory_does_not():
     with process_executor(2, 1e9) as executor:
         numbers = [*range(KILLS), *range(KILLS + 1, 10)]
@@ -154,8 +150,6 @@ def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
         begun.wait()
     wait_until(lambda: not Path(f'/proc/{worker}').exists())
 
-
-# the verb
 
 def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, pool):
     logs = tmp_path / 'logs'
@@ -275,8 +269,6 @@ def test_where_nothing_can_be_done_one_sentence_says_why(tmp_path, capsys, make,
     assert not out and wanted in error and error.count('\n') == 1
 
 
-# pooling
-
 def crossed(values):
     """Return values of units by drives, each with a small error of its own."""
     unit, drive = np.indices(values.shape).reshape(2, -1)
@@ -395,8 +387,6 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
     assert np.sum((ends[:, 0] < slopes) & (slopes < ends[:, 1])) >= 6
 
 
-# models
-
 def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
     (found,) = summarize_types(records())
     said = dict(build_models(found))
@@ -437,10 +427,3 @@ def test_a_diagnosis_by_a_course_takes_what_is_usual_of_a_fleet_as_its_prior():
 def _bias(model):
     (place,) = [place for place, each in enumerate(model.terms) if each.effect.name == 'bias']
     return model.terms[place].values[0], np.sqrt(model.covariance[place, place])
-
-
-# the table
-
-def test_a_table_holds_a_row_for_each_log():
-    logs = records()
-    assert len(log_table(logs).splitlines()) == 1 + len(logs)

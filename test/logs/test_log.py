@@ -112,15 +112,6 @@ def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch
         read_log(path)
 
 
-def test_texts_of_a_log_are_read_back_whatever_ends_their_lines(tmp_path):
-    path = written(tmp_path, '# a\ngyro_dps,place,"a\rb"\n1,"a\rb",c\n2,"a\r\nb","d"\n')
-    log = read_log(path)
-    write_log(path, Log(output=log.output, notes=('one\rtwo\nthree',), others=log.others))
-    again = read_log(path)
-    assert (again.notes == ('one two three',)
-            and again.others == {'place': ('a\nb', 'a\nb'), 'a\nb': ('c', 'd')})
-
-
 def test_a_lost_value_is_nan_or_an_empty_cell(tmp_path):
     text = '\ufeffgyro_dps,reference_rate_dps,reference_heading_deg\r\n1,nan,\r\n,180,NaN\r\n\r\n'
     log = read_log(written(tmp_path, text))  # neither the mark nor the empty line is part of it

@@ -34,8 +34,6 @@ def stored(rig):
     return read_model(rig.calibration_file).self_calibration
 
 
-# A run that drives the robot
-
 def test_a_run_drives_the_profile_and_finds_stores_and_uses_scale_and_bias(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     begin, first = rig.clock.now, len(rig.outputs)
@@ -232,8 +230,6 @@ def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path, cancelled):
     assert len(rig.commands) == last and rig.robot.rate == pytest.approx(0.3, abs=1e-3)
     assert not cancelled or last <= sent + 1
 
-
-# What a drive does not begin over
 
 OBSTACLES = {
     'teleop': ({}, lambda rig: setattr(rig, 'other', 0.3),
@@ -558,8 +554,6 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     success, message = rig.calibrate(REST)
     assert not success and words in message, message
 
-
-# A run alone: when it is complete
 
 def test_turns_that_are_not_finished_are_given_up():
     run = CalibrationRun(TURNS, math.inf, 0.0)
