@@ -450,6 +450,11 @@ def test_axes_and_accelerations_of_a_razor_are_turned_as_in_ros(axis, rate, forc
             and again.specific_force == pytest.approx(sample.specific_force, abs=0.001))
 
 
+def test_a_line_of_a_razor_is_written_as_the_firmware_prints_it():
+    assert (RAZOR.encoder()(Sample(-0.25, specific_force=GRAVITY))
+            == b'#YPRAG=0.00,0.00,0.00,0.00,0.00,256.00,0.00,0.00,0.25\r\n')
+
+
 def test_the_angles_that_a_razor_sends_until_it_is_asked_for_more_are_in_order_but_no_sample():
     decoder = RAZOR.decoder()
     assert decoder.feed(b'#YPR=-142.28,-5.38,33.52\r\n') == []

@@ -498,6 +498,22 @@ def test_a_gyro_beyond_its_range_during_a_calibration_is_named_by_its_rate(tmp_p
     assert not success and 'beyond the range of this gyro, and not used' in message
 
 
+def test_odometry_that_is_computed_from_the_gyro_is_no_reference(tmp_path):
+    rig = rested(tmp_path, robot=Robot(bias=0.0), calibration_reference=ODOMETRY)
+    estimator, turned = rig.pipeline.estimator, 0.0
+
+    def fused(stamp, reading):
+        nonlocal turned
+        turned += estimator.corrected_rate * INTERVAL
+        rig.pipeline.add_odometry(stamp, math.remainder(turned, math.tau),
+                                  Velocity(angular=(0.0, 0.0, estimator.corrected_rate)))
+
+    rig.odometry = fused
+    turn_to_and_fro(rig, 13.5)
+    success, message = rig.session.conclude()
+    assert not success and 'the reference is computed from this gyro' in message, message
+
+
 def test_odometry_may_be_finished_early(tmp_path):
     rig = rested(tmp_path, calibration_reference=ODOMETRY, calibration_duration=600.0)
     rig.begin(ODOMETRY)
