@@ -191,18 +191,6 @@ def test_a_log_without_channels_says_what_it_cannot_show():
     assert judge_diagnosis(log, found).is_right, told(log, found)
 
 
-def test_a_log_of_a_gyro_at_rest_needs_no_reference():
-    log, = hidden_in(['warm_up'], 5.0, 0, 'white', REFERENCES[0])
-    truth = log.truth
-    rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
-    found = diagnose([replace(log_of(log), output=rest, reference_rate=None, moving=0.0 * rest)],
-                     np.random.default_rng(0))
-    assert judge_diagnosis(
-        log, found).is_in_set and not judge_diagnosis(log, found).false_names, told(log, found)
-    assert {'cubic_nonlinearity', 'time_offset', 'reference_once_per_rev'} <= set(
-        found.cannot_show)
-
-
 def recorded(names, steps, seed, given=None, multiple=8.0):
     """Record a gyro once for each moment of a temperature step of 10 K up, 15 K down later."""
     generator = np.random.default_rng(seed)
