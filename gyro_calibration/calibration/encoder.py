@@ -36,7 +36,7 @@ from gyro_calibration.calibration.noise_grid import (
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_kind import find_reference_kind, is_noisy
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
+    drop_repeated_references, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
     fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
@@ -104,7 +104,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     """
     log, chosen = choose_reference(log)
     refuse_wrapped(log)
-    log, repeated = drop_repeated_headings(log)
+    log, repeated = drop_repeated_references(log)
     time, output, motion, crossing = _extract_motion(log)
     spans = None if method or log.reference_heading is None else lay_out_spans(
         log, technology=technology)

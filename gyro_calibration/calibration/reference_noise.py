@@ -417,26 +417,29 @@ def heading_noise_share(log: Log) -> float:
     return math.sqrt(walks[0] / white)
 
 
-def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
+def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
     """
-    Return a log without headings that are repeated while the gyro turns, as of a lost marker.
+    Return a log without references that are repeated while the gyro turns, as of a lost marker.
 
     Also a remark on the longest of these stretches. In it the gyro turns, beyond its usual bias,
     by more than the step of the reference and than it differs from the reference over as long a
-    time elsewhere (at 1 %). The reference must then jump rather by what the gyro turned than not
-    at all: a bias may drift in a rest.
+    time elsewhere (at 1 %). A heading must then jump rather by what the gyro turned than not at
+    all: a bias may drift in a rest. A rate must jump to where the output is before, to a half.
     """
-    heading = log.reference_heading
-    known = np.flatnonzero(np.isfinite([] if heading is None else heading))
-    if log.time is None or log.output is None or heading is None or len(known) < _BLOCK_SAMPLES:
+    by_rate = log.reference_heading is None
+    given = log.reference_rate if by_rate else log.reference_heading
+    known = np.flatnonzero(np.isfinite([] if given is None else given))
+    if log.time is None or log.output is None or given is None or len(known) < _BLOCK_SAMPLES:
         return log, []
-    runs = [known[run.start:run.stop + 1] for run in find_runs(np.diff(heading[known]) == 0.0)
+    runs = [known[run.start:run.stop + 1] for run in find_runs(np.diff(given[known]) == 0.0)
             if run.stop > run.start + 1]
     if not runs:
         return log, []
+    output = bridge_gaps(log.output)
+    turned = integrate_with_curvature(log.time, output)
+    heading = integrate(log.time, bridge_gaps(given)) if by_rate else given
     moving = heading.copy()
     moving[np.concatenate(runs)] = np.nan
-    turned = integrate_with_curvature(log.time, bridge_gaps(log.output))
     difference = turned - moving
     seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
     if len(seconds) < 2:
@@ -444,27 +447,36 @@ def drop_repeated_headings(log: Log) -> tuple[Log, list[str]]:
     bias = float(np.median(np.diff(difference[seconds]) / np.diff(log.time[seconds])))
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
-    step, kept = quantization_step(heading[known]), heading.copy()
+    step, white = quantization_step(given[known]), white_noise_deviation(output)
+    kept = given.copy()
     lost = list[tuple[float, float, float]]()
     for rows in runs:
         first, last = rows[[0, -1]].tolist()
         span = float(log.time[last] - log.time[first])
-        unseen = turned[last] - turned[first] - bias * span
+        unseen = (turned[last] - heading[last] - (turned[first] - heading[first])) - bias * span
         after = known[min(np.searchsorted(known, last) + 1, len(known) - 1)]
-        jump = heading[after] - heading[last] - (turned[after] - turned[last])
-        if abs(unseen) <= step or abs(jump - unseen) >= abs(jump):
+        # but for a scale factor error of up to a tenth
+        least = (step + 0.1 * abs(given[last])) * span if by_rate else step
+        if by_rate:
+            jump, ahead = given[after] - given[last], output[last] - bias - given[last]
+            off = 2.0 * abs(jump - ahead) if abs(ahead) > 5.0 * white else math.inf
+        else:
+            jump = heading[after] - heading[last] - (turned[after] - turned[last])
+            off = abs(jump - unseen)
+        if abs(unseen) <= least or off >= abs(jump):
             continue
         starts = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1] - span, 500))
         ends = np.minimum(np.searchsorted(log.time, log.time[starts] + span), len(log) - 1)
         changes = difference[ends] - difference[starts] - bias * span
         changes = changes[np.isfinite(changes)]
-        if len(changes) and abs(unseen) > step + 2.0 * bound * robust_deviation(changes):
+        if len(changes) and abs(unseen) > least + 2.0 * bound * robust_deviation(changes):
             kept[rows[1:]] = np.nan
             lost.append((float(log.time[first]), float(log.time[last]), abs(unseen)))
     if not lost:
         return log, []
     begin, end, angle = max(lost, key=lambda each: each[1] - each[0])
-    return replace(log, reference_heading=kept), [
-        f'The reference stands from {begin:.4g} s to {end:.4g} s, where the gyro turns by '
-        f'{angle / DEGREE:.3g} deg, as if it were lost; it is not used there, nor where the same '
-        'happens for a shorter time.']
+    return (replace(log, reference_rate=kept) if by_rate
+            else replace(log, reference_heading=kept)), [
+        f'The reference stays the same from {begin:.4g} s to {end:.4g} s, where the gyro turns by '
+        f'{angle / DEGREE:.3g} deg more, as if it were lost; it is not used there, nor where the '
+        'same happens for a shorter time.']

@@ -22,7 +22,7 @@ from gyro_calibration.calibration.dwells import find_dwells, require_output
 from gyro_calibration.calibration.encoder import bridge_jumps, choose_reference
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings, keep_own_instants, OwnInstants)
+    drop_repeated_references, keep_own_instants, OwnInstants)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.candidates import (
     Candidate, common_channels, constant_channels, effect_candidate, is_named, observed_range,
@@ -201,7 +201,7 @@ def _use_own_values(log: Log, remarks: list[str]) -> tuple[Log, OwnInstants | No
         remarks.append('The reference has a value of its own every '
                        f'{1000.0 * instants.interval:.3g} ms, and is held or interpolated in '
                        'between; its own values alone are used.')
-    log, lost = drop_repeated_headings(log)
+    log, lost = drop_repeated_references(log)
     remarks += lost
     return log, instants
 
@@ -478,10 +478,13 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    for known in selection.unnamed:
-        if known.cause == PART_OF_LOG:
-            yield (f'From {known.shapes[0]:.4g} s to {known.shapes[1]:.4g} s the scale factor '
-                   'differs from that of the rest of the log: an effect of a part of the log.')
+    parts = [each.shapes for each in selection.unnamed if each.cause == PART_OF_LOG]
+    for begin, end, *_ in parts:
+        yield (f'From {begin:.4g} s to {end:.4g} s the scale factor differs from that of the rest '
+               'of the log: an effect of a part of the log.')
+    if len(parts) > 1:
+        yield ('A scale factor that differs from turn to turn is that of odometry whose wheels '
+               'slip: if it is the reference, state --reference-kind odometry.')
     scale = fit.scale_factor_error
     own = {term.effect.name for term in ([] if model is None else model.terms)}
     if is_scale_implausible(fit):

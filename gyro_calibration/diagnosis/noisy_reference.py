@@ -697,22 +697,24 @@ def _cluster_robust_chance(x: Array, residual: Array, clusters: Sequence[NDArray
     against a wander of the bias counts as that of all its cosines, since all of them show its
     size, although a slow cause is in few of them. Fewer clusters than `MIN_STRETCHES` show none.
     """
-    information = x.T @ x
-    size = np.sqrt(np.diag(information)) + 1e-300
+    size = np.linalg.norm(x, axis=0) + 1e-300
+    axes, lengths, _ = np.linalg.svd(x / size, full_matrices=False)
+    axes = axes[:, lengths > 1e-6]  # columns that depend on each other count once
+    count, found = axes.shape[1], []
+    if not count:
+        return 1.0, 1.0
     # by the residual with the candidate: scores that contain the effect would overestimate scatter
-    off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
-    count, found = x.shape[1], []
-    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size ** 2)))
-    square = float(np.sum((root @ x.T @ residual) ** 2))
+    along = axes.T @ residual
+    off = residual - axes @ along
     for cluster in clusters:
-        scores = np.array([np.bincount(cluster, part * off) for part in x.T])
+        scores = np.array([np.bincount(cluster, part * off) for part in axes.T])
         shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
         shares[cosines] = shares[cosines].mean()
         effective = float(shares.sum() ** 2 / (shares ** 2).sum())
         scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
-        ratio = max(float(np.linalg.eigvalsh(root @ scatter @ root.T).max()), 1.0)
+        ratio = max(float(np.linalg.eigvalsh(scatter).max()), 1.0)
         found.append((1.0 if effective < MIN_STRETCHES else float(fisher.sf(
-            square / ratio / count, count, max(effective - count, 1.0))), ratio))
+            along @ along / ratio / count, count, max(effective - count, 1.0))), ratio))
     return max(found)
 
 

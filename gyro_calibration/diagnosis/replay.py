@@ -164,6 +164,7 @@ _LEAST_ROUNDED_NOISE = 1e-3
 _BLOCK_SAMPLES = 16
 #: Samples next to a gap of at least as many whose rate is not used: the error at the end of a
 #: spline is 0.43 times as large from sample to sample. Shorter gaps change the slope by little.
+#: Delays and lags of a rate, which is on a line over the gap, are computed by splines too.
 _GAP_MARGIN_SAMPLES = 6
 
 #: Earliest and longest lag of a motion behind its command, s; ratio of neighbouring lags less 1.
@@ -429,6 +430,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
                      else prepared_log.reference_rate)
         known = np.isfinite(reference)
         smooth = np.interp(time, time[known], reference[known])
+        reference = np.where(_near_long_gaps(~known), np.nan, reference)
     kept = usable & np.isfinite(reference) & np.isfinite(log.output)
     if log.reference_rate is None:
         kept &= (~_find_corners(reference, log.output, kept,
@@ -442,8 +444,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     _refuse_gaps(log.time[kept], place)
     noise = 0.0
     if is_heading:
-        noise = heading_step / math.sqrt(12.0) or _largest_heading_noise(
-            _residual_without_delay(time, log.output, smooth)[kept], place, interval)
+        noise = max(heading_step / math.sqrt(12.0), _largest_heading_noise(
+            _residual_without_delay(time, log.output, smooth)[kept], place, interval))
         smooth = _without_noise(smooth, noise / interval)
     # of more than 50 000 points, neighbours are averaged
     every = max(1, math.ceil((place[-1] + 1) / 50_000))
@@ -575,10 +577,12 @@ def _bridge_gaps(samples: Array, grid_index: NDArray[np.intp], least_reach: int)
     whole[grid_index] = samples
     length = steps[before] - 1
     total = np.concatenate([[0.0], np.cumsum(samples)])
-    reach = np.maximum(length, least_reach)
-    first, last = np.maximum(before + 1 - reach, 0), np.minimum(before + 1 + reach, len(samples))
-    left, right = ((total[end] - total[begin]) / (end - begin)
-                   for begin, end in ((first, before + 1), (before + 1, last)))
+    reach, after = np.maximum(length, least_reach), before + 1
+    first, last = np.maximum(after - reach, 0), np.minimum(after + reach, len(samples))
+    # near an end of the log also samples of the other side
+    left, right = ((total[end] - total[begin]) / (end - begin) for begin, end in (
+        (first, np.minimum(np.maximum(after, first + least_reach), len(samples))),
+        (np.maximum(np.minimum(after, last - least_reach), 0), last)))
     number = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
     share = (number + 1.0) / np.repeat(length + 1, length)
     whole[np.repeat(grid_index[before], length) + 1 + number] = (
@@ -605,9 +609,16 @@ def _heading_rates(time: Array, heading: Array) -> tuple[Array, Array]:
             spline = make_interp_spline(at, heading[part][~lost[part]], 5)
             rate[part] = spline(time[part], 1)
     # a spline errs at the ends of a log as it does at a gap
-    near = maximum_filter1d(lost, 3) | maximum_filter1d(
-        np.pad(long, 1, constant_values=True), 2 * _GAP_MARGIN_SAMPLES + 1)[1:-1]
+    ends = np.pad(lost, _GAP_MARGIN_SAMPLES, constant_values=True)
+    near = maximum_filter1d(lost, 3) | _near_long_gaps(ends)[
+        _GAP_MARGIN_SAMPLES:-_GAP_MARGIN_SAMPLES]
     return np.where(near, np.nan, rate), rate
+
+
+def _near_long_gaps(lost: Mask) -> Mask:
+    """Return which samples are in or next to a gap of at least `_GAP_MARGIN_SAMPLES`."""
+    return np.asarray(maximum_filter1d(binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES)),
+                                       2 * _GAP_MARGIN_SAMPLES + 1))
 
 
 def find_delay(time: Array, output: Array, rate: Array) -> float:

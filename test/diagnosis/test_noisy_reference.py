@@ -22,7 +22,7 @@ from gyro_calibration.calibration.reference_noise import heading_noise_share
 from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import select_causes
+from gyro_calibration.diagnosis.noisy_reference import _cluster_robust_chance, select_causes
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
@@ -699,3 +699,13 @@ def test_an_output_without_numbers_is_refused():
     wheels(6, lag=0.25)[0]], ids=['exact', 'exact, asymmetric', 'late, as after a command'])
 def test_a_rate_that_is_exact_or_that_a_motion_follows_late_is_no_odometry(log):
     assert classify_reference(log).kind == 'rate_command'
+
+
+def test_columns_that_depend_on_each_other_are_evidence_once():
+    generator = np.random.default_rng(0)
+    x, clusters = generator.standard_normal((400, 1)), [np.arange(400) // 20]
+    off = 0.2 * x[:, 0] + generator.standard_normal(400)
+    once, twice = (_cluster_robust_chance(each, off, clusters, slice(0, 0))
+                   for each in (x, x @ [[1.0, -2.0]]))
+    assert once == pytest.approx(twice, rel=1e-9)
+    assert once[0] < 0.01

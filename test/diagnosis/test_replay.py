@@ -18,7 +18,7 @@ from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.residuals import BandEnergies, drop_tone_bands, residual_curves
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DEGREE, Log, select_rows
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -42,9 +42,9 @@ def test_the_ends_of_a_fine_encoder_are_no_slips_or_steps(frequency, seed):
 
 
 @pytest.mark.parametrize('dead_zone', [0.0, 0.5])
-@pytest.mark.parametrize('noise', [0.0005, 0.005])
-def test_the_noise_of_a_heading_is_no_dead_zone_and_hides_none(dead_zone, noise):
-    """The rests of a motion have white noise of the heading alone, deg; the zone is in deg/s."""
+@pytest.mark.parametrize('noise, step', [(0.0005, 0.0), (0.005, 0.0), (0.003, 0.001)])
+def test_the_noise_of_a_heading_is_no_dead_zone_and_hides_none(dead_zone, noise, step):
+    """The rests of a motion have noise of a rounded heading, deg; the zone is in deg/s."""
     generator = np.random.default_rng(77)
     time = np.arange(12_000) * 0.05
     turns = np.repeat(generator.uniform(-0.8, 0.8, 60) * (np.arange(60) % 2), 200)
@@ -53,12 +53,24 @@ def test_the_noise_of_a_heading_is_no_dead_zone_and_hides_none(dead_zone, noise)
     heading = np.cumsum(rate) * 0.05 - 0.025 * (rate + rate[0])
     output = (np.where(np.abs(rate) < dead_zone * DEGREE, 0.0, 1.005 * rate)
               + 0.07 * DEGREE * generator.standard_normal(len(time)))
-    log = Log(time=time, output=output, reference_heading=heading + noise * DEGREE
-              * generator.standard_normal(len(time)))
-    found = diagnose([log], np.random.default_rng(0)).findings
+    heading += noise * DEGREE * generator.standard_normal(len(time))
+    if step:
+        heading = step * DEGREE * np.round(heading / DEGREE / step)
+    log = Log(time=time, output=output, reference_heading=heading)
+    found = [each for each in diagnose([log], np.random.default_rng(0)).findings
+             if each.effect != 'reference_quantization']
     assert [each.effect for each in found] == ['dead_zone'] * (dead_zone > 0.0)
     for each in found:
         assert each.parameters['dead_zone'].estimate == pytest.approx(dead_zone * DEGREE, rel=0.1)
+
+
+@pytest.mark.parametrize('seed', seeds(3))
+def test_one_sample_after_a_gap_is_no_step_of_the_bias(seed):
+    log = record(Noise(angle_random_walk=3e-4), np.random.default_rng(seed), 260.0, 0.05)
+    log.output[-1] += 3e-3  # 2 sigma
+    log = select_rows(log, np.delete(np.arange(5200), slice(4799, -1)))
+    found = diagnose([log], np.random.default_rng(0))
+    assert [each.effect for each in found.findings] == ['dropped_samples']
 
 
 @pytest.mark.parametrize('seed', seeds(2))

@@ -17,7 +17,7 @@ from chance import seeds
 from diagnosed import established, estimates, limited
 from gyro_calibration.calibration.encoder import calibrate_encoder, choose_reference
 from gyro_calibration.calibration.reference_noise import (
-    drop_repeated_headings, find_own_instants, keep_own_instants, rate_noise_share)
+    drop_repeated_references, find_own_instants, keep_own_instants, rate_noise_share)
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
 import numpy as np
@@ -143,7 +143,7 @@ def test_a_heading_that_is_seldom_known_gives_way_to_the_rate():
 def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():
     log, _, heading = turning(5)
     tracked = heading(TIME)
-    assert drop_repeated_headings(replace(log, reference_heading=tracked))[1] == []
+    assert drop_repeated_references(replace(log, reference_heading=tracked))[1] == []
     moving = np.flatnonzero(np.abs(log.output - BIAS) > 20.0 * DEGREE)
     for start in moving[[200, 600, 1000]].tolist():
         tracked[start:start + 150] = tracked[start]
@@ -160,6 +160,20 @@ def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():
     assert still.verdict == 'mismatched'
 
 
+@pytest.mark.parametrize('seed', seeds(2))
+def test_a_rate_that_is_repeated_while_the_gyro_turns_is_not_used(seed):
+    log, true, _ = turning(seed)
+    rate = true(TIME)
+    assert drop_repeated_references(replace(log, reference_rate=rate))[1] == []
+    start = np.flatnonzero((np.abs(rate) > 20.0 * DEGREE) & (TIME > 20.0))[0]
+    away = np.abs(rate - rate[start]) > 20.0 * DEGREE
+    rate[start:np.flatnonzero(away & (TIME - TIME[start] > 15.0))[0]] = rate[start]
+    found = diagnose([replace(log, reference_rate=rate)], np.random.default_rng(0))
+    assert found.verdict == 'adequate', found
+    assert 'as if it were lost' in found.remarks[0]
+    assert found.model.terms[1].values[0] == pytest.approx(SCALE, abs=2e-3)
+
+
 @pytest.mark.parametrize('seed', [1, 2, 7])
 def test_rests_in_which_the_bias_wanders_are_no_lost_reference(seed):
     generator, interval, count, white = np.random.default_rng(seed), 0.1, 12000, 1e-4
@@ -170,7 +184,7 @@ def test_rests_in_which_the_bias_wanders_are_no_lost_reference(seed):
               + np.sqrt(3.0 * interval) * white * np.cumsum(generator.standard_normal(count)))
     heading = np.append(0.0, np.cumsum(0.5 * interval * (rate[1:] + rate[:-1])))
     log = Log(time=interval * np.arange(count), output=output, reference_heading=heading)
-    assert drop_repeated_headings(log)[1] == []
+    assert drop_repeated_references(log)[1] == []
 
 
 def test_the_instants_of_a_held_rate_are_found_beside_a_gap():
