@@ -104,7 +104,7 @@ _TIMED = 'test_connection', 'test_fuzz', 'test_launch'
 _LONG = ('test_diagnosis', 'test_record_verb', 'test_selection', 'test_self_calibration',
          'test_motion_design', 'test_findings', 'test_extended_model', 'test_reproduction',
          'test_run_faults', 'test_encoder', 'test_followed_logs',
-         'test_rate_table_diagnosis', 'test_diagnose_verb', 'test_allan', 'test_package',
+         'test_rate_table_diagnosis', 'test_verbs', 'test_allan', 'test_package',
          'test_search', 'test_hidden')
 
 

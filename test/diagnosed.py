@@ -20,13 +20,10 @@ from gyro_calibration.logs.log import COLUMNS, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration_bench import scores
 from gyro_calibration_bench.hidden import Cause, HiddenLog
-from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS, WITHOUT_COLUMN
+from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 from gyro_calibration_bench.methods import answer_of_finding, known_model
 from gyro_calibration_bench.scores import judge_answer, Judgement
 import numpy as np
-
-#: A diagnosis holds out one of so many blocks, of so many s.
-EVERY, BLOCK = 3, 60.0
 
 
 def log_of(hidden: HiddenLog) -> Log:
@@ -84,56 +81,6 @@ def established(found: Diagnosis) -> dict[str, Finding]:
 def estimates(found: Diagnosis) -> dict[str, tuple[float, float]]:
     """Return the values of the model of a diagnosis and their deviations, by name."""
     return {name: (value, deviation) for name, _, value, deviation in found.model.estimates()}
-
-
-def won(hidden: HiddenLog, found: Diagnosis) -> dict[str, tuple[float, float]]:
-    """
-    Return the gains in mean square rate and heading error, by the diagnosis and by the truth.
-
-    Both on the parts held out, in units of what the truth leaves; nothing where the diagnosis
-    measured no gain, or where what is hidden has no gain to measure.
-    """
-    if found.gain is None or set(hidden.truth.names) <= WITHOUT_COLUMN:
-        return {}
-    changes = {'rate': found.gain.rate, 'heading': found.gain.heading}
-    knowing = _knowing(hidden)
-    return {name: ((change.before ** 2 - change.after ** 2) / knowing[name][1],
-                   (knowing[name][0] - knowing[name][1]) / knowing[name][1])
-            for name, change in changes.items() if change is not None and knowing[name][1] > 0.0}
-
-
-def _knowing(hidden: HiddenLog) -> dict[str, tuple[float, float]]:
-    """
-    Return the mean squares left on the parts held out, by bias and scale alone and by the truth.
-
-    The truth takes the bias, as the others do, from the other parts: it wanders.
-    """
-    truth, output, stamps, good = (hidden.truth, hidden.columns['gyro_rad_s'],
-                                   hidden.columns['time_s'], hidden.truth.is_good)
-    length = min(BLOCK, (stamps[-1] - stamps[0]) / 6.0)
-    number = np.floor((stamps - stamps[0]) / length).astype(int)
-    out = (number % EVERY == 1) & (number < int((stamps[-1] - stamps[0]) / length + 1e-9))
-    kept = good & ~out
-    design = np.column_stack([np.ones_like(output), truth.reference])
-    left = [output - design @ np.linalg.lstsq(design[kept], output[kept], rcond=None)[0],
-            output - _predicted(hidden)]
-    left[1] = left[1] - np.mean(left[1][kept])
-    headings = [[length * np.mean(each[out & good & (number == block)])
-                 for block in np.unique(number[out])] for each in left]
-    return {'rate': _squares([each[out & good] for each in left]), 'heading': _squares(headings)}
-
-
-def _predicted(hidden: HiddenLog) -> np.ndarray:
-    """Return the output to expect; that of a noisy gyro has no steps."""
-    truth, gyro = hidden.truth, hidden.truth.gyro
-    limit = gyro.size_of('saturation') or np.inf
-    return np.clip(truth.rate + truth.added_rate, -limit, limit) * (
-        gyro.size_of('unit_error') or 1.0)
-
-
-def _squares(both: Sequence[Sequence[float]]) -> tuple[float, float]:
-    before, after = (float(np.mean(np.square(each))) for each in both)
-    return before, after
 
 
 def described(hidden: HiddenLog, found: Diagnosis) -> str:

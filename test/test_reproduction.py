@@ -43,8 +43,6 @@ def numbers(source, words):
     return found
 
 
-# verdicts
-
 @pytest.mark.parametrize('published, value, verdict', [
     ('4.8', 4.849, 'reproduced'), ('4.8', 4.851, 'differs'), ('< 2', 1.9, 'reproduced'),
     ('< 2', 2.1, 'differs'), ('~ 10', 30.0, 'reproduced'), ('~ 10', 33.0, 'differs'),
@@ -59,8 +57,6 @@ def test_a_verdict_is_what_the_last_digit_allows(published, value, verdict):
     assert Comparison('', '', 5.0, '4.8', uncertainty=0.2).is_reproduced
     assert not Comparison('', '', 1.9, '< 2', uncertainty=0.2).is_reproduced
 
-
-# the verb and its page
 
 @one_source
 def test_the_page_holds_what_the_program_prints(source):
@@ -83,8 +79,6 @@ def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys,
     assert {'quantity', 'unit', 'published', 'ours', 'verdict'} <= set(
         answers[0][source]['comparisons'][0])
 
-
-# numbers by hand
 
 @pytest.mark.parametrize('source, words, wanted', [
     ('ojeda', 'unit of an angle', {'printed': 10, 'right': 1}),

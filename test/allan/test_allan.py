@@ -110,7 +110,6 @@ def test_what_is_there_is_seen_within_its_bounds_and_its_standard_deviation(
 
 
 def test_a_gauss_markov_process_is_found_and_a_flicker_or_random_walk_is_not_taken_for_one():
-    """Of 1e-3 rad/s and 20 s, in 2000 s of white noise."""
     generator, kept, found = np.random.default_rng(8), math.exp(-0.01 / 20.0), []
     for _ in range(5):
         shocks = 1e-3 * math.sqrt(1.0 - kept ** 2) * generator.standard_normal(200_000)
@@ -155,7 +154,6 @@ def stamps(count):
 
 @pytest.mark.parametrize('gap, longest', [(0, 50.0), (1000, 5.0)])
 def test_lost_samples_are_counted_and_do_not_change_the_figures(gap, longest):
-    """Also 40 % of them, in gaps of 10 s."""
     generator = np.random.default_rng(10)
     rate = simulate_noise(WHITE, 100_000, INTERVAL, generator)
     kept = generator.random(100_000) > 0.001
@@ -234,7 +232,6 @@ def test_steps_of_the_output_are_no_motion(step):
 
 
 def test_the_part_at_rest_that_is_proposed_is_accepted(tmp_path, run):
-    """The times are those of --from and --to."""
     time, rate = stamps(20_000), simulate_noise(WHITE, 20_000, INTERVAL,
                                                 np.random.default_rng(24))
     rate += np.where((time > 20.0) & (time < 30.0), np.sin(time), 0.0)

@@ -58,8 +58,6 @@ def errors(found):
     return (found.output - SCALE * found.rate - BIAS) / found.deviation
 
 
-# Rate tables
-
 def test_the_rows_of_a_rate_table_are_its_dwells_and_their_order_tells_the_named_sweeps(data):
     log = read_log(data / 'fog_rate_table' / 'table.csv')
     found = extract_dwells(log)
@@ -124,8 +122,6 @@ def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
         extract_dwells(log)
 
 
-# Logs in time
-
 def test_joined_logs_keep_their_sweeps_and_places_apart():
     parts = [extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
              for name in ('a.csv', 'b.csv')]
@@ -146,7 +142,6 @@ def references(generator):
 @pytest.mark.parametrize('every, sign', [(1, 1.0), (10, 1.0), (100, -1.0)])
 @pytest.mark.parametrize('reference', ['rate', 'heading', 'fine encoder', 'coarse encoder'])
 def test_every_rate_of_a_table_is_found(reference, every, sign, generator):
-    """At 100, 10 and 1 Hz, also by a gyro that runs the other way."""
     (name, given), = references(generator)[reference].items()
     log = run(generator)
     found = find_dwells(Log(output=sign * log.output[::every], time=TIME[::every],
@@ -250,18 +245,6 @@ def test_a_log_that_swings_or_is_noise_is_refused_with_the_other_way(rate, gener
             find_dwells(run(generator, rate=swing, **reference))
 
 
-def test_stretches_at_the_limit_of_a_coarse_output_are_left_out():
-    for seed in range(20):
-        draw = np.random.default_rng(seed)
-        limit, step = draw.uniform(70.0, 88.0) * DEGREE, draw.uniform(0.1, 1.0) * DEGREE
-        for clipped in (False, True):
-            log = run(draw, 0.01 * draw.uniform(0.1, 1.0))
-            output = np.clip(log.output, -limit, limit) if clipped else log.output
-            found = extract_dwells(replace(log, output=step * np.round(output / step)))
-            fastest = np.abs(found.rate).max()
-            assert (fastest < limit) == clipped == ('at the limit' in ' '.join(found.remarks))
-
-
 def test_a_limit_that_two_speeds_do_not_distinguish_from_an_effect_is_one_without_noise():
     rates = np.array([0.0, 100.0, 200.0, 0.0, -100.0, -200.0, 0.0]) * DEGREE
     output = np.repeat(1.002 * rates, 1000)
@@ -272,8 +255,6 @@ def test_a_limit_that_two_speeds_do_not_distinguish_from_an_effect_is_one_withou
     assert np.abs(found.rate).max() == pytest.approx(100.0 * DEGREE)
     assert 'at the limit' in ' '.join(found.remarks)
 
-
-# Recordings
 
 def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):
     found = find_dwells(read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz'))

@@ -77,7 +77,6 @@ def test_a_planned_motion_can_be_driven_tells_the_scale_better_and_calibrates(na
 
 @pytest.mark.parametrize('size', [1.0, 0.03])
 def test_a_calibration_states_what_the_plan_promised(size):
-    """Within 1.1, for a gyro of consumer grade and a fine one, with the rest after the run."""
     noise, deviations = Noise(size * WHITE.angle_random_walk), []
     time = np.arange(2450) / 100.0
     for seed in range(12):

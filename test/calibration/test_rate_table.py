@@ -8,20 +8,26 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Calibration from dwells: on simulated rate tables of known truth, and against least squares."""
+"""Calibration from dwells of known truth, and the error of a full turn."""
 
 from dataclasses import replace
+from functools import partial
+import json
 import math
 
 from gyro_calibration.calibration.dwells import (
     Dwells, dwells_from_table, extract_dwells, select_dwells)
-from gyro_calibration.calibration.rate_table import channels_of, fit_effects
+from gyro_calibration.calibration.rate_table import channels_of, compute_turn_errors, fit_effects
 from gyro_calibration.calibration.scatter import find_inliers
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
+from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import (
     BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, rate_temperature_polynomial,
     SCALE_FACTOR_ASYMMETRY, SCALE_FACTOR_ERROR, SINE_RESPONSE, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import motion_from_rates, simulate
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 from recovery import CUBIC, gyros, LINEAR, run, SINE, Table
@@ -41,8 +47,6 @@ def dwells(rate, error, temperature=None, sweep=None, deviation=np.nan):
 def measured(terms=LINEAR, seed=1, **table):
     return Table(**table).measure(GyroModel(terms), np.random.default_rng(seed))
 
-
-# estimates
 
 @pytest.mark.parametrize('stated', [False, True])
 def test_no_dwell_is_taken_as_exact(stated):
@@ -122,8 +126,6 @@ def test_the_shape_of_a_sine_is_found_wherever_it_is(k):
     assert fit.terms[2].values[0] == pytest.approx(k, rel=1e-3)
 
 
-# few dwells
-
 @pytest.mark.parametrize('runs', [40, pytest.param(400, marks=pytest.mark.evidence)])
 def test_intervals_from_three_speeds_hold_the_truth(runs):
     generator = np.random.default_rng(3)
@@ -135,8 +137,6 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
         held += abs(fit.terms[1].values[0] - 0.02) < 1.96 * math.sqrt(fit.model.covariance[1, 1])
     assert binom.ppf(RARE, runs, 0.95) <= held <= binom.ppf(1 - RARE, runs, 0.95)
 
-
-# scatter
 
 @pytest.mark.parametrize('rates', [[0.0, 0.2], np.zeros(30), np.linspace(-0.3, 0.3, 41)])
 def test_a_table_without_any_error_is_fitted(rates):
@@ -166,8 +166,6 @@ def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():
     error[36] += 5e-3
     assert np.flatnonzero(~find_inliers(dwells(rate, error, sweep=sweep))).tolist() == [36]
 
-
-# refusals
 
 ASCENDING = np.linspace(-1.0, 1.0, 20)
 REFUSED = {
@@ -199,16 +197,12 @@ def test_what_the_dwells_do_not_determine_is_refused_with_the_remedy(table, effe
         fit_effects(table, effects)
 
 
-# a polynomial of the output
-
 def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the_output_away(data):
     """On this table 0.1.0 stated t0w1 = 0.097 +- 46 deg/s, with a residual of 0.045."""
     fit = fit_effects(dwells_from_table(read_log(data / 'fog_rate_table' / 'table.csv')),
                       [rate_temperature_polynomial(3, 2)])
     assert np.sqrt(np.diag(fit.model.covariance)).max() < 2.0 * fit.residual_rms
 
-
-# coarse steps
 
 @pytest.mark.parametrize('has_time', [False, True], ids=['table', 'log'])
 def test_the_steps_of_an_output_without_noise_are_in_the_deviations(has_time):
@@ -232,3 +226,166 @@ def test_the_steps_of_an_output_without_noise_are_in_the_deviations(has_time):
                            - [b * DEGREE, s]) / deviations)
     assert np.abs(scores).max() < 3.5
     assert np.mean(np.abs(scores) < 1.96) >= 0.85
+
+
+# The error of a full turn: by hand, against simulated turns, and as the program reports it
+
+TURN = 2.0 * math.pi
+
+
+def dwells_of(rates, errors, temperature=None, sweep=None):
+    """Return the dwells of a rate table from rates and errors in deg/s."""
+    rate = np.array(rates, dtype=float) * DEGREE
+    number = np.zeros(len(rate), dtype=int) if sweep is None else np.array(sweep)
+    degc = None if temperature is None else np.array(temperature, dtype=float)
+    return Dwells(rate, rate + np.array(errors) * DEGREE, degc, np.full(len(rate), np.nan), number,
+                  tuple(f'row {place + 1}' for place in range(len(rate))))
+
+
+HAND = dwells_of([0.0, 10.0, -20.0], [0.1, 0.15, 0.06])
+
+
+def test_a_turn_at_10_deg_s_takes_36_s_and_one_at_20_takes_18():
+    errors = compute_turn_errors(HAND, HAND.rate + np.array([0.02, 0.03, 0.01]) * DEGREE)
+    assert errors.static / DEGREE == pytest.approx([0.05 * 36.0, -0.04 * 18.0])
+    assert errors.modelled / DEGREE == pytest.approx([0.01 * 36.0, -0.01 * 18.0])
+
+
+def test_every_sweep_has_its_own_rest_and_one_without_takes_that_of_the_nearest_temperature():
+    found = dwells_of([0, 10, 0, 10, 10], [0.1, 0.2, 0.5, 0.6, 0.6], [20, 21, 40, 41, 38],
+                      [0, 0, 1, 1, 2])
+    errors = compute_turn_errors(found, found.output)
+    assert errors.static / DEGREE == pytest.approx([3.6, 3.6, 3.6])
+    assert '1 of 3 sweeps have none' in errors.remarks[0]
+
+
+@pytest.mark.parametrize('rates, said', [([10.0, 20.0, 30.0], 'record a rest'),
+                                         ([0.0, 0.0, 3.0], 'none of 3 dwells turns at 5 deg/s')],
+                         ids=['no rest', 'rests'])
+def test_a_table_without_turns_or_a_rest_is_refused(rates, said):
+    found = dwells_of(rates, [0.0] * 3)
+    with pytest.raises(DataRefused, match=said):
+        compute_turn_errors(found, found.output)
+
+
+def test_a_gyro_that_is_upside_down_is_refused_with_the_way_out():
+    with pytest.raises(DataRefused, match='the other way than the reference .* --invert'):
+        compute_turn_errors(replace(HAND, output=-HAND.output), -HAND.output)
+
+
+NOISE = Noise(angle_random_walk=5e-5)
+GYRO = GyroModel((Term(BIAS, (0.004,)), Term(SCALE_FACTOR_ERROR, (0.01,)),
+                  Term(SINE_RESPONSE, (0.3, 1.0))), noise=NOISE)
+#: Its calibration has an error.
+MODEL = GyroModel((Term(BIAS, (0.003,)), Term(SCALE_FACTOR_ERROR, (0.014,)),
+                   Term(SINE_RESPONSE, (0.25, 1.0))))
+
+
+@pytest.mark.parametrize('rate', [7.2, -12.0, 36.0, -90.0])
+def test_a_simulated_turn_integrated_at_10_hz_is_off_by_as_much(rate):
+    found = dwells_of([0.0, rate], [0.0, 0.0])
+    found = replace(found, output=GYRO.output(found.rate, np.full(2, 25.0)))
+    errors = compute_turn_errors(found, compensate(MODEL, found.output).rate)
+    rest, lasts = 10.0, 360.0 / abs(rate)
+    motion = motion_from_rates(np.array([0.0, rest, rest + 0.1, rest + lasts, rest + lasts + 0.1]),
+                               np.array([0, 0, rate, rate, 0]) * DEGREE)
+    log = simulate(GYRO, motion, 10.0, np.random.default_rng(1))
+    assert log.reference_heading[-1] == pytest.approx(math.copysign(TURN, rate))
+    deviation = NOISE.angle_random_walk * math.sqrt(lasts + lasts ** 2 / rest)
+    for expected, output in ((errors.static[0], log.output),
+                             (errors.modelled[0], compensate(MODEL, log.output).rate)):
+        turned = (integrate(log.time[100:], output[100:] - output[:100].mean())[-1]
+                  - math.copysign(TURN, rate))
+        # The ramps of 0.1 s, at other rates than the turn, may add the error of 0.1 s.
+        assert turned == pytest.approx(expected, abs=4.0 * deviation + 0.1 * abs(expected) / lasts)
+        assert abs(expected) > 5.0 * deviation, 'the claim would be lost in the noise'
+
+
+def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
+    found = dwells_of([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
+                      [0, 0, 1, 1, 2])
+    rate = np.where(found.sweep == 0, np.nan, found.rate + 0.1 * DEGREE)
+    errors = compute_turn_errors(found, rate)
+    assert (errors.static / DEGREE == pytest.approx([0.2 * 18.0, 0.3 * 18.0])
+            and errors.modelled == pytest.approx(0.0))
+    assert '1 turns are left out' in errors.remarks[1]
+
+
+def sweeps(deviation=0.0):
+    """Return four sweeps with a bias of 0.2 deg/s and a scale factor error of 0.01."""
+    rates = np.tile(np.arange(-60.0, 61.0, 10.0), 4)
+    scatter = np.random.default_rng(5).normal(0.0, deviation, len(rates))
+    return dwells_of(rates, 0.2 + 0.01 * rates + scatter, sweep=np.repeat(np.arange(4), 13))
+
+
+@pytest.fixture
+def turn(run):
+    return partial(run, 'turn')
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Return a file of four sweeps at 20 to 50 degC, with b = 0.2 deg/s and s = 0.01."""
+    found = sweeps()
+    write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate,
+                                          temperature=20.0 + 10.0 * found.sweep))
+    return tmp_path / 'table.csv'
+
+
+@pytest.fixture
+def model(tmp_path):
+    """Return a model file that leaves s = 0.002, valid to 35 deg/s and 30 degC."""
+    path = tmp_path / 'model.yaml'
+    path.write_text(
+        'effects: {bias: {bias: 0.0}, scale_factor_error: {scale_factor_error: 0.008}}\n'
+        'valid: {rate: [-0.611, 0.611], temperature: [0, 30]}')
+    return path
+
+
+def test_the_data_hold_every_turn_in_si(turn, log, model):
+    code, text, _ = turn(log, '--model', model, '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['turns'] == 48 == len(answer['rate_rad_s'])
+    ways = np.sign(answer['rate_rad_s'])
+    assert answer['static_rad_per_turn'] == pytest.approx(TURN * 0.01 * ways)
+    assert answer['modelled_rad_per_turn'] == pytest.approx(TURN * (1.01 / 1.008 - 1.0) * ways)
+    assert answer['ratio_rms'] == pytest.approx(0.01 / (1.01 / 1.008 - 1.0))
+    assert (sum(each['turns'] for each in answer['by_rate'])
+            == sum(each['turns'] for each in answer['by_temperature']) == 48)
+
+
+def test_the_table_gives_degrees_and_per_cent_and_what_is_beyond_the_range_of_the_model(
+        turn, log, model):
+    code, text, _ = turn(log, '--model', model)
+    row = next(line.split() for line in text.splitlines()
+               if line.startswith(('5 to 7.5 ', '7.5 to 15 ')))
+    assert code == 0 and [float(cell) for cell in row[4:8]] == [3.6, 1.0, 3.6, 1.0]
+    assert '\nrate [deg/s]' in text and '\ntemperature [degC]' in text
+    assert '24 of 52 dwells are beyond the calibrated rates' in text
+    assert '26 of 52 dwells are outside the calibrated temperatures' in text
+
+
+def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(turn, tmp_path):
+    found = sweeps(0.01)
+    write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate))
+    code, text, _ = turn(tmp_path / 'table.csv', '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['left_out'] and answer['effects'] == ['bias', 'scale_factor_error']
+    assert answer['temperature_degc'] is None and answer['by_temperature'] == []
+    assert answer['modelled']['rms_rad_per_turn'] < 0.3 * answer['static']['rms_rad_per_turn']
+
+
+def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(turn, tmp_path):
+    """By means of dwells alone, a supply that depends on the direction acts as an asymmetry."""
+    (tmp_path / 'model.yaml').write_text(
+        'effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
+    time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
+    motion = motion_from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
+    log = simulate(GyroModel(), motion, 50.0, np.random.default_rng(2))
+    supply = np.where(np.abs(log.time - 20.0) < 11.0, 6.0, 5.0)
+    write_log(tmp_path / 'log.csv',
+              replace(log, output=log.output + 0.01 * (supply - 5.0), supply=supply))
+    code, text, _ = turn(tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json')
+    answer = json.loads(text)
+    assert (answer['static']['largest_rad_per_turn'] > 0.1
+            and answer['modelled']['largest_rad_per_turn'] < 1e-9)

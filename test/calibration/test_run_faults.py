@@ -47,7 +47,6 @@ S, B = 0.03, 0.05 * DEGREE
 @pytest.mark.parametrize('level', LEVELS)
 @pytest.mark.parametrize('name', BAD)
 def test_a_run_that_went_wrong_is_refused_by_its_name(name, level):
-    """Two runs of each; of the 200 of the benchmark all are refused, and nearly all by name."""
     reasons = [tried((name, number, level))[0] for number in range(2)]
     assert all(reasons) and not any('\n' in reason for reason in reasons)
     assert any(WAYS[name][2] in reason for reason in reasons), reasons
@@ -71,7 +70,6 @@ def output(seed=0, motion=CALIBRATION_MOTION, time=TIME, level=1.0):
 
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
 def test_the_goodness_of_fit_has_the_probability_that_it_says(runs):
-    """The probability is uniform where the noise is as stated: mean to 4 standard errors."""
     probabilities = [self_calibrate(TIME, output(seed), CALIBRATION_MOTION,
                                     noise=XV3500.noise).goodness.probability
                      for seed in range(runs)]
@@ -202,18 +200,6 @@ def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
     assert find_rest_after(TIME, rate[:2001], calibrated(0), CALIBRATION_MOTION) is None
 
 
-@pytest.mark.parametrize('yaw', [0.5, 2.0, -5.0])
-def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
-    """The fit takes it for a bias, and the rest after it then has a rate of opposite sign."""
-    time = np.arange(2600) / 100.0
-    rate = output(0, time=time) + np.where(time < 20.5, yaw * DEGREE, 0.0)
-    fit = self_calibrate(time[:2001], rate[:2001], CALIBRATION_MOTION, noise=XV3500.noise)
-    assert fit.bias - B == pytest.approx(yaw * DEGREE, rel=0.1)
-    rest = find_rest_after(time, rate, fit, CALIBRATION_MOTION)
-    with pytest.raises(DataRefused, match='the corrected rate is'):
-        check_rest(time[rest], rate[rest], fit, XV3500.noise)
-
-
 #: The built-in profile, one that ends with 1.5 s of rest, and the built-in one by its headings.
 PROFILES = [CALIBRATION_MOTION, constant_rate_motion(
     [(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1.5, 0)]),
@@ -290,7 +276,6 @@ def odometry(seed, deviation, drift):
 
 @pytest.mark.parametrize('runs', [10, pytest.param(25, marks=pytest.mark.evidence)])
 def test_odometry_calibrates_and_its_own_scale_and_drift_are_in_the_deviations(runs):
-    """Of 60 runs, 93 to 98 % were within 1.96 standard deviations; 1 of 50 was refused."""
     reference, sizes = ReferenceErrors(0.0075, 0.01 * DEGREE), []
     for seed in range(runs):
         late = np.random.default_rng([seed, 3]).uniform(-0.3, 0.3)
@@ -404,13 +389,10 @@ def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, run)
     found = json.loads(text)
     assert (code == 0 and found['scale_factor_error_standard_deviation']
             == pytest.approx(0.0052, abs=0.0003))
-    assert (abs(found['rest_rate_rad_s']) < found['rest_limit_rad_s']
-            and found['degrees_of_freedom'] > 20)
-    assert (found['time_offset_standard_deviation_s'] < 0.01 and 0.0 < found['probability'] < 1.0
-            and found['noise_ratio'] < 2.0)
-    assert found['start_heading_rad'] is None
+    assert abs(found['rest_rate_rad_s']) < found['rest_limit_rad_s']
+    assert found['time_offset_standard_deviation_s'] < 0.01 and found['noise_ratio'] < 2.0
     said = run(*words)[1]
-    assert 'chi-square' in said and 'At rest after the run' in said and '+-' in said
+    assert 'At rest after the run' in said and '+-' in said
     spoiled = write_log(tmp_path / 'spoiled.csv', time,
                         output(0, time=time) + np.where(time > 20.5, 0.5 * DEGREE, 0.0))
     code, _, error = run('self-calibrate', spoiled, *words[2:])

@@ -123,24 +123,6 @@ def test_a_sine_is_taken_up_to_its_fringe_and_beyond_it_the_reason_says_so():
             assert 'beyond its fringe' in reason and '--effects' in reason
 
 
-def test_every_effect_has_its_reason():
-    selection = select_effects(measured(WANDERING, SINE), 'open_loop_fog')
-    reasons = {choice.effect: choice for choice in selection.choices}
-    assert (reasons['bias'].taken
-            and reasons['scale_factor_asymmetry'].reason.startswith((
-                'its p-value is above 0.0', 'does not predict')))
-    assert reasons['cubic_nonlinearity'].reason.startswith('explains the same as sine_response')
-    taken = reasons['scale_factor_temperature']
-    assert (taken.taken and taken.error_with < taken.error_without
-            and taken.p_value < FALSE_ALARM_RATE)
-
-
-def test_what_cannot_be_seen_says_what_would_show_it():
-    cold = replace(measured(Table(), LINEAR), temperature=None)
-    reasons = {choice.effect: choice.reason for choice in select_effects(cold).choices}
-    assert 'record temperature_degc' in reasons['bias_temperature']
-
-
 def test_rests_show_a_bias_alone():
     table = measured(Table(), LINEAR)
     steady = replace(table, rate=np.zeros(len(table)), output=table.output - table.rate)
@@ -163,8 +145,6 @@ def test_on_the_recorded_table_sine_and_cubic_are_hardly_distinguished_and_a_rat
             and 110.0 < pair.distinguishing_rate / DEGREE < 200.0)
     assert selection.calibration.left_out_rms < 0.05 * DEGREE
 
-
-# Another campaign
 
 @pytest.mark.parametrize('sine', [True, False], ids=['open-loop', 'MEMS'])
 @pytest.mark.parametrize('gyros', [4, pytest.param(40, marks=pytest.mark.evidence)])

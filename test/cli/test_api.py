@@ -10,6 +10,7 @@
 
 """The public names: same results as the command line, and a cheap import."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 import re
@@ -20,6 +21,7 @@ import gyro_calibration
 from gyro_calibration import (
     allan, compensate, diagnose, fit, GyroModel, Log, read_log, read_model, self_calibrate,
     simulate, track, write_log, write_model)
+from gyro_calibration.cli import plots
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
@@ -109,17 +111,35 @@ def test_headings_are_those_of_the_command_line(run_model, run, tmp_path):
         track(drive, GyroModel())
 
 
-def test_every_answer_has_a_picture(run_model, tmp_path):
+def test_every_answer_has_a_picture_with_a_unit_on_every_axis(run_model, run, tmp_path,
+                                                              monkeypatch):
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    figures, save = [], plots._save_figure
+    monkeypatch.setattr(plots, '_save_figure',
+                        lambda *given: figures.append(given[0]) or save(*given))
     log = simulate(GYRO, 'robot', sample_rate=20.0, seed=2)
-    table = Log(output=np.linspace(-1.0, 1.02, 41), reference_rate=np.linspace(-1.0, 1.0, 41))
-    for answer in (run_model, compensate(log, run_model.model),
-                   fit(table, effects=['bias', 'scale_factor_error']),
+    rate = np.tile(np.linspace(-1.0, 1.0, 21), 4)
+    output = 1.01 * rate + 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
+    output[[20, 50]] += 0.1, -0.05
+    table = Log(output=output, reference_rate=rate, temperature=np.repeat([0.0, 20.0, 40.0], 28))
+    for answer in (run_model, compensate(log, run_model.model), fit(table),
+                   fit(replace(table, temperature=None), effects=['bias', 'scale_factor_error']),
                    fit(Log(log.time, log.output, reference_heading=log.reference_heading)),
                    allan(simulate(NOISE, 'rest', seed=1))):
-        figure = answer.plot(tmp_path / 'picture.png')
-        assert figure.get_supxlabel() and (tmp_path / 'picture.png').stat().st_size > 10_000
-        (tmp_path / 'picture.png').unlink()
+        answer.plot(tmp_path / 'picture.svg')
+        assert (tmp_path / 'picture.svg').read_text().rstrip().endswith('</svg>')
+    for each in table, replace(table, temperature=None):
+        write_log(tmp_path / 'table.csv', each)
+        code, _, error = run('turn', tmp_path / 'table.csv', '--picture', tmp_path / 'a.png')
+        assert code == 0, error
+    assert len(figures) == 8 and (tmp_path / 'a.png').stat().st_size > 10_000
+    for figure in figures:
+        assert figure.get_supxlabel().endswith('.'), 'a line says what to see'
+        panels = [axes for axes in figure.axes if axes.get_label() != '<colorbar>']
+        assert panels and all('[' in axes.get_ylabel() for axes in panels)
+        assert all('[' in axes.get_xlabel()
+                   for axes in panels if axes.xaxis.get_tick_params()['labelbottom'])
+        assert all('[' in axes.get_xlabel() + axes.get_ylabel() for axes in figure.axes)
 
 
 def test_a_diagnosis_names_its_causes_writes_its_files_and_shows_its_report(tmp_path):

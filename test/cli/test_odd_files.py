@@ -71,8 +71,6 @@ KINDS = {'a pipe': os.mkfifo, 'a socket': make_socket, 'a folder': os.mkdir,
 each_kind = pytest.mark.parametrize('kind', KINDS)
 
 
-# Paths that are no files
-
 @each_kind
 @pytest.mark.parametrize('read, error, name', [
     (lambda path: read_log(path), LogError, 'a.csv'),
@@ -107,8 +105,6 @@ def test_what_is_no_file_is_not_replaced(kind, folder, run):
             and 'name a file' in store.calibration_hint)
     assert {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()} == before
 
-
-# Files that cannot be opened
 
 @pytest.mark.parametrize('path, words', [
     (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
@@ -155,8 +151,6 @@ def test_the_longest_name_that_there_may_be_is_written(folder):
     assert path.read_bytes() == b'newer' and len(os.listdir(folder)) == 3
 
 
-# Failed writes
-
 @pytest.mark.parametrize('step', ['fsync', 'replace'])
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, step):
     path = tmp_path / 'model.yaml'
@@ -175,8 +169,6 @@ def test_a_folder_that_takes_no_file_is_reported_by_the_name_that_was_given():
         write_atomically('/proc/model.yaml', b'new')
     assert refused.value.filename == '/proc/model.yaml'
 
-
-# Links and modes
 
 WRITERS = {
     'compensate': ('compensate log.csv --model model.yaml --out {}', 'a.csv'),
@@ -218,8 +210,6 @@ def test_a_new_file_has_the_mode_that_the_umask_leaves_and_an_old_one_its_own(tm
     finally:
         os.umask(before)
 
-
-# Control characters
 
 ESCAPES = '\x1b[31m\x9b2J\u202e\u2066\x07\r'
 
@@ -326,8 +316,6 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
     assert (len(list(read_messages(tmp_path / 'a.db3', contents))) == 98
             and contents.skipped_parts == 2)
 
-
-# Damaged numbers and text
 
 ODD = {
     'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n',

@@ -132,8 +132,6 @@ def is_unbroken(log):
     return bool(np.isin(steps, (1, -9999)).all())
 
 
-# What is written
-
 def notes():
     return {'port': '/dev/ttyUSB0', 'protocol': 'csv'}
 
@@ -233,8 +231,6 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
     np.testing.assert_array_equal(read_log(tmp_path / 'a.csv').supply, 200 * [5.0] + 200 * [4.9])
     assert recorder.late_columns == {'source_current_a'}
 
-
-# From the port
 
 @pytest.mark.parametrize(('name', 'number'),
                          [('a.csv.gz', signal.SIGTERM), ('a.mcap', signal.SIGINT)])
@@ -369,8 +365,6 @@ def test_where_nothing_can_be_written_no_file_is_left(record, tmp_path, name):
     assert code == 1 and 'nothing was written' in error and not (tmp_path / name).exists()
 
 
-# From topics
-
 class Robot:
     """Publishes the topics of a robot, with stamps of its own, many times faster than them."""
 
@@ -434,7 +428,6 @@ def reliable(**how):
 
 
 def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(ros, record, wait_until, tmp_path):
-    """The recording also has the definitions of its messages, which others understand."""
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom')
     both = [record('record', '--reference-topic', 'odom', *more, '--out', tmp_path / name,

@@ -18,10 +18,10 @@ import zlib
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
 from gyro_calibration.diagnosis.causes import (
-    cause_finding, cause_parameters, CAUSES, make_finding, mark_suspected, next_experiment,
+    cause_parameters, CAUSES, next_experiment,
     value_finding)
 from gyro_calibration.diagnosis.findings import (
-    detectable_sigmas, Estimate, MIN_PREDICTION_SIGMAS, prediction_sigmas, probabilities)
+    MIN_PREDICTION_SIGMAS, prediction_sigmas)
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import QUANTITIES
 from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
@@ -29,7 +29,6 @@ from gyro_calibration_bench.hidden import hide
 from gyro_calibration_bench.hidden.conditions import hide_look_alike, LOOK_ALIKES
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 
 def test_a_cause_has_units_and_a_variable_along_which_it_shows():
@@ -74,47 +73,10 @@ def test_a_set_that_is_found_has_its_experiment():
     assert all(CAUSES[name].separate_by for name in finding.ambiguous_with)
 
 
-@pytest.mark.parametrize('name', ['rate_ramp', 'bias_step', 'time_offset'])
-def test_the_remedy_of_a_suspected_cause_says_once_that_it_is_to_be_recorded_again(name):
-    remedy = mark_suspected(make_finding(name, {}, 0.01)).remedy
-    assert remedy.count('record again') == 1 and CAUSES[name].separate_by in remedy
-
-
-# The rules by which causes are named
-
-SIZE = {'warm_up': Estimate.from_half_width(1.0, 0.5, 'rad/s')}
-
-
-def test_no_single_stretch_confirms_a_cause_and_several_do():
-    assert prediction_sigmas(np.array([1e6, *np.zeros(19)])) < MIN_PREDICTION_SIGMAS
-    assert prediction_sigmas(np.array([*np.ones(4), 0.9])) > MIN_PREDICTION_SIGMAS
-    assert prediction_sigmas(np.array([-1.0, 0.5])) == 0.0
-
-
 def test_gains_of_noise_confirm_as_often_as_the_level_allows():
     gains = np.random.default_rng(0).standard_normal((4000, 30))
     assert np.mean([prediction_sigmas(each) > MIN_PREDICTION_SIGMAS
                     for each in gains]) == pytest.approx(0.05, abs=0.02)
-
-
-def test_an_effect_of_the_detectable_size_is_found_in_95_percent():
-    size = detectable_sigmas(0.01)
-    assert norm.sf(norm.isf(0.005) - size) == pytest.approx(0.95)
-
-
-def test_members_of_a_set_have_probabilities_by_their_deficits():
-    found = probabilities({'one': 1.0, 'other': 0.0})
-    assert [*found] == ['other', 'one'] and sum(found.values()) == pytest.approx(1.0)
-    assert found['other'] / found['one'] == pytest.approx(math.e)
-
-
-def test_a_finding_holds_its_set_the_experiment_and_how_sure_it_is():
-    found = cause_finding('warm_up', SIZE, 0.0, {'rate_ramp': 0.0, 'warm_up': 0.5}, False,
-                          {'long': 20.0}, 4.0, ['bias_temperature'])
-    assert found.ambiguous_with == ('rate_ramp', 'bias_temperature')
-    assert {*found.probability} == {'warm_up', 'rate_ramp'} and found.p_value > 0.0
-    assert found.minimum_detectable == pytest.approx(4.0 * SIZE['warm_up'].deviation)
-    assert 'rest for 20 min' in found.separate_by and found.status == 'suspected'
 
 
 def test_sine_and_cosine_are_amplitude_and_phase():

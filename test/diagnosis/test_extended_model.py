@@ -67,8 +67,6 @@ def value(model, name, place=0):
     return next(each.values[place] for each in model.terms if each.effect.name == name)
 
 
-# what is found of an effect that the model has already
-
 def on_top(own, found, *shapes, supply=None):
     """Return a model with an effect, and a finding of more of it from another origin or time."""
     model = replace(MODEL, terms=(*LINEAR, own),
@@ -151,16 +149,12 @@ def test_what_happens_once_is_named_and_only_what_lasts_is_in_the_model(once, ow
     assert 'in this log alone' in finding.remedy and not is_in_extended_model(finding, found)
 
 
-# a model that is right
-
 def test_a_model_that_is_right_is_left_as_it_is_to_the_letter():
     model = replace(MODEL, noise=Noise(1.5e-4, 1e-6, 1e-8))
     found = diagnosed(drive(), model)
     assert (found.verdict == 'adequate' and found.model is model
             and 'the model is unchanged' in headline(found)[1])
 
-
-# a self-calibration behind the model
 
 BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
 
@@ -175,8 +169,6 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
     assert value(found.model, 'scale_factor_error') == pytest.approx(1.01 * 1.02 - 1.0, abs=5e-4)
     assert value(found.model, 'bias') == pytest.approx(2e-3 + 1.01 * 1e-3, abs=2e-4)
 
-
-# units, limit and steps
 
 def at_rest(swing):
     """Return a log of a gyro that does not turn, or hardly does beside its noise."""
@@ -213,8 +205,6 @@ def test_a_limit_and_steps_that_are_found_are_in_the_model(name, size):
     assert found.model.covariance.shape == (3, 3) and found.model.terms[:2] == MODEL.terms
     assert diagnosed(drive(term(name, size), seed=5), found.model).verdict == 'adequate'
 
-
-# where it comes from
 
 def test_an_extended_model_comes_from_its_log_and_names_what_came_before(run, tmp_path):
     log, model = tmp_path / 'new.csv', tmp_path / 'model.yaml'

@@ -70,8 +70,6 @@ def names(found):
     return [finding.effect for finding in found.findings]
 
 
-# hidden effects
-
 @pytest.mark.parametrize('name', STATIC_EFFECTS)
 def test_an_effect_at_twice_the_smallest_size_is_found(without_gain, name):
     generator = np.random.default_rng(1)
@@ -99,15 +97,6 @@ def test_a_true_model_is_adequate_and_stays_as_it_is():
     assert found.verdict == 'adequate' and found.gain is None and found.model is model
 
 
-def test_a_parabola_over_temperature_stays_where_its_slope_is_withdrawn():
-    dwells = WANDERING.measure(gyro('bias_temperature_quadratic', 1e-5), np.random.default_rng(6))
-    found = diagnosis._name_causes(dwells, None)
-    slope = STATIC_EFFECTS['bias_temperature']
-    assert {slope, STATIC_EFFECTS['bias_temperature_quadratic']} <= set(found.fit.effects)
-    withdrawn = diagnosis._name_causes(dwells, None, [slope])
-    assert STATIC_EFFECTS['bias_temperature_quadratic'] in withdrawn.without
-
-
 def test_a_cause_that_left_out_sweeps_do_not_confirm_is_suspected_and_in_no_model(
         without_gain, monkeypatch):
     generator, truth = np.random.default_rng(7), gyro('cubic_nonlinearity', -0.01)
@@ -121,8 +110,6 @@ def test_a_cause_that_left_out_sweeps_do_not_confirm_is_suspected_and_in_no_mode
     assert found.verdict == 'adequate'
     assert [term.effect.name for term in found.model.terms] == [*NUISANCES]
 
-
-# sets, and what separates them
 
 def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(without_gain):
     generator, truth = np.random.default_rng(4), gyro('sine_response', 0.25)
@@ -150,8 +137,6 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
     assert members(found) == {'bias_temperature'}
 
 
-# models that are put to the test
-
 def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
     table = replace(Table(), fastest=300.0 * DEGREE)
     found = diagnosed(table, gyro('cubic_nonlinearity', -0.01), np.random.default_rng(9),
@@ -159,8 +144,6 @@ def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
     assert names(found) == ['cubic_nonlinearity']
     assert [term.effect.name for term in found.model.terms] == [*NUISANCES, 'cubic_nonlinearity']
 
-
-# what has no name, and what is no effect
 
 def test_what_dwells_cannot_test_of_a_model_is_left_and_reported(without_gain):
     model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
@@ -201,8 +184,6 @@ def test_tables_without_temperature_say_what_they_cannot_show():
     assert known == set(diagnosis.CAUSES)
 
 
-# what is won
-
 def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
     generator, truth = np.random.default_rng(16), gyro('cubic_nonlinearity', -0.01)
     found = diagnosed(Table(), truth, generator)
@@ -220,8 +201,6 @@ def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
     rate = next(curve for curve in found.curves if curve.along == 'rate')
     assert rms(rate.after / rate.deviation) < 2.0 < rms(rate.before / rate.deviation)
 
-
-# a measured table
 
 def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data):
     found = diagnose_table(recorded_table(data), None)

@@ -10,12 +10,10 @@
 
 """A log is laid out for the search whatever its reference lost; and what is left of it."""
 
-from dataclasses import replace
 import math
 
 from chance import seeds
 from diagnosed import estimates
-from gyro_calibration.calibration.reference_noise import keep_own_instants
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
@@ -25,79 +23,6 @@ from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-
-LATE = 0.004
-
-
-@pytest.fixture(scope='module')
-def smoothed():
-    """Return a hand's motion at 250 Hz, 4 ms late, with smoothed noise of gyro and reference."""
-    generator = np.random.default_rng(5)
-    time = np.arange(30_000) / 250.0
-    turns = [(frequency, generator.normal(), generator.uniform(0.0, 6.0))
-             for frequency in (0.13, 0.31, 0.7, 1.1, 1.9, 3.1, 5.3)]
-
-    def rate(when):
-        return sum(size * np.sin(2.0 * np.pi * frequency * when + phase)
-                   for frequency, size, phase in turns)
-
-    def averaged(values):
-        return np.convolve(values, np.full(7, 1.0 / 7.0), 'same')
-
-    noise = 0.03 * generator.standard_normal(len(time))
-    output = rate(time - LATE) + averaged(averaged(0.002 * generator.standard_normal(len(time))))
-    reference = rate(time) + averaged(averaged(averaged(averaged(noise))))
-    return Log(time=time, output=output + 1e-6 * generator.standard_normal(len(time)),
-               reference_rate=reference)
-
-
-@pytest.fixture(scope='module')
-def gaping(smoothed):
-    """Return the same log, where the reference is lost for half a second."""
-    lost = (smoothed.time > 40.0) & (smoothed.time < 40.5)
-    return replace(smoothed, reference_rate=np.where(lost, np.nan, smoothed.reference_rate))
-
-
-def laid_out(log):
-    return replay(log, np.ones(len(log.time), dtype=bool), np.random.default_rng(0))
-
-
-def test_stamps_in_bursts_lose_no_sample():
-    time = 0.01 * np.arange(20_000)
-    late = 0.04 * (np.arange(len(time)) // 4) + 1e-3 * (np.arange(len(time)) % 4)
-    noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
-    each = laid_out(Log(time=late, output=noise))
-    assert each.grid_index[-1] == len(time) - 1 and each.interval == pytest.approx(0.01, rel=1e-3)
-
-
-def test_a_delay_is_named_as_one_beside_a_noisy_and_gaping_reference(gaping):
-    found = diagnose([gaping], np.random.default_rng(1)).findings[0]
-    assert (found.effect == 'time_offset'
-            and found.parameters['time_offset'].estimate == pytest.approx(LATE, rel=0.03))
-
-
-TIME = np.arange(12_000) / 100.0
-NOISE = 1e-3 * np.random.default_rng(4).standard_normal(len(TIME))
-
-
-def stepped(every):
-    """Return a rate commanded in steps, each held: rests and stretches of 10 s, with turns."""
-    wanted = np.where(TIME % 20.0 < 10.0, np.where(TIME % 40.0 < 20.0, 0.0, 0.3),
-                      0.3 + 0.5 * np.sin(0.7 * TIME))
-    return wanted[np.arange(len(TIME)) // every * every]
-
-
-def test_a_held_reference_that_stands_is_not_bent_towards_what_comes_next():
-    """Rests of 10 s were a ramp to the first value after them."""
-    held = stepped(5)
-    log, _ = keep_own_instants(Log(output=stepped(1) + NOISE, time=TIME, reference_rate=held))
-    each = replay(log, np.ones(len(TIME), bool), np.random.default_rng(0))
-    standing = (TIME % 20.0 > 0.5) & (TIME % 20.0 < 9.5)
-    assert np.abs(each.reference - held)[standing].max() < 1e-5
-    turning = (TIME % 20.0 > 10.5) & (TIME % 20.0 < 19.5)
-    wanted = 0.3 + 0.5 * np.sin(0.7 * TIME)
-    assert np.abs(each.reference
-                  - wanted)[turning].max() < 1e-3 < np.abs(held - wanted)[turning].max()
 
 
 @pytest.mark.parametrize('frequency', [20.0, 100.0])
@@ -150,7 +75,6 @@ def test_one_sample_after_a_gap_is_no_step_of_the_bias(seed):
 
 @pytest.mark.parametrize('seed', seeds(2))
 def test_single_lost_samples_neither_cost_nor_bias_a_scale_in_a_random_walk(seed):
-    """The walk is as large as the white noise after a third of a second."""
     generator = np.random.default_rng(300 + seed)
     time = np.arange(12_000) / 40.0
     rate = (0.6 * np.sin(0.3 * time) + 0.3 * np.sin(1.1 * time)
@@ -251,7 +175,6 @@ def test_corners_of_a_motion_that_jitters_are_no_cause():
 
 @pytest.mark.parametrize('seed', [0, 3, *seeds(8)[1:]])
 def test_a_coarse_output_at_few_rates_leaves_open_what_its_rounding_may_do(seed):
-    """Three rates and slow ramps between them, in steps of 20 times the noise."""
     generator = np.random.default_rng(seed)
     time, scale, bias = np.arange(10_000) / 50.0, 0.01, generator.normal(0.0, 0.01)
     corners = np.cumsum(generator.uniform(0.5, 4.0, 160))

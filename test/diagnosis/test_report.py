@@ -24,7 +24,7 @@ from gyro_calibration.diagnosis.findings import (
     Change, Curve, Diagnosis, Estimate, Finding, Gain, Reference, Unexplained)
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import (
-    format_probability, format_quantity, headline, lists, terminal_lines)
+    format_quantity, headline, terminal_lines)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -36,8 +36,6 @@ CHROMIUM = Path('/usr/bin/chromium')
 HOSTILE = ('</title></script><script>document.title = "taken"</script><img '
            'src="http://example.org/x.png" onerror="alert(1)">&"\'\x1b[2J\udcff.csv')
 
-
-# diagnoses made by hand
 
 def curve(along, unit, at, error, mended, deviation=0.01 * DEGREE):
     """Return a curve whose error is wholly before, and partly mended after."""
@@ -185,8 +183,6 @@ def made(request):
     return MADE[request.param]()
 
 
-# the page as text
-
 class Page(HTMLParser):
     """Read a page strictly: every element closed, in order; lists elements and attributes."""
 
@@ -276,8 +272,6 @@ def test_the_finding_stands_on_top_and_is_the_same_for_the_terminal(page, made):
     assert ' '.join(terminal_lines(made)).replace('\n', ' ').startswith(headline(made)[0])
 
 
-# the words
-
 def test_a_set_is_named_with_the_experiment_that_distinguishes_it():
     text = ' '.join(' '.join(terminal_lines(extended())).split())
     assert 'bias temperature or rate ramp, which these data cannot distinguish' in text
@@ -288,13 +282,6 @@ def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_u
     assert 'time offset (or bandwidth), cubic nonlinearity and 2 more' in headline(several())[0]
     text = ' '.join(terminal_lines(several()))
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
-
-
-@pytest.mark.parametrize('shares, cancel', [((0.6, 0.4), False), ((0.7, 0.6), True)])
-def test_shares_that_add_up_to_more_than_the_whole_are_said_to_cancel(shares, cancel):
-    found = replace(extended(), heading_shares=dict(zip(('bias', 'warm_up'), shares)))
-    title = next(title for title, _ in lists(found) if title.startswith('Shares'))
-    assert ('cancel' in title) == cancel
 
 
 def test_what_a_reference_with_errors_does_not_establish_is_not_said_to_be_noise():
@@ -319,13 +306,6 @@ def test_an_estimate_is_written_with_the_digits_of_its_interval(value, interval,
     assert str(format_quantity(Estimate(value, interval, unit))) == words
 
 
-@pytest.mark.parametrize('probability, words',
-                         [(0.0, 'below 1 in 10 000'), (1 / 250, '1 in 250'), (0.3, '30 %'),
-                          (np.nan, 'not known')])
-def test_a_chance_is_reported_in_words(probability, words):
-    assert format_probability(probability) == words
-
-
 @pytest.mark.parametrize('interval, words',
                          [((0.01, 0.02), 'reduces'), ((-0.01, 0.02), 'includes zero'),
                           ((-0.02, -0.01), 'increases'), (None, 'no interval')])
@@ -339,8 +319,6 @@ def test_lines_for_a_terminal_are_not_too_long(made):
     if made.logs != (HOSTILE,):
         assert max(len(line) for text in terminal_lines(made) for line in text.split('\n')) <= 120
 
-
-# the page in a browser
 
 WIDTHS = {'watch': 320, 'phone': 390, 'desk': 1280}
 #: For each frame: its width, that of its content, elements that reach beyond its right edge except

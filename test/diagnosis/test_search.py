@@ -56,20 +56,6 @@ def gained(search, named):
             - fit_causes(search.problem, []).log_likelihood)
 
 
-# sets and prices
-
-@pytest.fixture(name='both', scope='module')
-def _both():
-    """Return the findings in a log with a tone, and a drift while it is heated evenly."""
-    log = resting(tone(2e-3, 3.3) + 4e-6 * TIME, temperature=20.0 + 0.05 * TIME)
-    return {each.effect: each for each in diagnose([log], np.random.default_rng(0)).findings}
-
-
-def test_a_set_is_reported_beside_a_cause_of_many_values(both):
-    drift = next(each for name, each in both.items() if name != 'interference_tone')
-    assert {'rate_ramp', 'bias_temperature'} <= {drift.effect, *drift.ambiguous_with}, both
-
-
 @pytest.mark.parametrize('cause, added, places', [
     ('interference_tone', tone(3e-4, 3.3), len(TIME)), ('bias_step', 3e-4 * (TIME > 150.0), 30),
     ('~time', 8e-4 * np.exp(-0.5 * ((TIME - 150.0) / 8.0) ** 2), 10)])
@@ -88,8 +74,6 @@ def test_what_one_stretch_shows_does_not_predict_the_others():
     assert (evidence_for(search, named, 0) > 10.0
             and held_out_sigmas(search, named)[0] < MIN_PREDICTION_SIGMAS)
 
-
-# shapes
 
 @pytest.mark.parametrize('name, shape', [('dead_zone', 'dead_zone'), ('bias_step', 'step_time')])
 def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
@@ -110,8 +94,6 @@ def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
     place = places.index((name, 0))
     assert math.sqrt(found.model.covariance[place, place]) == pytest.approx(deviation, rel=0.01)
 
-
-# tones
 
 def test_a_tone_above_what_is_searched_has_its_own_frequency_and_size():
     time = np.arange(60_000) / 100.0
@@ -155,8 +137,6 @@ def test_what_is_established_is_significant_given_all_that_is():
                    for place, each in enumerate(selected))
 
 
-# contradictions
-
 def test_a_scale_factor_of_a_part_of_a_log_is_not_blamed_on_the_temperature():
     generator, time = np.random.default_rng(4), np.arange(6000) * 0.05
     rate = np.sin(0.9 * time) * np.sin(0.11 * time)
@@ -168,21 +148,6 @@ def test_a_scale_factor_of_a_part_of_a_log_is_not_blamed_on_the_temperature():
     assert not established(found)
     assert 'rate and time' in [each.along for each in found.unexplained]
     assert any('an effect of a part of the log' in remark for remark in found.remarks)
-
-
-# where is looked
-
-def test_the_interval_of_the_time_of_a_step_holds_it():
-    times, held = (150.0, 185.0), 0
-    for seed in range(6):
-        part = 6e-4 * ((times[0] < TIME) & (times[1] > TIME))
-        search, named = found_in([laid(resting(part, seed=seed))])
-        assert [known.cause for known in named] == 2 * ['bias_step']
-        fit = fit_causes(search.problem, named)
-        for place in range(2):
-            time, = fit.shapes(place).values()
-            held += min(abs(time.estimate - true) for true in times) < 1.96 * time.deviation < 10
-    assert held >= 11
 
 
 LATE = (TIME >= 200.0) & (TIME < 300.0)
@@ -225,8 +190,6 @@ def test_columns_that_nearly_depend_on_each_other_leave_a_positive_residual():
     units = fit.columns / np.linalg.norm(fit.columns, axis=1)[:, None]
     assert np.linalg.svd(units, compute_uv=False)[-1] ** 2 > 0.5e-9
 
-
-# the noise that a model states
 
 def diagnosed_drift(noise, drift, seed):
     """Return the findings at rest, with a model of which `allan` saw no random walk."""

@@ -380,18 +380,3 @@ def test_a_swing_that_a_slow_robot_repeats_is_refused():
               output=(1.0 + S) * rate + B + 1e-3 * generator.standard_normal(COUNT))
     with pytest.raises(DataRefused, match='in a swing that repeats: turn at several rates'):
         diagnose([log], generator, reference_kind='rate_command')
-
-
-def test_a_command_that_is_held_between_updates_has_no_noise():
-    log = commanded_log('swing', 3e-4, 3)
-    held = log.reference_rate[np.arange(COUNT) // 4 * 4]
-    assert rate_noise_share(Log(output=log.output, time=log.time, reference_rate=held)) == 0.0
-
-
-def test_a_scale_is_fitted_beside_the_lag_of_a_swing():
-    """A lag attenuates a swing, by 2 % at 0.2 Hz here."""
-    errors = []
-    for seed in range(4):
-        fit = calibrate_encoder(commanded_log('swing', 3e-4, seed)).fit
-        errors.append((fit.scale_factor_error - S) / np.sqrt(fit.covariance[0, 0]))
-    assert np.abs(errors).max() < 4.0

@@ -14,7 +14,6 @@ import contextlib
 import itertools
 import math
 import os
-import random
 import termios
 import threading
 import tty
@@ -24,7 +23,6 @@ from gyro_calibration.driver.connection import (
     Connection, Decimator, PortError, resolve_port, SerialPort)
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
-import numpy as np
 import pytest
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
@@ -34,8 +32,6 @@ NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of 
 def turning(rate=0.5, frequency=100.0):
     return (Sample(rate, 31.5, k / frequency) for k in itertools.count())
 
-
-# With real ports
 
 def held():
     """Return how many threads and file descriptors this process has."""
@@ -58,8 +54,6 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
     assert found == pytest.approx([0.01 * number for number in range(100)])
 
 
-# Recognizing
-
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_auto_finds_the_protocol_and_reports_it(name):
     world = World(15.0, baud=find_protocol(name).baud)
@@ -77,8 +71,6 @@ def test_auto_asks_for_what_the_protocol_needs():
     assert problem.startswith(
         'csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
 
-
-# Finding and waiting
 
 def test_a_gyro_is_found_again_under_another_name(tmp_path):
     """As in /dev/serial/by-id, where the name holds the serial number of the adapter."""
@@ -124,9 +116,6 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     assert reading.connection.waited_duration == pytest.approx(31.3 + 10.0, abs=0.2)
 
 
-# Silence
-
-
 @pytest.mark.parametrize('period', [1.5, 10.0])
 def test_a_slow_gyro_is_silent_after_three_of_its_periods(period):
     """Its period is known from the second sample on, or from the parameter."""
@@ -170,7 +159,6 @@ def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_answers(proto
 
 @pytest.mark.parametrize('protocol', ['csv', 'auto'])
 def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
-    """Its silence is reported meanwhile."""
     world = World(10.0)
     world.restart = 4.5
     world.send(b'1.0\r\n')
@@ -178,8 +166,6 @@ def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
     assert reading.samples and reading.connection.open_count == 1
     assert reading.problems == [NOTHING]
 
-
-# Counts and stamps
 
 def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     world = World(5.0)
@@ -194,22 +180,6 @@ def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)
     assert reading.connection.counts.lost_samples == 0
 
-
-def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps():
-    generator, encode = random.Random(3), find_protocol('kvh_1750').encoder()
-    sent = [b'' if generator.random() < 0.02 else encode(Sample(1e-4 * number, sequence=number))
-            for number in range(8_000)]
-    world = World(8.0)
-    world.send(iter(sent), rate=1000.0)
-    reading = Reading(world, 'kvh_1750')
-    counts = reading.connection.counts
-    numbers = np.round([1e4 * sample.output for sample in reading.samples])
-    assert counts.lost_samples == numbers[-1] - numbers[0] + 1 - counts.samples > 100
-    assert all(chunk.stamps[-1] <= chunk.arrival for chunk in reading.chunks)
-    assert reading.steps[5000:] == pytest.approx(1e-3 * np.diff(numbers)[5000:], abs=1e-6)
-
-
-# The port alone
 
 @pytest.fixture
 def terminal():
@@ -261,7 +231,6 @@ def test_a_port_that_cannot_be_opened_says_why(path, reason):
 
 
 def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
-    """What came at the other speed is dropped."""
     master, path = terminal
     port = SerialPort(path, 9600)
     port.open()
@@ -274,8 +243,6 @@ def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
     assert (speed, port.baud, port.read()) == (termios.B115200, 115200, b'sense')
     port.close()
 
-
-# The mean of several samples in place of each
 
 PERIOD = 1e-3
 EPOCH = 1.7e9

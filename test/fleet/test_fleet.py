@@ -30,7 +30,7 @@ from gyro_calibration.fleet.pooling import (
     find_changes, find_outlying_groups, Observations, PooledValue)
 from gyro_calibration.fleet.run import process_executor, run_tasks
 from gyro_calibration.fleet.summary import (
-    build_models, count_effects, data, describe_type, log_table, summarize_types)
+    build_models, count_effects, data, describe_type, summarize_types)
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -64,8 +64,6 @@ def pool(tmp_path, capsys):
                        for each in found['no_evidence']}
     return pool
 
-
-# the unit of each log
 
 def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     (tmp_path / 'fleet.csv').write_text('log,unit,drive,date,temperature\n'
@@ -133,8 +131,6 @@ def test_notes_and_names_say_what_a_table_does_not(tmp_path):
         compile_file_pattern('rc_car')
 
 
-# workers
-
 def test_a_worker_that_is_killed_ends_the_run_and_one_without_memory_does_not():
     with process_executor(2, 1e9) as executor:
         numbers = [*range(KILLS), *range(KILLS + 1, 10)]
@@ -154,8 +150,6 @@ def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
         begun.wait()
     wait_until(lambda: not Path(f'/proc/{worker}').exists())
 
-
-# the verb
 
 def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, pool):
     logs = tmp_path / 'logs'
@@ -222,7 +216,6 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, poo
 
 
 def test_names_may_hold_any_characters(tmp_path):
-    """Also bytes that are no text, and units whose names differ by letters of any language."""
     names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a b': 'x'}
     for seed, name in enumerate(names.values()):
         write_log(tmp_path / f'{name}.csv', drive(0.01, seed))
@@ -275,8 +268,6 @@ def test_where_nothing_can_be_done_one_sentence_says_why(tmp_path, capsys, make,
     out, error = capsys.readouterr()
     assert not out and wanted in error and error.count('\n') == 1
 
-
-# pooling
 
 def crossed(values):
     """Return values of units by drives, each with a small error of its own."""
@@ -349,7 +340,6 @@ def test_each_value_is_laid_to_the_unit_or_the_reference():
 
 @pytest.mark.parametrize('unit', ['0', '4'])
 def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
-    """As where one gyro rested only: by name the first one or the last."""
     logs = [{**each, 'values': {'bias': each['values']['bias']}}
             if each['unit'] == unit else each for each in records()]
     (found,) = summarize_types(logs)
@@ -376,7 +366,6 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
 
 
 def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
-    """Over age all drift alike."""
     generator, degc, years = np.random.default_rng(21), 5.0 * np.arange(8), 0.125 * np.arange(8)
     slopes = 1e-4 * (2.0 + generator.standard_normal(8))
     logs = [{**records()[0], 'log': f'{unit}-{place}', 'unit': str(unit), 'drive': '',
@@ -397,8 +386,6 @@ def test_units_whose_drift_over_temperature_differs_have_slopes_of_their_own():
                      for unit in range(8)])
     assert np.sum((ends[:, 0] < slopes) & (slopes < ends[:, 1])) >= 6
 
-
-# models
 
 def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
     (found,) = summarize_types(records())
@@ -440,10 +427,3 @@ def test_a_diagnosis_by_a_course_takes_what_is_usual_of_a_fleet_as_its_prior():
 def _bias(model):
     (place,) = [place for place, each in enumerate(model.terms) if each.effect.name == 'bias']
     return model.terms[place].values[0], np.sqrt(model.covariance[place, place])
-
-
-# the table
-
-def test_a_table_holds_a_row_for_each_log():
-    logs = records()
-    assert len(log_table(logs).splitlines()) == 1 + len(logs)

@@ -113,8 +113,6 @@ def test_what_no_gyro_has_is_not_used(given):
     assert 'is not used' in table.add(*given) and not table.entries
 
 
-# A stored calibration
-
 @pytest.fixture(scope='module', name='carried')
 def _carried():
     """Return error and standard deviation of 120 later calibrations, without and with a table."""
@@ -160,8 +158,6 @@ def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not(
         for age, this_run in ((60.0, False), (3 * DAY, False), (3000.0, True)))
     assert min(before, in_this_run) > after + 0.9 * table.jumps[0].variance
 
-
-# Files
 
 def test_a_table_survives_a_restart(tmp_path):
     table, _, history = jumped()

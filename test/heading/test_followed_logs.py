@@ -11,6 +11,7 @@
 """A log that is followed has the heading of single samples and of the node; and how good it is."""
 
 import contextlib
+from dataclasses import replace
 from functools import cache
 import math
 
@@ -19,12 +20,13 @@ from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
-from gyro_calibration.model.effects import BIAS
+from gyro_calibration.model.channels import channels_from_log
+from gyro_calibration.model.effects import BIAS, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model.motion import motion_from_headings
+from gyro_calibration.model.motion import motion_from_headings, simulate_gyro_output
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.ros.calibration_session import ODOMETRY
 from gyro_calibration.ros.inputs import Velocity
@@ -60,55 +62,20 @@ def drive(seconds, seed, coefficient=0.0, bias=0.005):
     return time, rate, output, temperature
 
 
-def lossy(*columns):
-    """Return the columns without some rows: lost samples, and a gap."""
-    kept = np.ones(len(columns[0]), bool)
-    kept[5000:5007] = kept[9000:9400] = False
-    return [column[kept] for column in columns]
-
-
-def by_samples(tracker, time, rate, sensitivity, still, wheels):
-    found = np.empty((len(time), 5))
-    for place in range(len(time)):
-        tracker.add(float(time[place]), float(rate[place]), sensitivity[place],
-                    None if wheels is None else wheels[place], still)
-        found[place] = (tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance,
-                        tracker.is_resting)
-    return found
-
-
-@pytest.mark.parametrize('with_wheels', [False, True])
-def test_whole_blocks_at_once_give_the_heading_of_single_samples(with_wheels):
-    model = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
-    time, rate, output, _ = drive(150.0, 1)
-    output[8000] += 30.0
-    output[8100:8103] += 10.0
-    output[10000] = math.nan
-    time, rate, output = lossy(time, rate, output)
-    corrected = np.asarray(CALIBRATED.correct(output))
-    sensitivity = rate_sensitivity(model, output, corrected, 25.0).T
-    still = rate_sensitivity(model, 0.0, 0.0, 25.0)
-    wheels = [bool(each) for each in rate != 0.0] if with_wheels else None
-    single, whole = (HeadingTracker(NOISE, uncertainty_covariance(model), TrackerSettings(), 0.0)
-                     for _ in range(2))
-    expected = by_samples(single, time, corrected, sensitivity, still, wheels)
-    found = whole.follow(time, corrected, sensitivity, wheels, still)
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    assert single.intervals.lost_samples == whole.intervals.lost_samples > 0
-    assert (single.outlier_count == whole.outlier_count == 1
-            and single.refused_count == whole.refused_count == 1)
-
-
-@pytest.mark.parametrize('calibration', [None, CALIBRATED], ids=['uncalibrated', 'calibrated'])
-def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibration):
-    time, _, output, temperature = drive(240.0, 2, 0.02 * DEGREE)
+@pytest.mark.parametrize('calibration, with_wheels', [(None, False), (CALIBRATED, True)],
+                         ids=['uncalibrated', 'calibrated, with wheels'])
+def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibration, with_wheels):
+    time, rate, output, temperature = drive(240.0, 2, 0.02 * DEGREE)
     output[15000:20000] = output[10000] * 0.0 + 0.005 + 0.02 * DEGREE * (
         temperature[15000:20000] - 25.0)  # a rest in which it gets warm
     output[8000] += 30.0
     output[13000] = 1e4
     temperature[11000:11300] = math.nan
     temperature[12500] = 1e9
-    time, output, temperature = lossy(time, output, temperature)
+    kept = np.ones(len(time), bool)  # lost samples, and a gap
+    kept[5000:5007] = kept[9000:9400] = False
+    time, rate, output, temperature = (each[kept] for each in (time, rate, output, temperature))
+    wheels = [bool(each) if with_wheels else None for each in rate != 0.0]
     model = GyroModel((Term(BIAS, (0.005,)),), noise=NOISE, self_calibration=calibration)
     single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), TrackerSettings(),
                                       NOW)
@@ -117,13 +84,13 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
     for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
         if degc == degc:
             single.add_temperature(at, degc)
-        single.add(at, float(output[place]), NOW + at)
+        single.add(at, float(output[place]), NOW + at, wheels=wheels[place])
         tracker = single.tracker
         expected[place] = (tracker.heading, tracker.variance, single.rate, tracker.rate_variance,
                            tracker.is_resting, single.corrected_rate)
-    found = whole.follow(time, output, NOW, temperature)
+    found = whole.follow(time, output, NOW, temperature, wheels if with_wheels else None)
     np.testing.assert_allclose(found[:, :6], expected, rtol=1e-11, atol=1e-12)
-    assert single.restart_count == whole.restart_count > 2, 'a warm tracker begins anew'
+    assert single.restart_count == whole.restart_count > 2 - with_wheels, 'where it is warm'
     assert single.refused_count == whole.refused_count == 1
     assert single.refused_temperature_count == whole.refused_temperature_count == 1
     assert [entry.bias for entry in whole.table.entries] == pytest.approx(
@@ -260,3 +227,103 @@ def test_a_node_that_is_calibrated_by_odometry_on_20_s_follows_the_encoder_for_f
     assert answers and answers[0][0], answers
     error, pure = np.array(found) - found[0] - heading, integrate(time, output) - heading
     assert rms(error) < rms(pure) / 3.0, (rms(error), rms(pure), answers)
+
+
+# Compensation of logs with surroundings: in one piece, in blocks, and as a stream
+
+VALUES = {'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),
+          'thermal_lag': (120.0, -2e-3), 'thermal_hysteresis': (10.0, 2e-3, 3e-4),
+          'warm_up': (300.0, 0.004), 'rate_ramp': (2e-7,), 'bias_step': (200.0, -1e-3),
+          'acceleration_sensitivity': (1e-4,), 'vibration_rectification': (1.0, 2e-4),
+          'supply_sensitivity': (5.0, 4e-4), 'interference_tone': (0.07, 3e-4, -2e-4)}
+HEADING = {'heading_sensitivity': (1e-3, -5e-4)}
+TIME = np.arange(0.0, 900.0, 0.05) + np.random.default_rng(0).uniform(0.0, 0.02, 18000)
+
+
+def model_of(values, **more):
+    return GyroModel(tuple(Term(CATALOGUE[name], each) for name, each in values.items()), **more)
+
+
+def heated_drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
+    """Return a log of a gyro that is driven, heated and cooled, and shaken."""
+    rate = motion(TIME)
+    force = np.random.default_rng(1).standard_normal(len(TIME))
+    log = Log(output=rate, time=TIME, temperature=30.0 + 15.0 * np.abs(1.0 - TIME / 300.0),
+              reference_rate=rate, reference_heading=integrate(TIME, rate),
+              supply=5.0 + 0.2 * np.sin(TIME / 40.0),
+              specific_force=np.where(TIME > 400.0, 2.0, 0.1) * force)
+    channels = channels_from_log(log).with_rate(rate, rate)
+    return replace(log, output=simulate_gyro_output(model, TIME, channels))
+
+
+def in_blocks(model, log, size):
+    compensation = LogCompensation(model)
+    parts = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))
+             for first in range(0, len(log), size)]
+    return np.concatenate([part.rate for part, _ in parts]), np.hstack([each for _, each in parts])
+
+
+@pytest.mark.parametrize('size', [1, 700, 5000])
+def test_blocks_are_compensated_as_the_whole(size):
+    model = model_of(VALUES | HEADING, covariance=np.eye(16) * 1e-10)
+    log = heated_drive(model)
+    if size == 1:
+        log = rows_of(log, np.arange(600))
+    whole, sensitivity = LogCompensation(model).add(log)
+    rates, sensitivities = in_blocks(model, log, size)
+    np.testing.assert_allclose(rates, whole.rate, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(sensitivities, sensitivity, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize('size', [500, 700, 5000, 18000])
+def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_blocks_as_in_one_piece(
+        size):
+    model = model_of(HEADING | {'scale_factor_error': (0.01,)})
+    log = heated_drive(model)
+    turned = replace(log, reference_heading=1.5 + log.reference_heading)
+    output = simulate_gyro_output(
+        model, TIME, channels_from_log(turned).with_rate(log.reference_rate, log.reference_rate))
+    lost = (TIME > 0.1) & (TIME < 0.2) | (TIME > 100.0) & (TIME < 400.1) | (TIME > 800.0)
+    log = replace(turned, output=output,
+                  reference_heading=np.where(lost, np.nan, turned.reference_heading))
+    assert in_blocks(model, log, size)[0] == pytest.approx(log.reference_rate, abs=1e-6)
+
+
+def test_rows_without_output_are_left_out(tmp_path, compensate):
+    model = model_of(VALUES | HEADING)
+    log = heated_drive(model)
+    done = compensate(replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan,
+                                                   log.output)), model)
+    rate = done.columns['rate_rad_s']
+    assert '18 rows have no output' in done.text and 'no reference heading' not in done.text
+    assert np.nanmax(np.abs(done.columns['heading_rad'] - done.log.reference_heading)) < 1e-3
+    assert np.isnan(rate).sum() == 18 and np.nanmax(np.abs(rate - log.reference_rate)) < 1e-3
+    assert np.array_equal(compensate_log(model, read_log(tmp_path / 'log.csv')), rate,
+                          equal_nan=True)
+
+
+def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(compensate):
+    model = model_of({'supply_sensitivity': (5.0, 1e-4), 'time_offset': (0.02,),
+                      'heading_sensitivity': (0.0, 0.0), 'saturation': (1.0,)})
+    log = replace(heated_drive(GyroModel()), supply=None, reference_heading=None)
+    done = compensate(log, model)
+    assert done.code == 0 and all(words in done.text
+                                  for words in ('no supply voltage', 'no reference heading',
+                                                'saturation: An output at the limit'))
+
+
+@pytest.mark.parametrize('name, value',
+                         [('time_offset', 0.03), ('time_offset', -0.03), ('clock_rate', 2e-3)])
+def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_time(
+        compensate, name, value):
+    model, time = model_of({name: (value,)}), np.arange(70_000) * 0.01
+    rate = np.sin(1.3 * time)
+    log = Log(output=rate, time=time + 50.0, reference_rate=rate,
+              reference_heading=(1.0 - np.cos(1.3 * time)) / 1.3)
+    log = replace(log, output=simulate_gyro_output(model, time,
+                                                   channels_from_log(log).with_rate(rate, rate)))
+    done, inside = compensate(log, model), slice(10, -200)
+    assert 'true_time' not in done.columns
+    assert (np.abs(done.columns['rate_rad_s'] - rate)[inside].max() < 1e-4
+            < np.abs(log.output - rate).max())
+    assert np.ptp((done.columns['heading_rad'] - done.log.reference_heading)[inside]) < 5e-4

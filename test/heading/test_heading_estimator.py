@@ -113,13 +113,6 @@ def test_what_a_model_was_not_fitted_to_is_not_known(effects, unknown):
     assert (0.0 if used is None else used.covariance[0][0]) == (9e-4 if unknown[0] else 0.0)
 
 
-def test_a_bias_that_the_model_was_not_fitted_to_is_estimated_at_rest():
-    model = GyroModel((Term(SCALE_FACTOR_ERROR, (0.0,)),), np.array([[1e-8]]), noise=NOISE)
-    gyro = Gyro(begun(model), bias=0.3 * DEGREE).go(20.0).go(10.0, 0.5).go(20.0)
-    assert abs(gyro.error) < 4.0 * gyro.deviation
-    assert abs(gyro.live.tracker.bias[0] - 0.3 * DEGREE) < 0.02 * DEGREE
-
-
 @pytest.mark.parametrize('temperature', [25.0, None])
 def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_been_right(
         temperature):

@@ -72,7 +72,6 @@ UNCERTAIN = ((1e-4, -2e-6), (-2e-6, 1e-6))
 
 
 def test_the_variance_is_that_of_many_runs_with_known_truth():
-    """60 s of driving with white noise, and s and b drawn from their covariance."""
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, generator, ends = np.arange(6001) * INTERVAL, np.random.default_rng(0), []
     true = ROBOT_MOTION.rate_at(time)

@@ -14,8 +14,6 @@ import math
 
 from chance import RARE, rms_bounds
 import gyro_calibration
-from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX, HeadingState, initial_state, RateIntegral, smooth_states)
@@ -50,12 +48,15 @@ def gyro(motion, generator, noise=XV3500, bias=None):
             (1.0 + SCALE * generator.standard_normal()) * true + drawn[known:] - left)
 
 
-def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False):
-    return track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, KNOWN,
-                 settings or TrackerSettings(), wheels, hindsight)
+#: A gyro with little noise, and the covariance where its bias was known to 0.001 deg/s.
+QUIET, CERTAIN = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
 
 
-# the filter
+def follow(time, rate, settings=None, wheels=None, noise=XV3500, known=KNOWN, hindsight=False):
+    return track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
+                 settings or TrackerSettings(), None if wheels is None else wheels.tolist(),
+                 hindsight)
+
 
 def random_parts(generator, noise):
     """Return random turns and an unseen one, which of them are rests, and the state before."""
@@ -117,14 +118,11 @@ def test_the_state_at_the_end_is_that_of_the_last_sample():
     assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(0.3 * 206 * INTERVAL, abs=1e-9)
 
 
-# rest and motion
-
 @pytest.mark.parametrize('motion, before, share, runs', [
     (constant_rate_motion([(40, 0)]), BIAS, 0.7, 40),
     (constant_rate_motion([(1.6, 0), (2, 45)] * 10), 0.2 * DEGREE, 1.0 / 3.0, 10)],
     ids=['one of 40 s', 'ten of 1.6 s between turns'])
 def test_rests_determine_the_bias_as_well_as_stated(motion, before, share, runs):
-    """It is known to a share of the standard deviation of before."""
     errors, deviations, white = [], [], Noise(XV3500.angle_random_walk)
     for seed in range(runs):
         generator = np.random.default_rng([6, seed])
@@ -150,7 +148,7 @@ def test_a_slow_turn_that_lasts_is_followed(slow, wheels):
     errors = []
     for seed in range(2):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
-        found = follow(time, rate, wheels=None if wheels is None else (true > 0.0).tolist())
+        found = follow(time, rate, wheels=wheels and true > 0.0)
         errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
         assert np.abs(
             np.diff(found.heading)).max() < 10.0 * DEGREE * INTERVAL, ('the heading jumped')
@@ -214,11 +212,9 @@ def test_false_alarms_are_as_rare_as_stated():
 def test_what_turns_a_robot_whose_wheels_stand_is_a_turn_and_the_deviation_has_a_bias(
         change, hindsight):
     """A floor that turns, wheels that creep; or a motor whose vibration changes the bias."""
-    noise, known = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
     motion = constant_rate_motion([(20, 0), (40, change), (20, 0), (3, 40), (20, 0)])
-    time, true, heading, rate = gyro(motion, np.random.default_rng(13), noise, bias=0.0)
-    found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
-                  TrackerSettings(), (np.abs(true) > 2.0 * DEGREE).tolist(), hindsight)
+    time, true, heading, rate = gyro(motion, np.random.default_rng(13), QUIET, bias=0.0)
+    found = follow(time, rate, None, np.abs(true) > 2.0 * DEGREE, QUIET, CERTAIN, hindsight)
     late = time > 62.0
     assert np.abs(found.heading - heading)[late].max() < 0.5 * DEGREE
     of_bias = (found.heading - (heading - np.minimum(40.0, time - 20.0) * change * DEGREE))[late]
@@ -226,14 +222,10 @@ def test_what_turns_a_robot_whose_wheels_stand_is_a_turn_and_the_deviation_has_a
 
 
 def test_a_bias_that_drifts_or_has_jumped_at_the_next_stop_is_found_by_wheels():
-    noise, known = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
-    parts = [(300, 0), (4, 45), (20, 0), (4, -30), (20, 0)]
-    motion = constant_rate_motion(parts)
+    motion = constant_rate_motion([(300, 0), (4, 45), (20, 0), (4, -30), (20, 0)])
     for bias in (lambda t: 0.2 * np.minimum(t / 300.0, 1.0), lambda t: 0.3 * (t > 290.0)):
-        time, true, heading, rate = gyro(motion, np.random.default_rng(3), noise, bias=0.0)
-        rate = rate + DEGREE * bias(time)
-        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
-                      TrackerSettings(), (true != 0.0).tolist(), False)
+        time, true, heading, rate = gyro(motion, np.random.default_rng(3), QUIET, bias=0.0)
+        found = follow(time, rate + DEGREE * bias(time), None, true != 0.0, QUIET, CERTAIN)
         error = found.heading - heading
         assert found.resting[-1] and abs(error[-1]) < 6.0 * DEGREE
         # the bias at the end of a drift is not yet known
@@ -248,8 +240,7 @@ def test_short_rests_that_wheels_show_measure_the_bias_of_another_power_on(bias,
     errors = []
     for seed in range(4):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
-        found = follow(time, rate + bias * DEGREE, wheels=(true != 0.0).tolist(),
-                       hindsight=hindsight)
+        found = follow(time, rate + bias * DEGREE, wheels=true != 0.0, hindsight=hindsight)
         errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
         assert found.variance[-1] < (2.0 * DEGREE) ** 2
     assert np.abs(errors).max() < 4.0, errors
@@ -259,15 +250,13 @@ def test_short_rests_that_wheels_show_measure_the_bias_of_another_power_on(bias,
     (2.0, 1.0, 0.07), (10.0, 12.0, 0.5)], ids=['short', 'fan'])
 def test_a_small_bias_of_another_power_on_is_found_by_short_rests_and_while_a_fan_runs(
         rest, noise_factor, bias):
-    """0.07 deg/s is not shown by a window of 0.5 s alone; the drive begins in motion."""
     noise, known = Noise(1.4e-4, 0.0, 3e-7), np.diag([1e-6, (0.004 * DEGREE) ** 2])
     motion = constant_rate_motion([(10, 3), (2, 45), (rest, 0), (10, -4), (2, -45), (rest, 0)] * 5)
     errors = []
     for seed in range(4):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed), Noise(
             noise_factor * noise.angle_random_walk), bias=-bias * DEGREE)
-        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
-                      TrackerSettings(), (true != 0.0).tolist(), False)
+        found = follow(time, rate, None, true != 0.0, noise, known)
         errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
         assert found.variance[-1] < (5.0 * DEGREE) ** 2
     assert np.abs(errors).max() < 4.0, errors
@@ -277,16 +266,14 @@ def test_a_small_bias_of_another_power_on_is_found_by_short_rests_and_while_a_fa
 @pytest.mark.parametrize('creep', [0.4, 2.0])
 def test_a_body_that_creeps_on_after_its_wheels_have_stopped_has_no_other_bias(creep, hindsight):
     """For 0.8 s after each way; the rate is no bias, as no other standstill repeats it."""
-    noise, known = Noise(2e-5), np.diag([1e-8, (0.001 * DEGREE) ** 2])
     parts = [(60, 0.5), (3, 30), (0.8, creep), (8, 0), (3, -40), (20, 0.3), (0.8, -0.7 * creep),
              (8, 0)]
     motion = constant_rate_motion(parts)
     moving = np.concatenate([np.full(round(duration / 0.01), abs(rate) not in (
         0.0, creep, 0.7 * creep)) for duration, rate in parts])
-    time, _, heading, rate = gyro(motion, np.random.default_rng(3), noise, bias=0.0)
-    wheels = moving[np.minimum(np.rint(time / 0.01).astype(int), len(moving) - 1)].tolist()
-    found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, known,
-                  TrackerSettings(), wheels, hindsight)
+    time, _, heading, rate = gyro(motion, np.random.default_rng(3), QUIET, bias=0.0)
+    wheels = moving[np.minimum(np.rint(time / 0.01).astype(int), len(moving) - 1)]
+    found = follow(time, rate, None, wheels, QUIET, CERTAIN, hindsight)
     assert abs(found.heading[-1] - heading[-1]) < 0.5 * DEGREE
     assert found.variance[-1] < (1.0 * DEGREE) ** 2
 
@@ -307,20 +294,6 @@ def test_wheels_that_are_known_during_a_rest_widen_the_bias_of_the_calibration()
         tracker.add(INTERVAL * index, off, np.array([0.0, -1.0]),
                     None if index < round(10.0 / INTERVAL) else False)
     assert tracker.is_resting and tracker.bias[0] == pytest.approx(off, abs=0.1 * off)
-
-
-def test_rests_at_one_rate_near_that_of_the_calibration_are_its_bias():
-    """Off by 0.03 deg/s, without wheels: 6 deg over the drive."""
-    noise, known = Noise(1e-4, 1e-6), np.diag([1e-8, (0.005 * DEGREE) ** 2])
-    motion = constant_rate_motion([(15, 0), (3, 45), (15, 0), (3, -60)] * 6 + [(15, 0)])
-    for seed in range(4):
-        time, _, heading, rate = gyro(motion, np.random.default_rng(seed), noise, bias=0.0)
-        found = track(time, rate + 0.03 * DEGREE, -np.vstack([rate, np.ones(len(rate))]), noise,
-                      known, TrackerSettings(), None, False)
-        late = time > 100.0
-        error = np.abs(found.heading - heading)[late]
-        assert error[-1] < 1.0 * DEGREE
-        assert (error < 4.0 * np.sqrt(found.variance[late])).all()
 
 
 def test_hindsight_does_not_reach_over_a_gap():
@@ -369,8 +342,6 @@ def test_calibrations_in_one_instant_of_a_rest_leave_finite_states():
     assert all(np.isfinite(state.mean).all() for _, state in tracker.recalibrations)
 
 
-# how good, and how true
-
 def random_drive(generator, duration):
     """Return a drive of rests, some too short to notice, fast and slow turns."""
     stretches, time = [(5.0, 0.0)], 5.0
@@ -388,7 +359,6 @@ def random_drive(generator, duration):
 
 @pytest.mark.parametrize('drives', [7, pytest.param(16, marks=pytest.mark.evidence)])
 def test_errors_are_as_large_as_stated_and_hindsight_and_rests_help(drives):
-    """Statistics of many drives are in the benchmark; here a few show no gross error."""
     squares, sizes = [], []
     for seed in range(drives):
         generator = np.random.default_rng(seed)
@@ -406,7 +376,6 @@ def test_errors_are_as_large_as_stated_and_hindsight_and_rests_help(drives):
 
 
 def test_the_scatter_of_a_rest_has_the_likelihood_of_its_joint_distribution():
-    """Means over 1 s: bias, a process of first order, and white noise."""
     count, white, bias_variance = 12, 1e-4, 4e-5
     rates = np.random.default_rng(5).normal(0.0, 0.03, count)
     state, likelihood = np.array([[0.0], [0.01], [0.0], [0.0], [bias_variance]]), 0.0
@@ -484,18 +453,6 @@ def test_a_log_that_begins_with_a_slow_turn_ends_with_the_right_heading(seed):
     assert abs(error[-1]) < 3.0 * deviation[-1] < 10.0
 
 
-def test_with_hindsight_the_turn_is_in_the_heading_from_the_begin_on():
-    error, deviation = followed(TURN_FIRST, hindsight=True)
-    assert (np.abs(error) <= 3.0 * deviation).all()
-    assert np.abs(error).max() < 2.0
-
-
-def test_a_turn_at_the_limit_of_the_prior_counts_once():
-    """With the bias it is at 6.1 sigma, which its steps cross: parts would confirm each other."""
-    error, deviation = followed([(10, 0), (60, -2.854), (20, 9.0), (20, -7.0)])
-    assert np.abs(error).max() < 2.0 and (np.abs(error) <= 3.0 * deviation).all()
-
-
 @pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
 def test_the_deviation_holds_where_a_vehicle_never_rests_and_each_way_bends(hindsight):
     """A bend within the deviation of the bias passes for a rest; others show that it is none."""
@@ -544,13 +501,42 @@ def test_rests_that_agree_show_that_a_vehicle_rests():
     assert deviations[0] > deviations[1] > deviations[2] and deviations[2] < 1.05 * 0.451
 
 
-@pytest.mark.parametrize('way', [5 * [(4.0, 0.6), (1.0, 0.9)], [
-    part for rate in np.linspace(-2.1, 2.1, 22) for part in ((3.0, rate), (2.0, 20.0))]],
-    ids=['pieces of a bend', 'more bends than in memory'])
-def test_bends_do_not_replace_the_bias_of_a_rest_before_them(way):
-    """Pieces of one bend do not confirm each other; the first rest is the longest."""
-    error, deviation = followed([(13.0, 0.0), *way, (4.0, 20.0), (5.0, 0.0), (4.0, -20.0)])
-    assert (np.abs(error) <= 3.0 * deviation).all() and deviation[-1] < 3.0
+KNOWN_REST, LAST_REST = (13.0, 0.0), [(4.0, 20.0), (5.0, 0.0), (4.0, -20.0)]
+#: Parts of a drive, whether hindsight is used, largest error and deviation at the end, deg.
+TURNS = {
+    'a turn first': (TURN_FIRST, True, 2.0, np.inf),
+    # with the bias it is at 6.1 sigma, which its steps cross: parts would confirm each other
+    'at the limit of the prior': (
+        [(10, 0), (60, -2.854), (20, 9.0), (20, -7.0)], False, 2.0, np.inf),
+    'pieces of a bend': (
+        [KNOWN_REST, *5 * [(4.0, 0.6), (1.0, 0.9)], *LAST_REST], False, np.inf, 3.0),
+    'more bends than in memory': ([KNOWN_REST, *(
+        part for rate in np.linspace(-2.1, 2.1, 22) for part in ((3.0, rate), (2.0, 20.0))),
+        *LAST_REST], False, np.inf, 3.0)}
+
+
+@pytest.mark.parametrize('parts, hindsight, largest, doubt', TURNS.values(), ids=TURNS)
+def test_steady_turns_do_not_replace_the_bias_of_a_rest(parts, hindsight, largest, doubt):
+    error, deviation = followed(parts, hindsight=hindsight)
+    assert (np.abs(error) <= 3.0 * deviation).all()
+    assert np.abs(error).max() < largest and deviation[-1] < doubt
+
+
+#: Parts of a drive, prior of the bias, deg/s, noise, and largest error, deg.
+CALIBRATED = {
+    'never confirmed': ([(8.0, 30.0), (60.0, 0.15), (8.0, 30.0), (10.0, 0.0), (8.0, 30.0),
+                         (10.0, 0.0)], 0.002, NOISE, 1.0),
+    # turns may be faster than 0.5 deg/s, thousands of times the noise of a fine gyro
+    **{f'{rate} deg/s': ([(4.0, 30.0), (20.0, rate), (4.0, 30.0), (10.0, 0.0)], 0.0005,
+                         FINE_NOISE, 0.1) for rate in (0.6, 1.9, -4.7)}}
+
+
+@pytest.mark.parametrize('parts, bias, noise, largest', CALIBRATED.values(), ids=CALIBRATED)
+def test_a_steady_turn_does_not_replace_the_bias_of_a_calibration(parts, bias, noise, largest):
+    error, deviation = followed(parts, bias, true_bias=0.0, noise=noise)
+    assert np.abs(error).max() < largest
+    if noise is NOISE:  # the next rests end the doubt
+        assert deviation[round(70 * RATE)] > 1.0 > deviation[-1]
 
 
 @pytest.mark.parametrize('hindsight', [False, True], ids=['live', 'hindsight'])
@@ -562,34 +548,3 @@ def test_rests_replace_a_bias_that_is_not_that_of_the_calibration(off, hindsight
         0.002, hindsight, true_bias=off)
     after = slice(round((60 if abs(off) > 0.2 else 20) * RATE), None)  # rests, or the first one
     assert (np.abs(error[after]) <= 4.0 * deviation[after]).all() and deviation[-1] < 1.0
-
-
-def test_a_steady_turn_does_not_replace_the_bias_of_a_calibration():
-    """It is never confirmed; rests at the bias of the calibration end the doubt."""
-    error, deviation = followed(
-        [(8.0, 30.0), (60.0, 0.15), (8.0, 30.0), (10.0, 0.0), (8.0, 30.0), (10.0, 0.0)], 0.002,
-        true_bias=0.0)
-    assert deviation[round(70 * RATE)] > 1.0 > deviation[-1]
-    assert np.abs(error).max() < 1.0
-
-
-@pytest.mark.parametrize('rate', [0.6, 1.9, -4.7])
-def test_a_steady_turn_of_a_fine_gyro_does_not_replace_the_bias_of_its_calibration(rate):
-    """Turns may be faster than 0.5 deg/s, thousands of times its noise."""
-    error, _ = followed([(4.0, 30.0), (20.0, rate), (4.0, 30.0), (10.0, 0.0)], 0.0005,
-                        true_bias=0.0, noise=FINE_NOISE)
-    assert np.abs(error).max() < 0.1
-
-
-def test_a_user_is_warned_of_the_ambiguity():
-    model = GyroModel(noise=NOISE)
-    assumptions = Assumptions(bias=0.5 * DEGREE, bias_temperature_coefficient=0.0)
-    one = HeadingEstimator(model, BiasTable(model), assumptions, TrackerSettings(), 1.7e9)
-    time, output, _ = simulated(TURN_FIRST)
-    messages = []
-    for at, value in zip(time, output):
-        one.add(at, value, 1.7e9)
-        messages.append(one.bias_message)
-    assert messages[round(10 * RATE)] == ''
-    assert 'several steady rates' in messages[round(38 * RATE)]
-    assert messages[-1] == ''

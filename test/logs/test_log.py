@@ -16,7 +16,10 @@ import math
 
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.logs.log import (
-    DEGREE, Log, log_from_table, LogError, read_log, select_rows, unwrap_heading, write_log)
+    DataRefused, DEGREE, Log, log_from_table, LogError, read_log, select_rows, unwrap_heading,
+    write_log)
+from gyro_calibration.logs.quality import (
+    quantization_step, refuse_saturated, white_noise_deviation)
 from gyro_calibration.logs.stamps import fit_stamp_grid
 import numpy as np
 import pytest
@@ -108,15 +111,6 @@ def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch
                    'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
     with pytest.raises(LogError, match='more than 100 numbers.*; split it'):
         read_log(path)
-
-
-def test_texts_of_a_log_are_read_back_whatever_ends_their_lines(tmp_path):
-    path = written(tmp_path, '# a\ngyro_dps,place,"a\rb"\n1,"a\rb",c\n2,"a\r\nb","d"\n')
-    log = read_log(path)
-    write_log(path, Log(output=log.output, notes=('one\rtwo\nthree',), others=log.others))
-    again = read_log(path)
-    assert (again.notes == ('one two three',)
-            and again.others == {'place': ('a\nb', 'a\nb'), 'a\nb': ('c', 'd')})
 
 
 def test_a_lost_value_is_nan_or_an_empty_cell(tmp_path):
@@ -405,3 +399,44 @@ def test_an_interval_that_changes_over_the_log_is_no_burst(change):
     stamps = fit_stamp_grid(time)
     assert stamps.has_bursts == (change == 0.0) == bool(stamps.burst_remarks)
     assert change or stamps.max_deviation < 0.04
+
+
+# Steps and limits of outputs whose truth is known
+
+def coarse_turns(generator, senses, noise):
+    """Return an output at 25 Hz of constant turns between rests, with ramps of 1 s, rad/s."""
+    rest, ramp = np.zeros(100), np.linspace(0.0, 1.0, 26)
+    parts = [np.concatenate([rest, rate * ramp, np.full(250, rate), rate * ramp[::-1]])
+             for rate in generator.uniform(40.0, 90.0) * np.array(senses)]
+    rate = np.concatenate([*parts, rest]) + generator.normal(0.0, 0.5)
+    return DEGREE * (rate + noise * generator.standard_normal(len(rate)))
+
+
+def test_the_white_noise_of_samples_that_have_no_neighbours_is_known():
+    values = np.full(3000, np.nan)
+    values[::3] = np.random.default_rng(0).standard_normal(1000)
+    assert white_noise_deviation(values) == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize('senses', [[1.0], [-1.0], [1.0, -1.0]])
+@pytest.mark.parametrize('step', [0.06, 0.5, 1.0])
+def test_ramps_and_rests_do_not_hide_the_step_of_an_output(senses, step):
+    """Ramps advance by nearly equal amounts, and most samples have one of a few codes."""
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        output = coarse_turns(generator, senses, generator.uniform(0.0, 0.5) * step)
+        rounded = step * DEGREE * np.round(output / (step * DEGREE))
+        assert quantization_step(rounded) / DEGREE == pytest.approx(step, rel=1e-6)
+
+
+@pytest.mark.parametrize('senses', [[1.0], [-1.0], [1.0, -1.0]])
+def test_a_coarse_turn_is_not_saturated_and_a_clipped_one_is(senses):
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        output = coarse_turns(generator, senses, 0.05)
+        for step in (0.5, 1.0):
+            refuse_saturated(step * DEGREE * np.round(output / (step * DEGREE)))
+        limit = generator.uniform(0.5, 0.95) * np.abs(output).max()
+        with pytest.raises(DataRefused, match=f'limit of {limit / DEGREE:.4g}'.replace(
+                'of ', 'of -?')):
+            refuse_saturated(np.clip(output, -limit, limit))

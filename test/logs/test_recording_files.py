@@ -46,8 +46,6 @@ def gyro(make, time, rate, **how):
     return [(at, make.imu(at, value, **how)) for at, value in zip(time, rate, strict=True)]
 
 
-# Storage
-
 @pytest.mark.parametrize('kind', KINDS)
 def test_a_recording_holds_what_the_log_held(data, tmp_path, kind):
     log = select_rows(read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz'), slice(800))
@@ -222,8 +220,6 @@ def test_several_files_of_a_folder_are_one_recording(make, tmp_path, turning):
     np.testing.assert_array_equal(read_recording(tmp_path / 'whole').output, rate[:1800])
 
 
-# Torn
-
 @pytest.mark.parametrize('kind', ['mcap', 'mcap-chunks'])
 def test_a_torn_mcap_file_is_read_up_to_the_tear(make, tmp_path, kind):
     # Enough for several chunks, the last of which is torn in its middle.
@@ -277,8 +273,6 @@ def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
     assert len(read_recording(tmp_path / 'dead')) == 300
 
 
-# Hostile
-
 @pytest.mark.parametrize('name', ['zstd', 'lz4'])
 def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
     bomb = {
@@ -319,8 +313,6 @@ def test_only_recordings_are_taken_for_recordings_and_one_that_is_not_there_is_n
             read_recording(tmp_path / name)
     assert not list(tmp_path.iterdir())
 
-
-# Topics
 
 def test_of_several_gyros_one_has_to_be_named(make, run, tmp_path, turning):
     time, rate, _ = turning
@@ -365,8 +357,6 @@ def test_what_is_no_log_of_a_gyro_is_refused(make, tmp_path, topics, chosen, wor
     with pytest.raises(LogError, match=words):
         read_recording(path, chosen)
 
-
-# Times
 
 def test_times_are_those_of_the_headers(make, tmp_path):
     time = np.arange(300) / RATE
@@ -413,8 +403,6 @@ def test_stamps_that_say_nothing_are_refused_unless_the_rate_is_given(make, tmp_
     np.testing.assert_array_equal(log.time, time)
 
 
-# Temperature
-
 def test_temperatures_lie_on_the_line_between_readings_and_long_gaps_are_reported(make, tmp_path):
     time = np.arange(0.0, 100.0, 0.1)
     imu = gyro(make, time, time)
@@ -441,8 +429,6 @@ def test_of_several_temperatures_the_one_named_like_the_gyro_is_taken(make, tmp_
     np.testing.assert_array_equal(
         read_recording(path, Topics(temperature='battery/temperature')).temperature, 5.0)
 
-
-# References
 
 def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
     time, rate, heading = turning
@@ -485,8 +471,6 @@ def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path,
     np.testing.assert_allclose(log.reference_heading[~lost], heading[~lost], atol=1e-9)
     assert any('more than half a turn' in note for note in log.notes)
 
-
-# Verbs
 
 @pytest.mark.parametrize('verb, motion', [
     ('fit', 'robot'), ('self-calibrate', 'calibration'), ('allan', 'rest'), ('diagnose', 'rest'),

@@ -334,7 +334,6 @@ node.spin(Hanging(), stop)
 
 
 def test_a_node_that_cannot_end_is_killed(ros_domain):
-    """As one does that Fast DDS holds for ever."""
     began = time.monotonic()
     ended = subprocess.run([sys.executable, '-c', _HANGING], stderr=subprocess.PIPE, text=True,
                            timeout=25.0)

@@ -51,8 +51,6 @@ def test_layouts_show_topics_fields_and_statuses_that_exist():
                 message = getattr(message, 'z' if part == 'yaw' else part)
 
 
-# robot_localization
-
 STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw',
          'ax', 'ay', 'az']
 #: Names in the documentation of its state estimation nodes (for a sensor, what follows its name).
@@ -72,8 +70,6 @@ def test_the_example_has_parameters_that_exist_and_fuses_one_thing_of_a_gyro_and
     for sensor, fused in (('imu0', ['vyaw']), ('odom0', ['vx', 'vy'])):
         assert parameters[f'{sensor}_config'] == [name in fused for name in STATE]
 
-
-# Launch
 
 def launch_arguments():
     """Return the tables of gyro.launch.py by name: argument -> parameter or default, text."""

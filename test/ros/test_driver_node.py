@@ -42,8 +42,6 @@ KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temper
         'last_error', 'period_ms', 'nominal_period_ms'}
 
 
-# Parameters
-
 @pytest.mark.parametrize(('given', 'sentence'), [
     ({'protocol': 'bogus'},
      "protocol 'bogus' is not known: choose one of csv, .*, or auto to find it by listening"),
@@ -61,8 +59,6 @@ def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
         Connection(values.port, values.protocol, values.baud, settings_from_parameters(values))
     assert len(str(refused.value).splitlines()) == 1
 
-
-# Messages
 
 def received(sample, kind=Imu, variance=1e-4):
     """Return a message of a sample as a subscriber receives it."""
@@ -99,8 +95,6 @@ def test_the_mean_of_ten_samples_has_a_tenth_of_the_variance_of_one(hold_node):
     assert imu.angular_velocity_covariance[8] == pytest.approx(1e-5)
     assert imu.header.stamp.nanosec == 250_000_000
 
-
-# Diagnostics
 
 def reported(world, protocol, given=None,
              monitored=lambda report, chunk: report.add(chunk.samples)):

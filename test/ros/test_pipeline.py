@@ -46,8 +46,6 @@ def headings(found):
     return np.array([each.heading for each in found])
 
 
-# Integration
-
 def test_raw_rates_are_integrated_by_the_trapezoid_rule_without_wrapping_until_a_reset(tmp_path):
     rig = Rig(tmp_path, model='', stationary_threshold=0.0)
     rates = 3.0 + 0.5 * np.sin(np.arange(300) * 0.02)
@@ -244,7 +242,6 @@ def test_a_gyro_whose_first_zeros_end_in_a_turn_has_missed_a_part_of_it(
 
 
 def test_the_error_of_a_coarse_output_is_in_the_variance(tmp_path):
-    """Turns at constant rates, each of which is rounded to one code of 0.5 deg/s."""
     step, errors = 0.5 * DEGREE, []
     for part in range(8):
         rig = Rig(_folder(tmp_path, str(part)), model=CERTAIN.replace('0.01}', '0.0}'))
@@ -326,8 +323,6 @@ def test_a_turn_while_one_value_is_held_for_a_short_time_is_in_the_variance(
     error, deviation = rig.error()
     assert abs(error) < 4.0 * deviation < 1.0
 
-
-# Rest
 
 def test_the_threshold_filter_deletes_rates_at_rest_unless_it_is_switched_off(tmp_path):
     rig = Rig(tmp_path, model='')
@@ -460,7 +455,6 @@ def test_velocities_of_the_last_second_show_whether_the_robot_moves(received, no
 
 @pytest.mark.parametrize('shift', [-0.3, -0.005, 0.3])
 def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, shift):
-    """A second publisher whose samples differ in stamp; both look like one stream."""
     rig = rested(tmp_path, stationary_method='none')
     rig.robot.command(0.7)
     for _ in range(500):
@@ -522,7 +516,6 @@ def test_every_other_sample_of_another_gyro_is_a_warning_and_the_heading_claims_
 
 
 def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
-    """As of a relay that joins two topics: the stamps increase, and the graph shows one node."""
     rig = Rig(tmp_path, model='')
     for _ in range(100):
         rig.feed([0.5])
@@ -604,8 +597,6 @@ def test_a_stamp_that_is_none_of_ros_time_is_refused(tmp_path, stamp):
     assert rig.feed([0.5])[0].heading == pytest.approx(0.05, abs=1e-9)
 
 
-# Temperature
-
 THERMAL = ('effects: {bias: {bias: 0.01}, bias_temperature: {bias_temperature: 2.0e-3}}\n'
            'reference_temperature: 25.0\nnoise: {angle_random_walk: 5.0e-4}\n')
 
@@ -623,8 +614,6 @@ def test_a_temperature_that_leaps_is_used_where_it_stays_and_is_possible(tmp_pat
     assert rig.pipeline.estimator.temperature == used
     assert rig.journal.counts['refused_temperatures'] >= given.count(60.0)
 
-
-# Clocks
 
 @pytest.mark.parametrize(('stamps', 'steady', 'beginnings'), [
     (9.0, 9.0, 1), (12.0, 12.0, 2), (0.0, 15.0, 1), (2.0, 15.0, 1)],
@@ -670,8 +659,6 @@ def test_stamps_that_leap_by_less_than_a_gap_are_in_the_variance(tmp_path):
     assert 0.5 < off < 3.0 * math.sqrt(last.heading_variance), off
 
 
-# The monitor of noise and bias
-
 @pytest.mark.parametrize('moved, parameters', [(0.15 * DEGREE, {}), (1.0 * DEGREE, {}),
                                                (0.15 * DEGREE, {'stationary_threshold': 0.0})],
                          ids=['below the threshold', 'above the threshold', 'without a threshold'])
@@ -701,8 +688,6 @@ def test_an_even_turn_of_a_circle_is_no_change_of_the_bias(tmp_path, rate, odome
     assert rig.pipeline.monitor.examined_count > 1
 
 
-# Effects with a past
-
 PLAIN = {'bias': {'bias': 0.002}, 'scale_factor_error': {'scale_factor_error': 0.02},
          'bias_temperature': {'bias_temperature': 2e-4, 'reference_temperature': 25.0}}
 PAST = {'thermal_lag': {'thermal_lag': -8e-4, 'time_constant': 40.0},
@@ -721,8 +706,6 @@ def test_a_time_offset_moves_the_published_stamps(tmp_path):
     found = rig.feed(np.full(3, 0.5))
     assert [rig.fed - each.stamp for each in found] == [40_000_000, 30_000_000, 20_000_000]
 
-
-# What is reported
 
 @pytest.fixture
 def reported():
@@ -853,8 +836,6 @@ def test_every_value_has_a_key_in_snake_case_that_the_documents_name(tmp_path, r
     assert [key for key in values if not re.fullmatch('[a-z0-9_]+', key)] == []
     assert [key for key in values if f'`{key}`' not in page] == []
 
-
-# Any values
 
 finite = st.floats(allow_nan=True, allow_infinity=True)
 event = st.one_of(

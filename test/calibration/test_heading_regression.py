@@ -8,23 +8,28 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Calibration against a course over ground: late, smoothed, lost, and with bursts of errors."""
+"""Headings as references: a course that is late and lost, an oblique axis, the noise grid."""
 
 from dataclasses import replace
 import math
+import re
 
+from chance import fewest, seeded
 from diagnosed import established
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.heading_regression import fit_spans
+from gyro_calibration.calibration.noise_grid import (
+    BandedNoise, fit_noise_grid, heading_noise, SharedNoise)
 from gyro_calibration.calibration.reference_kind import is_course
-from gyro_calibration.calibration.reference_noise import (
-    find_rests, heading_difference, keep_own_instants)
+from gyro_calibration.calibration.reference_noise import heading_difference, keep_own_instants
 from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.logs.quality import bridge_gaps
+from gyro_calibration.diagnosis.words import terminal_lines
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, log_from_table, read_log
+from gyro_calibration.logs.quality import bridge_gaps, cross_rotation
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 SCALE, BIAS = 1.01, 0.4 * DEGREE
 
@@ -186,30 +191,6 @@ def test_wheels_at_another_distance_are_no_slip(track):
     assert 'beyond what gyros of the technology mems have' in ' '.join(found.remarks)
 
 
-def short_odometry(seed, track, turns, slip):
-    """Return 90 s with turns of 90 deg, beside wheels whose heading walks by `slip` in each."""
-    generator, time = np.random.default_rng(seed), np.arange(0.0, 90.0, 0.02)
-    rate, is_turning = 0.2 * DEGREE * np.sin(time), np.zeros(len(time), dtype=bool)
-    for begin in np.linspace(5.0, 80.0, turns):
-        inside = (time >= begin) & (time < begin + 4.0)
-        rate[inside] += generator.choice([-1.0, 1.0]) * 45.0 * DEGREE * np.sin(
-            np.pi * (time[inside] - begin) / 4.0) ** 2
-        is_turning |= inside
-    slips = slip / math.sqrt(200.0) * is_turning * generator.standard_normal(len(time))
-    return Log(time=time, output=SCALE * rate + BIAS + 1e-3 * generator.standard_normal(len(time)),
-               reference_heading=np.cumsum(track * 0.02 * rate + slips))
-
-
-def test_noise_of_the_gyro_is_no_turn_of_a_course():
-    """It is in the observations too, so that a scale factor error of 1 would cancel it."""
-    spans = lay_out_spans(short_odometry(0, 1.0, 5, 0.0))
-    count = len(spans.heading) - 1
-    straight = replace(spans, heading=np.zeros(count + 1))
-    turned, none = (each.base_columns()[:count, 0] for each in (spans, straight))
-    assert np.abs(turned).max() > 45.0 * DEGREE
-    assert (none == 0.0).all() and (straight.angles == 0.0).all()
-
-
 def test_a_motion_capture_that_loses_its_markers_is_no_course():
     """It errs by less than a course, and by more than the gyro, as where its axes are oblique."""
     generator = np.random.default_rng(4)
@@ -241,13 +222,172 @@ def test_the_errors_of_a_reference_at_an_uneven_part_of_the_samples_are_found():
     assert heading_difference(log).total_walk == pytest.approx(0.2 * DEGREE, rel=0.2)
 
 
-def test_rests_are_found_beside_filtered_noise():
-    """Single seconds are far quieter than others by chance."""
-    time = np.arange(15_000) / 50.0
-    moves = time % 30.0 > 10.0
-    turned = np.where(moves, 0.3 * np.sin(1.3 * time), 0.0)
-    noise = np.random.default_rng(10).standard_normal(len(time))
-    slow = lfilter([0.1], [1.0, -0.9], noise)
-    rests, stands = find_rests(time, turned + 1e-3 * slow, np.cumsum(turned))
-    assert len(rests) == 10 and stands.all()
-    assert np.diff(time[rests]).sum() == pytest.approx(100.0, abs=10.0)
+# A sensor that is turned about three axes beside a motion capture
+
+OBLIQUE_SCALE, OBLIQUE_BIAS = 0.004, 0.2 * DEGREE
+
+
+def tumbling(seed, misalignment=(0.0, 0.0), sizes=(70.0, 40.0, 40.0), noise=0.03):
+    """
+    Return the table of a log of 120 s at 100 Hz, and the rates of the sensor, rad/s, (n, 3).
+
+    Yaw, pitch and roll are sums of sines of `sizes`, deg. The gyro is along z and has the
+    misalignment, rad, of the rates about x and y. The attitude has noise, deg, and is lost twice.
+    """
+    generator = np.random.default_rng(seed)
+    time = 0.01 * np.arange(12000)
+    still = np.clip(np.minimum(time - 5.0, 115.0 - time), 0.0, 1.0)
+    omega = 2.0 * np.pi * generator.uniform(0.05, 0.6, (3, 4))
+    phase = np.cumsum(still)[:, None, None] * 0.01 * omega
+    shift = generator.uniform(0.0, 2.0 * np.pi, omega.shape)
+    yaw, pitch, roll = (angles := np.sin(phase + shift).sum(axis=2) * 0.5 * DEGREE * sizes).T
+    slopes = (omega * np.cos(phase + shift)).sum(axis=2) * 0.5 * DEGREE * sizes
+    by_yaw, by_pitch, by_roll = (slopes * still[:, None]).T
+    rates = np.column_stack([
+        by_roll - by_yaw * np.sin(pitch),
+        by_pitch * np.cos(roll) + by_yaw * np.sin(roll) * np.cos(pitch),
+        by_yaw * np.cos(roll) * np.cos(pitch) - by_pitch * np.sin(roll)])
+    attitude = Rotation.from_euler('ZYX', angles) * Rotation.from_rotvec(
+        noise * DEGREE * generator.standard_normal((len(time), 3)))
+    quaternion = attitude.as_quat()
+    quaternion[[*range(3000, 3020), *range(8000, 8010)]] = np.nan
+    white = 0.05 * DEGREE * generator.standard_normal(len(time))
+    output = ((1.0 + OBLIQUE_SCALE) * rates[:, 2] + OBLIQUE_BIAS + rates[:, :2] @ misalignment
+              + white)
+    return {'time_s': time, 'gyro_rad_s': output,
+            **dict(zip(('qx', 'qy', 'qz', 'qw'), quaternion.T))}, rates
+
+
+def attitude_log(*given, **options):
+    return log_from_table(tumbling(*given, **options)[0], {'attitude': 'qw/qx/qy/qz'})
+
+
+def test_scale_and_bias_hold_beside_an_oblique_axis():
+    logs, source = 30, seeded('an oblique axis')
+    inside, axes = np.zeros(2, dtype=int), 0
+    for _ in range(logs):
+        misalignment = source.uniform(-0.7, 0.7, 2) * DEGREE
+        fit = calibrate_encoder(attitude_log(source.integers(2**32), misalignment)).fit
+        off = np.array([fit.scale_factor_error - OBLIQUE_SCALE, fit.bias - OBLIQUE_BIAS])
+        inside += np.abs(off) < 1.96 * np.sqrt(np.diag(fit.covariance))
+        axes += np.sum(np.abs(fit.misalignment - misalignment)
+                       < 1.96 * np.sqrt(np.diag(fit.misalignment_covariance)))
+    assert (inside >= fewest(logs, 0.9)).all() and axes >= fewest(2 * logs, 0.88)
+
+
+@pytest.mark.parametrize('method', [None, 'course'])
+def test_an_oblique_axis_is_stated_and_a_parallel_one_is_not(method):
+    for seed, misalignment in ((1, (0.0, 0.0)), (2, (0.5 * DEGREE, -0.3 * DEGREE))):
+        found = calibrate_encoder(attitude_log(seed, misalignment), method)
+        stated = [each for each in found.remarks if 'the axis of the gyro is oblique' in each]
+        assert len(stated) == any(misalignment)
+        assert not stated or re.search(r'by 0\.58\d \+- 0\.0\d+ deg', stated[0]), stated
+        assert any('about the axis of the attitude' in each for each in found.remarks)
+        assert found.method == (method or 'likelihood')
+
+
+def test_rotations_about_other_axes_are_no_noise_of_the_reference():
+    log = attitude_log(3, (0.01, 0.01), sizes=(20.0, 90.0, 90.0))
+    without = replace(log, cross_axis_1=None)
+    least, most = (heading_difference(each).total_walk for each in (log, without))
+    assert most > 0.5 * DEGREE > 4.0 * least
+
+
+def test_a_planar_attitude_gives_the_answers_of_its_heading():
+    table, rates = tumbling(4, noise=0.0)
+    turned = np.cumsum(rates[:, 2]) * 0.01
+    noise = 1e-3 * np.random.default_rng(4).standard_normal(len(turned))
+    half = 0.5 * (turned + noise)
+    planar = log_from_table(table | {'qw': np.cos(half), 'qx': 0.0 * half, 'qy': 0.0 * half,
+                                     'qz': np.sin(half)}, {'attitude': 'qw/qx/qy/qz'})
+    alone = replace(planar, cross_axis_1=None, cross_axis_2=None)
+    # a wobble that the gyro could not show is no rotation either
+    wobble = 0.2 * DEGREE * np.sin(planar.time)
+    for log in (planar, replace(planar, cross_axis_1=wobble, cross_axis_2=wobble)):
+        assert cross_rotation(log).shape == (len(log), 0)
+        (fit, other), (spans, others) = zip(
+            *((calibrate_encoder(each).fit, fit_spans(lay_out_spans(each, 'motion_capture')))
+              for each in (log, alone)))
+        assert (fit.covariance == other.covariance).all() and fit.bias == other.bias
+        assert (spans.values == others.values).all()
+        assert (spans.covariance == others.covariance).all()
+
+
+def test_an_oblique_axis_is_named_as_such_and_nothing_else_is():
+    log = attitude_log(11, (0.4 * DEGREE, 0.3 * DEGREE))
+    found = diagnose([log], np.random.default_rng(0))
+    (finding,) = found.findings
+    size = finding.parameters['axis_misalignment']
+    assert finding.status == 'established' and 'one axis' in finding.remedy
+    assert size.interval[0] < 0.5 * DEGREE < size.interval[1] < 0.55 * DEGREE, size
+    assert 'axis_misalignment' not in {each.effect.name for each in found.model.terms}
+    assert found.reference.kind == 'motion_capture'
+    assert 'oblique' in '\n'.join(terminal_lines(found))
+
+
+def test_a_parallel_axis_is_not_named():
+    assert not diagnose([attitude_log(12)], np.random.default_rng(0)).findings
+
+
+def test_a_reference_without_an_attitude_cannot_show_an_oblique_axis():
+    log = attitude_log(13, (0.2 * DEGREE, 0.0))
+    alone = Log(time=log.time, output=log.output, reference_heading=log.reference_heading)
+    found = diagnose([alone], np.random.default_rng(0))
+    assert 'axis_misalignment' in found.cannot_show
+
+
+# The restricted likelihood over a grid of noise sizes
+
+def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
+    generator = np.random.default_rng(1)
+    n, q = 40, 3
+    columns, shared, observed = (generator.standard_normal((n, 2)),
+                                 generator.standard_normal((n, q)), generator.standard_normal(n))
+    parts = [BandedNoise('a', np.full(n, 2.0), np.full(n, -0.9), (0.5, 0.5)),
+             BandedNoise('b', np.linspace(1.0, 2.0, n), None, (1.5, 1.5))]
+    variance = np.array([1.0, 0.5, 0.1])
+    found = fit_noise_grid(observed, columns, parts, shared,
+                           [SharedNoise('c', variance, (2.0, 2.0))])
+    dense = 0.25 * (2.0 * np.eye(n) - 0.9 * np.eye(n, k=1)
+                    - 0.9 * np.eye(n, k=-1)) + 2.25 * np.diag(np.linspace(1.0, 2.0, n))
+    dense += shared @ np.diag(4.0 * variance) @ shared.T
+    inverse = np.linalg.inv(dense)
+    information = columns.T @ inverse @ columns
+    values = np.linalg.solve(information, columns.T @ inverse @ observed)
+    left = observed - columns @ values
+    wanted = -0.5 * (
+        np.linalg.slogdet(dense)[1] + np.linalg.slogdet(information)[1] + left @ inverse @ left)
+    assert found.log_evidence == pytest.approx(wanted, rel=1e-9)
+    np.testing.assert_allclose(found.values, values, rtol=1e-8)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-8)
+
+
+def test_a_size_far_from_the_points_of_the_first_grid_is_found():
+    """The first points are a factor of 18 apart."""
+    white = np.random.default_rng(5).standard_normal(400)
+    for size in np.geomspace(0.03, 0.6, 13):
+        found = fit_noise_grid(size * white, np.ones((400, 1)),
+                               [BandedNoise('size', np.ones(400), None, (1e-4, 10.0))])
+        assert found.size('size') == pytest.approx(size * white.std(ddof=1), rel=0.02)
+
+
+def test_too_few_observations_are_refused():
+    with pytest.raises(ValueError, match='2 observations do not determine 2 values'):
+        fit_noise_grid(np.zeros(2), np.eye(2), [BandedNoise('a', np.ones(2), None, (1.0, 1.0))])
+
+
+def test_a_span_that_the_gyro_does_not_cover_shows_nothing():
+    """Its points have errors of their own, whatever its observation would be."""
+    generator = np.random.default_rng(1)
+    time, is_measured = np.arange(0.0, 60.0, 0.5), np.ones(119, dtype=bool)
+    is_measured[60] = False
+    turned = np.diff(0.01 * time + 0.02 * generator.standard_normal(120))
+    turned[61] += 0.5  # an error of the point after it that would be one of the point before, too
+    columns = (np.diff(time) * is_measured)[:, None]
+    parts = heading_noise(time, np.zeros(120), is_measured=is_measured)
+    found = []
+    for observation in (0.0, 3.0):
+        turned[60] = observation
+        found.append(fit_noise_grid(turned, columns, [parts[0], parts[1], parts[3]]))
+    assert found[0].values == pytest.approx(found[1].values, rel=1e-3)
+    assert found[0].size('reference') == pytest.approx(found[1].size('reference'), rel=1e-3)
