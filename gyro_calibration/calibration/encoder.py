@@ -52,7 +52,7 @@ from gyro_calibration.logs.log import (
     Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_holes, quantization_step, refuse_dead,
-    robust_deviation, white_noise_deviation)
+    refuse_saturated, robust_deviation, white_noise_deviation)
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -126,6 +126,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
+        refuse_saturated(output)
         fit = fit_course(spans or lay_out_spans(log, technology=technology))
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
@@ -156,6 +157,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
                           '--from), or correct the stamps')
     refuse_one_speed(motion, limits)
     refuse_dead(output)
+    refuse_saturated(output)
     # the gyro's lag is about that of a filter of 20 ms; a heading without steps may be a mean over
     # 0.2 s
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
@@ -547,14 +549,14 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     """Calibrate by the dwells of logs, by their paths, or by the heading of one (`api.fit`)."""
     for log in logs.values():
         _refuse_own_reference(log)
-    chosen = {path: choose_reference(log) for path, log in logs.items()}
-    # the rate alone, where the gyro shows that the heading is wrong
-    alone = {path: each for path, (each, _) in chosen.items() if each.reference_heading is None}
-    logs, remarks = {**logs, **alone}, [each for path in alone for each in chosen[path][1]]
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
-    if method == 'dwells' or method is None and (others or any(
-            log.time is None or log.reference_rate is not None or log.reference_heading is None
-            for log in logs.values())):
+    tries_dwells = method == 'dwells' or method is None and (others or any(
+        log.time is None or log.reference_rate is not None or log.reference_heading is None
+        for log in logs.values()))
+    chosen = {path: choose_reference(log) for path, log in logs.items()}
+    logs = {path: log for path, (log, _) in chosen.items()}
+    remarks = sum((found for _, found in chosen.values()), [])
+    if tries_dwells:
         is_settled = effects or method or len(logs) > 1
         share, parts = MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE, []
         try:
@@ -583,13 +585,13 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         raise InputError(_HEADING_ALONE)
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
-    if log.reference_heading is not None:
-        return found
-    return replace(found, remarks=(
-        *remarks, 'the log has a reference rate, which is constant '
-        f'{_MIN_DWELLS - 1} times at most, or for up to {100.0 * FEW_DWELLS_SHARE:g} % of the '
-        'time; so the rate is integrated, and headings are compared. For other effects than bias '
-        'and scale factor error, hold each rate for some seconds', *found.remarks))
+    if log.reference_heading is None:
+        remarks.append(
+            f'the log has a reference rate, which is constant {_MIN_DWELLS - 1} times at most, or '
+            f'for up to {100.0 * FEW_DWELLS_SHARE:g} % of the time; so the rate is integrated, '
+            'and headings are compared. For other effects than bias and scale factor error, hold '
+            'each rate for some seconds')
+    return replace(found, remarks=(*remarks, *found.remarks))
 
 
 def _refuse_own_reference(log: Log) -> None:

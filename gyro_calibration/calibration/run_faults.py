@@ -144,7 +144,12 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float) -
     """Refuse a run that the motion does not explain at any offset that is allowed, s."""
     unexplained, scale, offset = fit_profile(run, motion, largest_offset)
     late, _, begin = fit_profile(run, motion, 0.6 * motion.duration)
-    if late <= MAX_UNEXPLAINED_SHARE < unexplained:
+    # a run that ended early may look like one that began in the middle of the motion
+    every = np.arange(0.0, motion.duration, run.edges[1] - run.edges[0])
+    shown, whole = (float(np.abs(angle).sum()) for angle in (
+        run.reference_angle(motion, begin), np.diff(motion.heading_at(every))))
+    if late <= MAX_UNEXPLAINED_SHARE < unexplained and shown > (
+            1.0 - MAX_UNEXPLAINED_SHARE) * whole:
         raise DataRefused(f'the gyro is {abs(begin):.1f} s '
                           f'{"behind" if begin > 0.0 else "ahead of"} the {motion.name}: begin '
                           f'with it, or correct the time of the {motion.name}')
@@ -155,7 +160,8 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float) -
     raise DataRefused(f'the {who} does not follow the {motion.name}, which explains '
                       f'{100.0 * max(1.0 - unexplained, 0.0):.0f} % of the run, least at about '
                       f'{worst:.1f} s: check that both belong to one run, that it was driven at '
-                      'its speed and to its end, and that the robot reaches its rates')
+                      'its speed, from its beginning to its end, and that the robot reaches its '
+                      'rates')
 
 
 def fit_profile(run: RunPieces, motion: Motion,

@@ -191,17 +191,16 @@ def mark_rows(ends: Iterable[Sequence[int]], count: int) -> Mask:
     return marked
 
 
-def mask_outliers(values: Array, limit: float) -> Mask:
-    """Mark single samples beyond a limit, robust deviations, from neighbours and median."""
+def mask_outliers(values: Array, limit: float, step: float) -> Mask:
+    """Mark single samples beyond a limit, robust deviations or steps of the output."""
     if len(values) < 4:
         return np.zeros(len(values), dtype=bool)
     # The median of six neighbours resists two outliers among them.
     edged = np.pad(values, 3, mode='reflect')
     alone = values - np.median([edged[place:place + len(values)] for place in (0, 1, 2, 4, 5, 6)],
                                axis=0)
-    # A coarsely quantized output mostly equals its neighbours; then the limit is in steps.
-    least = max(quantization_step(values), 1e-9)
-    return np.logical_and(*(np.abs(off) > limit * max(robust_deviation(off), least)
+    # a coarsely quantized output mostly equals its neighbours, and then the limit is in steps
+    return np.logical_and(*(np.abs(off) > limit * max(robust_deviation(off), step, 1e-9)
                             for off in (alone, values - np.median(values))))
 
 
@@ -233,27 +232,18 @@ def refuse_dead(output: Array) -> None:
                           'move; check power and wires')
 
 
-def largest_divisor(values: Array, error: float = 0.0) -> float:
-    """Return the greatest common divisor of values with an error, to 1e-9 of the largest; or 0."""
+def largest_divisor(values: Array) -> float:
+    """Return the greatest common divisor of values, to 1e-9 of the largest; or 0."""
     values = np.abs(values)
-    smallest = 1e-9 * float(values.max(initial=0.0)) + error
+    smallest = 1e-9 * float(values.max(initial=0.0))
     while (values > smallest).any():
         divisor = float(values[values > smallest].min())
         rest = np.abs(values - divisor * np.rint(values / divisor))
-        off = rest > smallest + error * values / divisor
+        off = rest > smallest
         if not off.any():
             return divisor
         values = np.append(rest[off], divisor)
     return 0.0
-
-
-def mark_extremes(output: Array) -> tuple[Mask, float]:
-    """Mark samples at the largest value of a range of both senses; return their step too."""
-    values = np.unique(output[np.isfinite(output)])
-    ends, step = values[[0, -1]], largest_divisor(values - values[0])
-    tolerance = 1e-9 * np.abs(ends).max()
-    ends = ends[np.abs(ends) >= np.abs(ends).max() - step - tolerance]
-    return (np.abs(output[:, None] - ends) <= tolerance).any(axis=1), step
 
 
 class Saturated(DataRefused):
