@@ -32,7 +32,7 @@ from gyro_calibration.calibration.likelihood import (
     ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, GridFit,
-    HierarchicalPrior, TridiagonalMatrix)
+    HierarchicalPrior, mean_walk_covariance, TridiagonalMatrix)
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_kind import find_reference_kind, is_noisy
 from gyro_calibration.calibration.reference_noise import (
@@ -404,10 +404,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float,
     spacing, moved = np.diff(middle), np.diff(heading)
     begins = np.flatnonzero(np.diff(piece, prepend=-1))
     durations = motion.time[np.append(begins[1:], len(piece)) - 1] - motion.time[begins]
-    between = (durations[1:] + durations[:-1]) / 6.0
-    # means over pieces of a random walk
-    walk = BandedNoise('angle_random_walk', np.maximum(spacing - between, between),
-                       durations[:-1] / 6.0, (1e-5, 1e-2))
+    walk = BandedNoise('angle_random_walk', *mean_walk_covariance(middle, durations), (1e-5, 1e-2))
     # a file has headings to 1e-6 rad
     rounding = max(quantization_step(motion.heading), 1e-6) / math.sqrt(
         12.0 * len(piece) / len(known))
@@ -418,7 +415,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float,
         moved + bias * spacing, spacing[:, None], [walk, repeated],
         *bias_wander_columns(middle, cosine_count=WANDER_COSINES),
         hierarchical_priors=(HierarchicalPrior('bias', 0, (0.1 * largest, largest)),))
-    white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(
+    white, steady = TridiagonalMatrix(*mean_walk_covariance(middle, durations)).whiten(
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
     walks = np.sqrt(squares / stats.chi2.ppf([0.975, 0.025], len(white) - 1))
