@@ -358,7 +358,8 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
     angle = reference[good] if rate is None else integrate(time[good], reference[good])
     return _Samples(time[good], output[good], None if rate is None else rate[good], angle,
                     quantization_step(angle) if rate is None else 0.0,
-                    _find_output_step(output[good]), None if log.temperature is None else log.temperature[good]), (
+                    _find_output_step(output[good]),
+                    None if log.temperature is None else log.temperature[good]), (
                         [remark] if places else [])
 
 

@@ -246,14 +246,6 @@ def largest_divisor(values: Array) -> float:
     return 0.0
 
 
-class Saturated(DataRefused):
-    """An output whose share of samples is at a limit, rad/s."""
-
-    def __init__(self, limit: float, share: float):
-        super().__init__(f'the gyro is saturated: {100 * share:.0f} % of the samples are at its '
-                         f'limit of {limit / DEGREE:.4g} deg/s; turn slower, or set a wider range')
-
-
 def refuse_saturated(output: Array) -> None:
     """Refuse an output that is clipped at its largest or smallest value."""
     # A range holds both senses: the lesser end of turns one way is a rest, and no limit.
@@ -273,4 +265,6 @@ def refuse_saturated(output: Array) -> None:
     for end in ends:
         neighbour = -2 if end else 1
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
-            raise Saturated(float(values[end]), counts[end] / len(output))
+            raise DataRefused(f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of '
+                              f'the samples are at its limit of {values[end] / DEGREE:.4g} deg/s; '
+                              'turn slower, or set a wider range')
