@@ -87,7 +87,8 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     if left_out:
         remarks.append(f'{left_out} samples without output, or moving, are left out.')
     # single samples far beyond the noise; a motion or a jolt lasts longer than two samples
-    outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS))
+    outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS,
+                                            quantization_step(output[known])))
     if 0 < outliers.size <= 0.001 * len(rate):
         rate[outliers] = np.nan
         remarks.append(f'Far beyond the noise, and left out: {outliers.size} single '

@@ -28,7 +28,7 @@ from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
-    find_runs, largest_divisor, mark_extremes, mark_rows, mask_outliers, mask_repeated_samples,
+    find_runs, largest_divisor, mark_rows, mask_outliers, mask_repeated_samples,
     quantization_step)
 from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
@@ -107,31 +107,36 @@ def extract_dwells(log: Log, name: str = '', min_share: float = MIN_DWELL_SHARE)
 
 def _mark_limited(log: Log, dwells: Dwells) -> Mask:
     """
-    Return which dwells are at the limit of the output of their log, shape (n,).
+    Return which dwells are at a limit of the output of their log, in one sense or both, (n,).
 
     A line through the others is beyond it at each of their rates, and leaves far less than a line
     and one more effect of the rate through all; or they alone have no noise.
     """
-    output = require_output(log)
-    extreme, step = mark_extremes(output)
-    limited = np.array([extreme[rows].mean() > 0.5 for rows in dwells.rows])
+    output, nothing = require_output(log), np.zeros(len(dwells), dtype=bool)
+    ends = np.array([np.nanmin(output), np.nanmax(output)])
+    step = largest_divisor(np.unique(output[np.isfinite(output)]) - ends[0])
     constant = np.array([np.ptp(output[rows]) == 0.0 for rows in dwells.rows])
     rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
     line = np.column_stack([np.ones(len(rate)), rate])
-    if limited.sum() < 2 or len(np.unique(rate[~limited])) < 3:
-        return np.zeros(len(dwells), dtype=bool)
 
     def residual(columns: Array, rows: Mask) -> Array:
         return np.asarray(dwells.output - columns @ np.linalg.lstsq(
             columns[rows], dwells.output[rows], rcond=None)[0])
 
-    off, everywhere = residual(line, ~limited), np.ones(len(rate), dtype=bool)
-    instead = min(float(np.sum(residual(np.column_stack([line, effect]), everywhere) ** 2))
+    instead = min(float(np.sum(residual(np.column_stack([line, effect]), ~nothing) ** 2))
                   for effect in (np.abs(rate), rate ** 2, rate ** 3))
-    left = float(np.sum(off[~limited] ** 2)) + len(rate) * step ** 2 / 12.0
-    is_beyond = -np.sign(dwells.output[limited]) * off[limited] > 0.0
-    return limited & bool(is_beyond.all() and (
-        (limited == constant).all() or instead > OUTLIER_THRESHOLD * left))
+    for extremes in (ends, ends[:1], ends[1:]):
+        limited = np.array([np.isclose(output[rows][:, None], extremes, 1e-9, 0.0).any(
+            axis=1).mean() > 0.5 for rows in dwells.rows])
+        if limited.sum() < 2 or len(np.unique(rate[~limited])) < 3:
+            continue
+        off = residual(line, ~limited)
+        left = float(np.sum(off[~limited] ** 2)) + len(rate) * step ** 2 / 12.0
+        is_beyond = -np.sign(dwells.output[limited]) * off[limited] > 0.0
+        if is_beyond.all() and ((limited == constant).all()
+                                or instead > OUTLIER_THRESHOLD * left):
+            return limited
+    return nothing
 
 
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
@@ -210,11 +215,11 @@ def dwells_from_table(log: Log) -> Dwells:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
     output, temperature = output[rows], None if log.temperature is None else log.temperature[rows]
-    # The step is the largest one that all differences are multiples of. Where the rates explain
-    # it, as those of a gyro without errors, it is at most 1 deg/s.
+    # The step is the largest one that all differences are multiples of. Where they are on a line,
+    # as of a gyro without errors, it is at most 1 deg/s.
     changes = output - output[0]
     step = largest_divisor(changes)
-    if step > 0.5 * largest_divisor(rate - rate[0]):
+    if fit_scale(output, rate)[0] * np.sum((output - output.mean()) ** 2) < (1e-3 * step) ** 2:
         step = largest_divisor(np.append(changes, DEGREE))
     # of means over many samples it is that of the digits of the file
     rounding = np.full(len(rate), step / math.sqrt(12.0))
@@ -307,6 +312,7 @@ class _Samples(NamedTuple):
     rate: Array | None
     heading: Array  # of the reference, or the integral of its rate
     step: float  # of an encoder, rad
+    output_step: float  # rad/s; 0 without one
     temperature: Array | None
     scale: float = 1.0  # approximate ratio of output to reference
 
@@ -352,8 +358,15 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
     angle = reference[good] if rate is None else integrate(time[good], reference[good])
     return _Samples(time[good], output[good], None if rate is None else rate[good], angle,
                     quantization_step(angle) if rate is None else 0.0,
+                    _find_output_step(output[good]),
                     None if log.temperature is None else log.temperature[good]), (
                         [remark] if places else [])
+
+
+def _find_output_step(output: Array) -> float:
+    """Return the step of an output, rad/s: of few codes too, and of codes rounded to 1 % of it."""
+    exact, step = largest_divisor(np.unique(output) - output.min()), quantization_step(output)
+    return exact if exact > 0.01 * step else step
 
 
 # dwells of a log in time
@@ -373,7 +386,8 @@ def find_dwells(log: Log, min_share: float = MIN_DWELL_SHARE) -> Dwells:
     for part in parts:
         is_repeated[part] = mask_repeated_samples(samples.output[part])
         fresh = part[~is_repeated[part]]
-        is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
+        is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD,
+                                          samples.output_step)
         kept.append(fresh[~is_outlier[fresh]])
     # 0.25 s at least, for a time offset; it shows before a ramp, in the mirrored log
     error, rate_change = samples.error, np.diff([np.median(samples.output[rows]) for rows in kept])
@@ -571,13 +585,10 @@ def _average(samples: _Samples,
     # one value nothing is known
     common = float(np.mean(variance)) if np.any(
         variance > durations * (1e-9 * np.abs(output).max()) ** 2) else 0.0
-    # Where most dwells are on one step each, the whole output shows the step.
-    values = [samples.output[rows] for rows in dwells]
-    step = (quantization_step(np.concatenate(values))
-            if np.median([np.ptp(each) for each in values]) > 0.0
-            else largest_divisor(np.unique(samples.output) - samples.output.min()))
-    is_quiet = np.array([np.var(each) <= 0.25 * step ** 2 for each in values])
-    rounding = is_quiet * step / math.sqrt(12.0)
+    # the whole output shows its step, as dwells may be on one step each
+    is_quiet = np.array([np.std(samples.output[rows]) <= 0.5 * samples.output_step
+                         for rows in dwells])
+    rounding = is_quiet * samples.output_step / math.sqrt(12.0)
     deviation = np.sqrt(common / durations + blur ** 2
                         + _independent_deviation(rate, output, rounding) ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan), rounding

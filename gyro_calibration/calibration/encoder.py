@@ -32,7 +32,7 @@ from gyro_calibration.calibration.likelihood import (
     ScaleBiasFit)
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise, bias_wander_columns, difference_covariance, fit_noise_grid, GridFit,
-    HierarchicalPrior, TridiagonalMatrix)
+    HierarchicalPrior, mean_walk_covariance, TridiagonalMatrix)
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.reference_kind import find_reference_kind, is_noisy
 from gyro_calibration.calibration.reference_noise import (
@@ -52,7 +52,7 @@ from gyro_calibration.logs.log import (
     Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975, refuse_wrapped)
 from gyro_calibration.logs.quality import (
     bridge_gaps, cross_rotation, encoder_step, find_holes, quantization_step, refuse_dead,
-    robust_deviation, white_noise_deviation)
+    refuse_saturated, robust_deviation, white_noise_deviation)
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, Effect, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -126,6 +126,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
+        refuse_saturated(output)
         fit = fit_course(spans or lay_out_spans(log, technology=technology))
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
@@ -156,6 +157,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
                           '--from), or correct the stamps')
     refuse_one_speed(motion, limits)
     refuse_dead(output)
+    refuse_saturated(output)
     # the gyro's lag is about that of a filter of 20 ms; a heading without steps may be a mean over
     # 0.2 s
     has_steps = encoder_step(motion.heading) >= MAX_ROUNDING_STEP
@@ -402,10 +404,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float,
     spacing, moved = np.diff(middle), np.diff(heading)
     begins = np.flatnonzero(np.diff(piece, prepend=-1))
     durations = motion.time[np.append(begins[1:], len(piece)) - 1] - motion.time[begins]
-    between = (durations[1:] + durations[:-1]) / 6.0
-    # means over pieces of a random walk
-    walk = BandedNoise('angle_random_walk', np.maximum(spacing - between, between),
-                       durations[:-1] / 6.0, (1e-5, 1e-2))
+    walk = BandedNoise('angle_random_walk', *mean_walk_covariance(middle, durations), (1e-5, 1e-2))
     # a file has headings to 1e-6 rad
     rounding = max(quantization_step(motion.heading), 1e-6) / math.sqrt(
         12.0 * len(piece) / len(known))
@@ -416,7 +415,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float,
         moved + bias * spacing, spacing[:, None], [walk, repeated],
         *bias_wander_columns(middle, cosine_count=WANDER_COSINES),
         hierarchical_priors=(HierarchicalPrior('bias', 0, (0.1 * largest, largest)),))
-    white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(
+    white, steady = TridiagonalMatrix(*mean_walk_covariance(middle, durations)).whiten(
         np.column_stack([moved, spacing])).T
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
     walks = np.sqrt(squares / stats.chi2.ppf([0.975, 0.025], len(white) - 1))
@@ -547,14 +546,14 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     """Calibrate by the dwells of logs, by their paths, or by the heading of one (`api.fit`)."""
     for log in logs.values():
         _refuse_own_reference(log)
-    chosen = {path: choose_reference(log) for path, log in logs.items()}
-    # the rate alone, where the gyro shows that the heading is wrong
-    alone = {path: each for path, (each, _) in chosen.items() if each.reference_heading is None}
-    logs, remarks = {**logs, **alone}, [each for path in alone for each in chosen[path][1]]
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
-    if method == 'dwells' or method is None and (others or any(
-            log.time is None or log.reference_rate is not None or log.reference_heading is None
-            for log in logs.values())):
+    tries_dwells = method == 'dwells' or method is None and (others or any(
+        log.time is None or log.reference_rate is not None or log.reference_heading is None
+        for log in logs.values()))
+    chosen = {path: choose_reference(log) for path, log in logs.items()}
+    logs = {path: log for path, (log, _) in chosen.items()}
+    remarks = sum((found for _, found in chosen.values()), [])
+    if tries_dwells:
         is_settled = effects or method or len(logs) > 1
         share, parts = MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE, []
         try:
@@ -583,13 +582,13 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         raise InputError(_HEADING_ALONE)
     (log,) = logs.values()
     found = calibrate_encoder(log, method, technology=technology or 'mems')
-    if log.reference_heading is not None:
-        return found
-    return replace(found, remarks=(
-        *remarks, 'the log has a reference rate, which is constant '
-        f'{_MIN_DWELLS - 1} times at most, or for up to {100.0 * FEW_DWELLS_SHARE:g} % of the '
-        'time; so the rate is integrated, and headings are compared. For other effects than bias '
-        'and scale factor error, hold each rate for some seconds', *found.remarks))
+    if log.reference_heading is None:
+        remarks.append(
+            f'the log has a reference rate, which is constant {_MIN_DWELLS - 1} times at most, or '
+            f'for up to {100.0 * FEW_DWELLS_SHARE:g} % of the time; so the rate is integrated, '
+            'and headings are compared. For other effects than bias and scale factor error, hold '
+            'each rate for some seconds')
+    return replace(found, remarks=(*remarks, *found.remarks))
 
 
 def _refuse_own_reference(log: Log) -> None:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 import math
 
 from gyro_calibration.calibration.noise_grid import (
-    average_hypotheses, bias_wander_columns, TridiagonalMatrix)
+    average_hypotheses, bias_wander_columns, mean_walk_covariance, TridiagonalMatrix)
 from gyro_calibration.calibration.run_faults import (
     DeviatingStretch, find_deviating_stretch, fit_profile, split_run)
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
@@ -224,7 +224,8 @@ class _RunAlignment:
                 for factors in prior_factors for size in np.geomspace(1e-7, 1e-2, 6)])
         expected = np.zeros(len(prior))
         expected[3] = -lag
-        walk = _random_walk_covariance(time, weight, begins)
+        last = np.append(begins[1:], len(time)) - 1
+        walk = mean_walk_covariance(means[:, 1], time[last] - time[begins])
         accelerations = np.empty((0, 3))
         if self.is_measured:  # those by gyro and reference over a block, and the 4th order
             whole, half = (_second_difference(self._integral, gyro_time[is_covered], each)
@@ -246,10 +247,9 @@ class _RunAlignment:
 
     def set_shaft_error(self, sizes: Array) -> None:
         """Compute the errors of a shaft at its headings without errors of these sizes, rad."""
-        points, self.shaft_error = self._points, sizes
-        shared = np.column_stack([_shaft_columns(correct_shaft(points.heading, sizes)),
-                                  points.shared[:, 2:]])
-        self._points = replace(points, shared=shared)
+        self.shaft_error = sizes
+        self._points = replace(self._points, shared=_shaft_columns(correct_shaft(
+            self._points.heading, sizes)))
 
     def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """Return rate, acceleration and integral of the rate at times, corrected for a lag."""
@@ -298,12 +298,10 @@ def _select_reference_points(motion: Motion, block: float, slip_deviation: float
         points = np.concatenate([_find_step_crossings(motion, step),
                                  _find_constant_readings(motion, step, block)])
         points = points[np.argsort(points[:, 0], kind='stable')]
-    time, heading, variance, *shared = points.T
-    rests = np.ones(len(shared))
-    return _ReferencePoints(
-        time, heading, variance, np.column_stack([_shaft_columns(heading), *shared]),
-        np.append(np.full(2, math.radians(1.0)), step / math.sqrt(12.0) * rests),
-        np.array([[factor, factor, *rests] for factor in _PRIOR_FACTORS]))
+    time, heading, variance = points.T
+    return _ReferencePoints(time, heading, variance, _shaft_columns(heading),
+                            np.full(2, math.radians(1.0)),
+                            np.repeat(_PRIOR_FACTORS[:, None], 2, axis=1))
 
 
 def _shaft_columns(heading: Array) -> Array:
@@ -379,7 +377,7 @@ def _find_step_crossings(motion: Motion, step: float) -> Array:
     Return the middles between lasting readings one step apart, with variances in units of theirs.
 
     There the heading is the edge between the two, but for the turn between the samples. The
-    columns are those of `_find_constant_readings`.
+    columns are time, heading and variance.
     """
     change = np.abs(np.diff(motion.heading))
     index = np.flatnonzero(change > 0.5 * step)
@@ -395,53 +393,23 @@ def _find_step_crossings(motion: Motion, step: float) -> Array:
                           if len(time) else relative_deviation)
     alone = np.diff(index, prepend=-1, append=len(change)) == 1
     edges = (change[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
-    return np.column_stack([time, heading, relative_deviation ** 2, np.zeros((len(time), 2))])[
-        edges]
+    return np.column_stack([time, heading, relative_deviation ** 2])[edges]
 
 
 def _find_constant_readings(motion: Motion, step: float, block: float) -> Array:
     """
     Return the readings that are constant for longer than a block, single ones, the first and last.
 
-    All samples of a constant reading count as one, but for the first and the last if they last
-    much longer than the readings next to them, as rests, whose samples share one error. The
-    columns are time, heading, variance, and this error of the first and the last.
+    All samples of a constant reading count as one. The columns are time, heading and variance.
     """
     change = np.abs(np.diff(motion.heading, prepend=motion.heading[0]))
     run = np.cumsum(change > 0.5 * step)
     begins = np.flatnonzero(np.diff(run, prepend=-1))
     ends = np.append(begins[1:], len(run)) - 1
-    durations = motion.time[ends] - motion.time[begins]
-    is_used = (durations > block) | (ends == begins)
+    is_used = (motion.time[ends] - motion.time[begins] > block) | (ends == begins)
     is_used[[0, -1]] = True
-    rest_columns = np.zeros((len(begins), 2))
-    if len(begins) > 2:
-        rest_columns[0, 0], rest_columns[-1, 1] = (
-            durations[end] > max(block, 2.0 * durations[next_to])
-            for end, next_to in ((0, 1), (-1, -2)))
-    variance = np.where(rest_columns.any(axis=1) | ~is_used, 1.0, np.bincount(run))
     kept = is_used[run] | (change > 1.5 * step)
-    return np.column_stack([motion.time, motion.heading, variance[run], rest_columns[run]])[kept]
-
-
-def _random_walk_covariance(time: Array, weight: Array,
-                            begins: NDArray[np.intp]) -> tuple[Array, Array]:
-    """
-    Return the variance of increments by a random walk, and the covariance of neighbours, s, (n,).
-
-    With A the weights summed up to each point, the weighted mean of a block is the last value less
-    the sum of A times the steps of the walk, or the first one plus that of 1 - A.
-    """
-    interval = np.diff(time, append=time[-1])
-    until = np.cumsum(weight)
-    until -= np.repeat(until[begins] - weight[begins], np.diff(begins, append=len(time)))
-    last = np.append(begins[1:], len(time)) - 1
-    gap = interval[last]
-    within = interval.copy()
-    within[last] = 0.0
-    before, after, both = (np.add.reduceat(product * within, begins)
-                           for product in (until ** 2, (1 - until) ** 2, until * (1 - until)))
-    return before[:-1] + gap[:-1] + after[1:], both[:-1]
+    return np.column_stack([motion.time, motion.heading, np.bincount(run)[run]])[kept]
 
 
 def robust_residual(columns: Array, observed: Array, passes: int) -> Array:

@@ -183,6 +183,17 @@ def difference_covariance(variance: Array) -> tuple[Array, Array]:
     return variance[1:] + variance[:-1], -variance[:-1]
 
 
+def mean_walk_covariance(middle: Array, duration: Array) -> tuple[Array, Array]:
+    """
+    Return the noise of increments between means over blocks by a random walk of 1 rad/√s.
+
+    Given are the mean times and the durations of the blocks, s, shape (n + 1,). Returned are the
+    variances and the covariances with the one before, s, shape (n,).
+    """
+    spacing, within = np.diff(middle), (duration[1:] + duration[:-1]) / 6.0
+    return np.maximum(spacing - within, within), duration[:-1] / 6.0
+
+
 def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
                         rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
                         cosine_count: int = 24) -> tuple[Array, list[SharedNoise]]:

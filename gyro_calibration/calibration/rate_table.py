@@ -231,14 +231,19 @@ class Calibration:
         return np.asarray(of_fit + np.diag(self.scatter.deviation(dwells) ** 2)
                           + shared @ shared.T)
 
+    @cached_property
+    def _dense_channels(self) -> Channels:
+        """Return the inputs at rates also between those of the dwells, where a sine would hide."""
+        rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
+        return Channels(rate, rate, self.given.reference_temperature)
+
     @property
     def min_non_monotonic_rate(self) -> float | None:
         """Return the slowest rate, rad/s, at which the output no longer grows with it, or None."""
-        # also between the rates of the dwells, where a fast sine would hide
-        rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
-        channels = Channels(rate, rate, self.given.reference_temperature)
-        folded = np.broadcast_to(GyroModel(self.terms).output_slope(channels) <= 0.1, len(rate))
-        return float(np.abs(rate[folded]).min()) if folded.any() else None
+        rate = np.abs(self._dense_channels.rate)
+        folded = np.broadcast_to(
+            GyroModel(self.terms).output_slope(self._dense_channels) <= 0.1, rate.shape)
+        return float(rate[folded].min()) if folded.any() else None
 
     @property
     def is_ambiguous(self) -> bool:
@@ -248,11 +253,9 @@ class Calibration:
         It may do so with the scale factor error or without: a fast sine that passes through all
         dwells needs a large one.
         """
-        rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
-        channels = Channels(rate, rate, self.given.reference_temperature)
         others = tuple(each for each in self.terms if each.effect is not SCALE_FACTOR_ERROR)
-        return any(bool((np.diff(rate + GyroModel(terms).error(channels)) < 0.0).any())
-                   for terms in (self.terms, others))
+        return any((np.diff(self._dense_channels.rate + GyroModel(terms).error(
+            self._dense_channels)) < 0.0).any() for terms in (self.terms, others))
 
     @property
     def uncorrected_rms(self) -> float:

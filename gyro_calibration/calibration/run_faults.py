@@ -144,7 +144,11 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float) -
     """Refuse a run that the motion does not explain at any offset that is allowed, s."""
     unexplained, scale, offset = fit_profile(run, motion, largest_offset)
     late, _, begin = fit_profile(run, motion, 0.6 * motion.duration)
-    if late <= MAX_UNEXPLAINED_SHARE < unexplained:
+    # a run that ended early may look like one that began in the middle of the motion
+    ended = min(run.fit_scale(run.reference_angle(motion, late_by) * (
+        run.edges[1:] - late_by < end))[0] for late_by in _trial_offsets(largest_offset)
+        for end in np.linspace(0.0, motion.duration, 50, endpoint=False).tolist())
+    if late <= MAX_UNEXPLAINED_SHARE < min(unexplained, ended):
         raise DataRefused(f'the gyro is {abs(begin):.1f} s '
                           f'{"behind" if begin > 0.0 else "ahead of"} the {motion.name}: begin '
                           f'with it, or correct the time of the {motion.name}')
@@ -155,15 +159,20 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float) -
     raise DataRefused(f'the {who} does not follow the {motion.name}, which explains '
                       f'{100.0 * max(1.0 - unexplained, 0.0):.0f} % of the run, least at about '
                       f'{worst:.1f} s: check that both belong to one run, that it was driven at '
-                      'its speed and to its end, and that the robot reaches its rates')
+                      'its speed, from its beginning to its end, and that the robot reaches its '
+                      'rates')
 
 
 def fit_profile(run: RunPieces, motion: Motion,
                 largest_offset: float, step: float = _TRIAL_STEP) -> tuple[float, float, float]:
     """Return the unexplained fraction of the squares at the best delay, the scale, and that, s."""
-    count = round(largest_offset / step)
     return min((*run.fit_scale(run.reference_angle(motion, offset)), offset)
-               for offset in (step * np.arange(-count, count + 1)).tolist())
+               for offset in _trial_offsets(largest_offset, step))
+
+
+def _trial_offsets(largest: float, step: float = _TRIAL_STEP) -> list[float]:
+    count = round(largest / step)
+    return list((step * np.arange(-count, count + 1)).tolist())
 
 
 def format_slip(motion: Motion, angle: float, time: float, sigmas: float) -> str:

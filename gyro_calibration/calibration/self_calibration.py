@@ -163,23 +163,25 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
     _refuse_fit(fit, motion, limits, white_noise)
-    # A reference that follows the noise of the gyro, that of the model, or less by the samples: by
-    # the likelihood ratio to the same fits with at least this noise. Without a model that of the
-    # quietest samples may be vibration, which both follow, but then s and b are not 0.
+    # that of the quietest samples may be vibration, which both follow, but then s and b are not 0
     quiet = [each for part in np.array_split(rate, 10) if (each := white_noise_deviation(part))]
     known = noise.angle_random_walk or is_own * min(quiet, default=0.0) * math.sqrt(
         float(np.median(np.diff(time))))
-    own = min(known, white_noise) ** 2
-    if own and fit.dof:
+    _refuse_copied_noise(fit, min(known, white_noise))
+    return fit
+
+
+def _refuse_copied_noise(fit: ScaleBiasFit, white_noise: float) -> None:
+    """Refuse a reference that follows the white noise of the gyro, rad/√s, by likelihood ratio."""
+    if white_noise and fit.dof:
         likelihood, variance, dof = fit.noise_profile.T
-        share = np.minimum(variance / own, 1.0)
+        share = np.minimum(variance / white_noise ** 2, 1.0)
         with_noise = likelihood - 0.5 * dof * (share - 1.0 - np.log(share))
         if chdtrc(1.0, 2.0 * (likelihood.max() - with_noise.max())) < MIN_FIT_PROBABILITY:
             raise DataRefused(
                 'the reference is computed from this gyro, since they differ by '
                 f'{math.sqrt(share[likelihood.argmax()]):.2f} times the noise of the '
                 'gyro: give a reference without it, such as odometry of the wheels')
-    return fit
 
 
 @dataclass(frozen=True)

@@ -207,7 +207,7 @@ class Spans:
         """Return the mean time of each point before the log, or after it, s, shape (n + 1,)."""
         at = self.gyro_stamps(self.value_times)
         outside = at - np.clip(at, self.stamps[0], self.stamps[-1])
-        return np.bincount(self.point_index, outside) / np.bincount(self.point_index)
+        return self._means_of_values(outside)
 
     @property
     def stretch_numbers(self) -> NDArray[np.intp]:
@@ -312,7 +312,7 @@ class Spans:
 
     def point_means(self, values: Array, slopes: Array | None = None) -> Array:
         """Return the means of a signal at the delayed points, linear or with slopes, (n + 1,)."""
-        total: Array = np.zeros(len(self.time))
+        total: Array = np.zeros(len(self.value_times))
         for before, share, interval in self._places:
             change = values[before + 1] - values[before]
             here = values[before] + share * change
@@ -320,8 +320,12 @@ class Spans:
                 here += share * (1.0 - share) * (
                     (1.0 - share) * (interval * slopes[before] - change)
                     - share * (interval * slopes[before + 1] - change))
-            total += np.bincount(self.point_index, here)
-        return total / len(self._places) / np.bincount(self.point_index)
+            total += here
+        return self._means_of_values(total) / len(self._places)
+
+    def _means_of_values(self, values: Array) -> Array:
+        """Return the means over the values of each point, shape (n + 1,)."""
+        return np.bincount(self.point_index, values) / np.bincount(self.point_index)
 
     def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
@@ -381,8 +385,8 @@ class Spans:
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
         if cause == MISALIGNMENT_TERM:
-            means = [np.bincount(self.point_index, np.interp(self.value_times, time, each))
-                     / np.bincount(self.point_index) for each in self.cross_rotation.T]
+            means = [self._means_of_values(np.interp(self.value_times, time, each))
+                     for each in self.cross_rotation.T]
             return np.pad(np.diff(means), ((0, 0), (0, len(self.rests)))).T * np.where(
                 self.is_measured, -1.0, 0.0)[:, None]
         if cause == DRIFT_TERM:

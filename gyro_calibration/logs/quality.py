@@ -193,17 +193,16 @@ def mark_rows(ends: Iterable[Sequence[int]], count: int) -> Mask:
     return marked
 
 
-def mask_outliers(values: Array, limit: float) -> Mask:
-    """Mark single samples beyond a limit, robust deviations, from neighbours and median."""
+def mask_outliers(values: Array, limit: float, step: float) -> Mask:
+    """Mark single samples beyond a limit, robust deviations or steps of the output."""
     if len(values) < 4:
         return np.zeros(len(values), dtype=bool)
     # The median of six neighbours resists two outliers among them.
     edged = np.pad(values, 3, mode='reflect')
     alone = values - np.median([edged[place:place + len(values)] for place in (0, 1, 2, 4, 5, 6)],
                                axis=0)
-    # A coarsely quantized output mostly equals its neighbours; then the limit is in steps.
-    least = max(quantization_step(values), 1e-9)
-    return np.logical_and(*(np.abs(off) > limit * max(robust_deviation(off), least)
+    # a coarsely quantized output mostly equals its neighbours, and then the limit is in steps
+    return np.logical_and(*(np.abs(off) > limit * max(robust_deviation(off), step, 1e-9)
                             for off in (alone, values - np.median(values))))
 
 
@@ -235,35 +234,18 @@ def refuse_dead(output: Array) -> None:
                           'move; check power and wires')
 
 
-def largest_divisor(values: Array, error: float = 0.0) -> float:
-    """Return the greatest common divisor of values with an error, to 1e-9 of the largest; or 0."""
+def largest_divisor(values: Array) -> float:
+    """Return the greatest common divisor of values, to 1e-9 of the largest; or 0."""
     values = np.abs(values)
-    smallest = 1e-9 * float(values.max(initial=0.0)) + error
+    smallest = 1e-9 * float(values.max(initial=0.0))
     while (values > smallest).any():
         divisor = float(values[values > smallest].min())
         rest = np.abs(values - divisor * np.rint(values / divisor))
-        off = rest > smallest + error * values / divisor
+        off = rest > smallest
         if not off.any():
             return divisor
         values = np.append(rest[off], divisor)
     return 0.0
-
-
-def mark_extremes(output: Array) -> tuple[Mask, float]:
-    """Mark samples at the largest value of a range of both senses; return their step too."""
-    values = np.unique(output[np.isfinite(output)])
-    ends, step = values[[0, -1]], largest_divisor(values - values[0])
-    tolerance = 1e-9 * np.abs(ends).max()
-    ends = ends[np.abs(ends) >= np.abs(ends).max() - step - tolerance]
-    return (np.abs(output[:, None] - ends) <= tolerance).any(axis=1), step
-
-
-class Saturated(DataRefused):
-    """An output whose share of samples is at a limit, rad/s."""
-
-    def __init__(self, limit: float, share: float):
-        super().__init__(f'the gyro is saturated: {100 * share:.0f} % of the samples are at its '
-                         f'limit of {limit / DEGREE:.4g} deg/s; turn slower, or set a wider range')
 
 
 def refuse_saturated(output: Array) -> None:
@@ -285,4 +267,6 @@ def refuse_saturated(output: Array) -> None:
     for end in ends:
         neighbour = -2 if end else 1
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
-            raise Saturated(float(values[end]), counts[end] / len(output))
+            raise DataRefused(f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of '
+                              f'the samples are at its limit of {values[end] / DEGREE:.4g} deg/s; '
+                              'turn slower, or set a wider range')

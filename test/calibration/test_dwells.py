@@ -16,6 +16,7 @@ import math
 from chance import fewest, most, rms_bounds
 from gyro_calibration.calibration.dwells import (
     dwells_from_table, extract_dwells, find_dwells, join_dwells)
+from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -254,6 +255,45 @@ def test_a_limit_that_two_speeds_do_not_distinguish_from_an_effect_is_one_withou
         output=np.clip(output, -185.0 * DEGREE, 185.0 * DEGREE)))
     assert np.abs(found.rate).max() == pytest.approx(100.0 * DEGREE)
     assert 'at the limit' in ' '.join(found.remarks)
+
+
+@pytest.mark.parametrize('low', [-1000.0, -80.0, -60.0])
+def test_a_table_at_a_limit_in_one_sense_or_at_two_that_differ_leaves_those_dwells_out(low):
+    sweep = np.array([0.0, *(sign * rate for rate in (20, 40, 60, 90) for sign in (1, -1))])
+    rate = np.tile(sweep, 3) * DEGREE
+    output = 1.01 * rate + 0.01 * DEGREE * np.random.default_rng(4).standard_normal(len(rate))
+    found = extract_dwells(Log(reference_rate=rate, output=np.clip(
+        output, low * DEGREE, 70.0 * DEGREE)))
+    assert (found.rate.max() / DEGREE, found.rate.min() / DEGREE) == pytest.approx(
+        (60.0, {-1000.0: -90.0, -80.0: -60.0, -60.0: -40.0}[low]))
+    assert 'at the limit' in found.remarks[0]
+
+
+def test_the_step_of_rounded_codes_is_that_of_the_output_where_each_dwell_is_on_one_code(
+        generator):
+    step = 0.1537456 * DEGREE
+    log = run(generator, 0.001)
+    codes = np.round(log.output / step) * step
+    found = find_dwells(replace(log, output=np.round(codes / DEGREE, 5) * DEGREE))
+    assert np.median([np.ptp(log.output[rows]) for rows in found.rows]) < step
+    assert found.rounding.max() == pytest.approx(step / math.sqrt(12.0), rel=1e-3)
+    assert rms(errors(found)) < 1.5
+
+
+def test_samples_a_few_steps_off_are_no_outliers_beside_a_noisy_reference_rate(generator):
+    step, rate = 0.6 * DEGREE, RATE + 0.005 * DEGREE * generator.standard_normal(len(RATE))
+    log = run(generator, 0.03, reference_rate=rate)
+    found = find_dwells(replace(log, output=step * np.round(log.output / step)))
+    assert 'outliers' not in ' '.join(found.remarks)
+
+
+@pytest.mark.parametrize('count', [3, 6])
+def test_the_step_of_a_table_is_not_that_of_the_digits_of_its_rates(count):
+    rate = np.round(np.tile(np.linspace(-250.0, 250.0, 2 * count + 1), 8), 4) * DEGREE
+    step = 0.6 * DEGREE
+    found = dwells_from_table(Log(reference_rate=rate, output=step * np.round(
+        (1.0062 * rate + 0.14 * DEGREE) / step)))
+    assert found.rounding == pytest.approx(step / math.sqrt(12.0))
 
 
 def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):

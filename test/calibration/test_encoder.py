@@ -54,6 +54,7 @@ def log_of(motion, duration, noise=None, generator=None, step=0.088 * DEGREE, la
 
 SWING = swing(120.0)
 CLEAN = log_of(SWING, 100.0)
+NOISY = log_of(SWING, 100.0, Noise(1e-4), np.random.default_rng(64))
 
 
 def test_the_model_holds_what_was_found():
@@ -89,7 +90,9 @@ REFUSED = {'no heading': (replace(CLEAN, reference_heading=None), 'reference_hea
            'one speed': (log_of(REST, 100.0),
                          'in both senses, or at another speed too, or with a rest'),
            'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'),
-           'dead': (replace(CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead')}
+           'dead': (replace(CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead'),
+           'clipped': (replace(NOISY, output=np.minimum(NOISY.output, 0.9)),
+                       'the gyro is saturated')}
 
 
 @pytest.mark.parametrize('log, reason', REFUSED.values(), ids=REFUSED)
@@ -149,7 +152,6 @@ def test_rows_that_are_missing_without_a_gap_in_the_stamps_are_found_by_the_jump
     assert not any('jumps' in remark for remark in whole.remarks)
 
 
-NOISY = log_of(SWING, 100.0, Noise(1e-4), np.random.default_rng(64))
 TURNED = np.cumsum(NOISY.output - B) * INTERVAL
 OWN = {'a sum': TURNED, 'the trapezoid rule': TURNED - 0.5 * INTERVAL * NOISY.output,
        'scaled': 0.97 * TURNED}
@@ -362,3 +364,12 @@ def test_a_wrong_heading_beside_a_right_rate_is_not_used_in_dwells():
     assert 'turns -1.000 times as far' in found.calibration.dwells.remarks[0]
     values = {parameter.name: value for _, parameter, value, _ in found.model.estimates()}
     assert values['scale_factor_error'] == pytest.approx(S, abs=5e-4)
+
+
+def test_references_that_differ_by_less_than_the_gyro_may_err_are_stated():
+    time = np.arange(9000) / 50.0
+    rate = 20.0 * DEGREE * uniform_filter1d(np.repeat(np.arange(15.0) % 4.0 - 1.5, 600), 25)
+    noise = 0.02 * DEGREE * np.random.default_rng(72).standard_normal(len(time))
+    found = calibrate({'': Log(time=time, output=rate + noise, reference_rate=rate,
+                               reference_heading=0.97 * np.cumsum(rate) / 50.0)})
+    assert 'turns 1.031 times as far' in found.calibration.dwells.remarks[0]

@@ -103,6 +103,15 @@ def test_another_motion_is_reported_by_where_it_deviates(time, moved, said):
         self_calibrate(time, moved, CALIBRATION_MOTION, noise=XV3500.noise)
 
 
+def test_a_run_that_ends_after_the_first_of_two_equal_halves_is_not_ahead_of_its_profile():
+    turns = [(1, 0), (3, 60), (1, 0), (3, -60)]
+    time = np.arange(0.0, 18.0, 0.02)
+    run, profile = (constant_rate_motion([*turns * times, (1, 0)]) for times in (1, 2))
+    with pytest.raises(DataRefused, match='from its beginning to its end'):
+        self_calibrate(time, 1.01 * run.rate_at(time) + 1e-4 * np.random.default_rng(
+            0).standard_normal(len(time)), profile)
+
+
 def test_a_run_without_known_noise_is_judged_by_the_noise_of_its_samples():
     """White noise of a gyro is no fault; a robot that swings about its profile is one."""
     limits = RunLimits(max_scale_deviation=1.0, max_heading_error=math.tau)
