@@ -134,7 +134,6 @@ class NoiseFigures(PrintedResult):
         return '\n'.join([*lines, f'{text}.'])
 
     def put_into(self, model: GyroModel) -> GyroModel:
-        """Return a model with these figures as its noise."""
         return replace(model, noise=self.fit.noise, noise_bounds=self.fit.noise_bounds)
 
     def plot(self, path: str | Path | None = None) -> Any:

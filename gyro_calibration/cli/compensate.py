@@ -34,7 +34,7 @@ from gyro_calibration.heading.log_compensation import (
     LogCompensation, no_plausible_row_message, plausible_rows, rows_of, smooth_track)
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import (
-    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, Mask, write_log)
+    Array, CACHE_BLOCK_SAMPLES, DataRefused, DEGREE, Log, Mask, write_log)
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model
@@ -228,12 +228,12 @@ def integrate_log(log: Log, model: GyroModel, threshold: Threshold, name: str) -
         # The noise of a rate depends on the interval between samples. That of the first block is
         # used for all rates, since a lost sample does not reduce the noise of a gyro. Rows without
         # output may lie between samples.
-        first = log.time[:BLOCK_ROWS]
-        of_output = first[known[:BLOCK_ROWS]]
+        first = log.time[:CACHE_BLOCK_SAMPLES]
+        of_output = first[known[:CACHE_BLOCK_SAMPLES]]
         variance = model.noise.rate_variance(
             float(np.median(np.diff(of_output if len(of_output) > 1 else first))))
     # in blocks, which limit the memory, unless rates are interpolated to the stamps
-    size = len(log) if model.moves_stamps else BLOCK_ROWS
+    size = len(log) if model.moves_stamps else CACHE_BLOCK_SAMPLES
     for begin in range(0, len(log), size):
         rows = rows_of(log, begin + np.flatnonzero(known[begin:begin + size]))
         result, sensitivity = compensation.add(rows)

@@ -73,9 +73,8 @@ def run(given: argparse.Namespace) -> Answer:
     """
     Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
 
-    The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
-    motion of the robot; driver and compensation run as processes of their own, as on a robot. The
-    compensation drives the calibration, then a drive follows.
+    The gyro of the robot, which follows ``cmd_vel``, is emulated on a pseudo-terminal; driver and
+    compensation run as processes of their own.
     """
     if _MISSING:
         raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); source ROS 2, or '
@@ -145,7 +144,6 @@ class _DemoClient:
     """Subscribes to the nodes and calls their services, spinning in a thread of its own."""
 
     def __init__(self, robot: _SimulatedRobot):
-        """Subscribe; the robot receives ``cmd_vel`` from now on."""
         self.raw_rates: list[tuple[float, float]] = []  # s and rad/s
         self.headings: list[tuple[float, float]] = []  # s and rad
         self.node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
@@ -175,7 +173,6 @@ class _DemoClient:
         self._thread.start()
 
     def call_service(self, name: str, timeout: float) -> None:
-        """Call a service, and wait until it has succeeded."""
         client = self.node.create_client(Trigger, name)
         if not client.wait_for_service(20.0):
             raise OSError(f'the service {name} did not appear within 20 s')
@@ -221,7 +218,6 @@ def _node_process(module: str, **parameters: object) -> Iterator[None]:
 
 
 def _calibrate_and_drive(client: _DemoClient) -> float:
-    """Calibrate and drive; return the time at which the drive began, s."""
     with verb.show_progress('starting driver and compensation') as on_progress:
         deadline = time.monotonic() + 60.0
         while not (client.raw_rates and client.headings

@@ -9,11 +9,10 @@
 # under the License.
 
 """
-Pictures for people: PNG or SVG, units on the axes, readable in black and white.
+Pictures: PNG or SVG, units on the axes, readable in black and white.
 
-Each function returns its figure, and writes it where a path is given; the ending of the path,
-.png or .svg, sets the format. The caption below a picture explains it. Arrays are in SI, with one
-value for each sample or dwell, shape (n,).
+Each function returns its figure, and writes it where a path is given. Arrays are in SI, of shape
+(n,).
 """
 
 from __future__ import annotations
@@ -42,11 +41,7 @@ _LINE_STYLES = ('-', '--', '-.', ':')
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
                   headings: Mapping[str, Array], name: str = 'reference') -> Any:
-    """
-    Draw headings, rad, against a reference (figure 10 of Hong and Park).
-
-    The error of each has a panel on its own scale.
-    """
+    """Draw headings, rad, and their errors against a reference (figure 10 of Hong and Park)."""
     count = len(headings)
     figure, panels = _panels(1 + count, 1, (9, 5 + 2 * count), (1.3, *[1.7 / count] * count))
     above, *below = panels[:, 0]

@@ -222,10 +222,9 @@ class McapRecorder(_Recorder):
 
 class CsvRecorder(_Recorder):
     """
-    Samples as rows of the log format.
+    Samples as rows of the log format, whose columns are fixed with the first piece.
 
-    The columns are fixed with the first piece. Values that come less often than samples, such as
-    the temperature, are repeated until the next one.
+    Values that come less often than samples, such as the temperature, are repeated.
     """
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):

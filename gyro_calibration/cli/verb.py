@@ -93,7 +93,6 @@ class Answer:
 
     @property
     def text(self) -> str:
-        """Return the lines, and a sentence for each file."""
         return '\n'.join([*self.lines, *(f'Written to {each}.' for each in self.files if each)])
 
 
@@ -199,13 +198,11 @@ def read(given: argparse.Namespace) -> Log:
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the logs of a verb that takes several."""
     for path in given.log:
         yield read(argparse.Namespace(**{**vars(given), 'log': path}))
 
 
 def cut_to_range(given: argparse.Namespace, log: Log) -> Log:
-    """Return the part of a log between --from and --to."""
     if given.begin <= 0.0 and given.end == math.inf:
         return log
     since = require_time(given, log) - require_time(given, log)[0]
@@ -234,7 +231,6 @@ def add_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 
 
 def require_folder(path: str) -> None:
-    """Refuse a file where a folder of results is wanted."""
     if os.path.exists(path) and not os.path.isdir(path):
         raise InputError(f'{path}: is a file, but must be a folder; give another name')
 

@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-A gyro on a serial port: opens, recognizes and reads it, and opens it again after a loss.
-
-This module has no ROS and starts no thread: `Connection.chunks` gives the samples in the thread of
-the caller.
-"""
+"""A gyro on a serial port: opens, recognizes and reads it, and opens it again after a loss."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -57,8 +52,7 @@ class SerialPort:
     """
     A port that can be lost and opened again, with 8 data bits, no parity and 1 stop bit.
 
-    Each method raises `PortError` where the device cannot do it or was disconnected; the port is
-    then closed.
+    Each method raises `PortError` where the device fails; the port is then closed.
     """
 
     def __init__(self, path: str, baud: int):
@@ -172,13 +166,11 @@ class Connection:
     again after 0.1 s, then with twice the delay each time, up to 5 s, until samples come. Many
     boards restart when their port is opened, so the port then stays open for 5 s more, and the
     gyro is requested to send each second, until the first sample. With the protocol ``'auto'`` it
-    first listens, at each baud in turn unless one is given, and sends nothing. The recognized
-    protocol is kept after a loss of the port, as long as its samples come.
+    first listens, at each baud in turn unless one is given, and sends nothing.
 
     The port is a path, or a pattern that finds it under any name; the baud is in bit/s, 0 for that
-    of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` where the
-    protocol is unknown, or settings that it needs are missing. Tests have a clock of their own, s,
-    and ports in place of a `SerialPort`.
+    of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` for an
+    unknown protocol, or missing settings. Tests have a clock of their own, s, and ports.
     """
 
     def __init__(self, port: str, protocol: str, baud: int = 0,
@@ -363,7 +355,7 @@ class Connection:
 def sample_messages(sample: Sample, stamp: int, frame: str,
                     variance: float) -> list[tuple[str, bytes]]:
     """
-    Return message types and serialized messages of a sample: its temperature if known, its rate.
+    Return types and serialized messages of a sample: its temperature if known, its rate.
 
     The stamp is in ns, the variance of the rate in (rad/s)².
     """

@@ -197,10 +197,10 @@ class SampleClock:
     """
     Stamps samples; stamps increase strictly.
 
-    Corrections by the line are slewed. A stamp jumps only where later arrivals show that samples
-    were lost. The nominal rate of the gyro, Hz, is used for the first samples only: its clock is
-    2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0 without one, and
-    `min_stamp` the last stamp of another clock.
+    Corrections by the line are slewed; a stamp jumps only where later arrivals show a loss. The
+    nominal rate, Hz, is used for the first samples only: clocks of gyros are 2 to 3 % off.
+    `modulus` is that of `Sample.sequence`, 0 without one, and `min_stamp` the last stamp of
+    another clock.
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
@@ -402,11 +402,10 @@ class HostTimeConverter:
     def convert_sample(self, stamp: float, previous_time: float, usual_interval: float,
                        arrival_interval: float = 0.0) -> float:
         """
-        Return the time of a sample, s; all arguments are in s.
+        Return the time of a sample, s; the usual interval, s, is inf while it is not known.
 
-        The previous time is -inf for the first sample, which shows no step, and the usual interval
-        inf while it is not known. Over a gap the jump of the stamps equals the time between their
-        arrivals, but not over a step of the clock.
+        Over a gap the stamps jump by the time between their arrivals, but not over a step of the
+        clock.
         """
         if previous_time == -math.inf:
             self._unshown_steps.clear()

@@ -9,10 +9,9 @@
 # under the License.
 
 """
-The logs of a fleet: of which unit, type and drive each is, and its record.
+The logs of a fleet: of which unit, type and drive each is, by a table, file names or notes.
 
-Unit, type and drive are in a table, in the names of files, or in notes. The record has the
-calibration and the diagnosis.
+The record of a log has its calibration and its diagnosis.
 """
 
 from __future__ import annotations
@@ -113,9 +112,8 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     """
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
 
-    A log that is named several times is one entry. A table inside a folder is used as well; the
-    results of an earlier fleet, and of this one in `excluded_folder`, are not. Raise `InputError`
-    where there is none, or a table is wrong or contradicts another one.
+    A table inside a folder is used as well; the results of a fleet, also in `excluded_folder`, are
+    not. Raise `InputError` where there is none, or a table is wrong or contradicts another one.
     """
     found: dict[str, FleetLog] = {}
     visited = {os.path.realpath(excluded_folder)} if excluded_folder else set()
@@ -261,8 +259,6 @@ def _fit_rest(log: Log) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class LogTask:
-    """The work on a log, with its options."""
-
     entry: FleetLog
     folder: str  # of the results
     technology: str = 'mems'  # of the gyros, one of `selection.TECHNOLOGY_PRIORS`
@@ -285,12 +281,9 @@ def process_log(task: LogTask) -> dict[str, Any]:
     """
     Return the record of a log, and store it; a stored record of the same content is used again.
 
-    It is JSON data, and equal to the bit on all machines. A change of unit, type or drive in a
-    table does not cause a new computation.
-
-    ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
-    ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
-    ``diagnosis`` is a summary.
+    It is JSON data, equal to the bit on all machines: a ``status``, `DONE` or `NO_EVIDENCE` with a
+    ``reason``; ``sha256`` of the file and ``content`` of its values; ``values`` by name, with
+    standard deviation and unit; a summary of the ``diagnosis``.
     """
     try:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
@@ -379,12 +372,7 @@ def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
 
 
 def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[float, float] | None]:
-    """
-    Return the method of calibration of a log, its model, and the time offset of its reference.
-
-    The offset, s, comes with its standard deviation. A log at rest gives the bias only, and any
-    other one is calibrated by `calibrate`. Raise `DataRefused` with the reason and the remedy.
-    """
+    """Return method, model, and time offset of the reference of a log, s, with its deviation."""
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
     refuse_mismatch(log)

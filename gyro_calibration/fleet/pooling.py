@@ -107,7 +107,7 @@ class _Equations:
     Sums over logs of the mixed-model equations, as matrices that multiply the weights of logs.
 
     The columns are the fixed effects, the drives, and the values, whose last row is the right
-    side. Units are eliminated; they have the parts value and slopes.
+    side.
     """
 
     def __init__(self, observed: Observations, fixed: Array, has_drives: bool):
@@ -409,8 +409,8 @@ class PooledValue:
         """
         Add the most significant one of several fixed effects.
 
-        Return its place, the value pooled with it, its size, and the p-value of the largest of so
-        many.
+        Return its place, the value pooled with it, its size, and its p-value times the number of
+        effects.
         """
         scores, none = [], np.array([-1])
         for column in columns:
@@ -498,8 +498,7 @@ def find_changes(pooled: PooledValue, date: _IntegerArray, units: Sequence[str],
     """
     Return the most significant change of a unit between dates, beyond the scatter of power-ons.
 
-    `date` is the number of the date of each log, or -1, shape (n,); the significance is the
-    probability of a change where there is none.
+    `date` is the number of the date of each log, or -1, shape (n,).
     """
     unit = pooled.observed.unit
     candidates = [(int(one), int(since)) for one in np.unique(unit)

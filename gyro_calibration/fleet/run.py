@@ -37,8 +37,7 @@ def process_executor(workers: int, memory: float | None = None,
     """
     Give an executor of processes on this machine, and shut it down at the end.
 
-    `memory` is the number of bytes that each of the workers may allocate; modules of `preload` are
-    imported once, and not by each new worker.
+    `memory` is the number of bytes that each worker may allocate; `preload` are modules.
     """
     context = get_context('forkserver')
     context.set_forkserver_preload(list(preload))
@@ -68,8 +67,7 @@ def cluster_executor(address: str) -> Iterator[Executor]:
     """
     Give an executor of a Dask cluster.
 
-    Raise `ImportError` where `distributed` is not installed, `OSError` or `ValueError` where no
-    scheduler answers at the address, or it is none.
+    Raise `ImportError` without `distributed`, `OSError` or `ValueError` without a scheduler there.
     """
     from distributed import Client
     if '://' not in address:  # a client without a scheduler blocks when it is deleted

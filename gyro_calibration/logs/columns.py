@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-Names and units of the columns of a log.
-
-A name of the log format states quantity and unit. The user assigns other names, with a unit, as
-`gyro=wz:deg/s`; without a unit, SI is assumed.
-"""
+"""Names and units of the columns of a log; the user may assign others, as `gyro=wz:deg/s`."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -84,9 +79,8 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
     """
     Return the column of each quantity of a log, and of each part of an `ATTITUDE`.
 
-    `user_columns` has the name of a quantity in options -> name of its column, or name:unit. The
-    axis is that of names that contain one. Raise `InputError` for an unknown quantity, column or
-    unit, a quantity in two columns, or no output.
+    `user_columns` has the name of a quantity in options -> name of its column, or name:unit. Raise
+    `InputError` for an unknown quantity, column or unit, a quantity in two columns, or no output.
     """
     found, by_user = dict[str, Column](), set[str]()
     for name, text in user_columns.items():

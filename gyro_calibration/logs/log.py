@@ -9,14 +9,14 @@
 # under the License.
 
 """
-Read and write logs.
+Logs, read from CSV files and written to them.
 
-A log is a CSV file, one row a sample or, without time, one row a dwell of a rate table. The header
-names each column with its unit.
+A row is a sample or, without time, a dwell of a rate table. The header names columns and units.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv
@@ -52,16 +52,12 @@ NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
 CACHE_BLOCK_SAMPLES = 1 << 15
-BLOCK_ROWS = 1 << 16  # rows in a block of a log
 MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
 _MAX_LINE_LENGTH = 1 << 16  # characters
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
-
 #: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
 MAX_TIME = 1e12
-#: Largest magnitudes where they are not `MAX_MAGNITUDE`: a single larger one decides a fit, degC.
-_MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
 #: Line numbers of the rows and the line after, quantity -> values in SI, other columns as text.
 _ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
@@ -104,7 +100,6 @@ class Log:
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Convert lists and columns of a DataFrame to arrays, and refuse what is no log."""
         arrays = {quantity: _to_floats(quantity, values) for quantity in QUANTITIES
                   if (values := getattr(self, quantity)) is not None}
         _refuse_invalid(arrays, {})
@@ -127,8 +122,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     Read a log file (.csv or .csv.gz), with the parameters of `api.read_log`.
 
     Values are separated by commas or spaces, or by semicolons or tabs; then the decimal mark may
-    be a comma.
-    `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
+    be a comma. `on_progress` takes the number of bytes read. A `LogError` names file, row, column.
     """
     blocks: list[tuple[dict[str, Any], dict[str, tuple[str, ...]]]] = []
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
@@ -141,7 +135,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
             lines = (' '.join(line.split()) + '\n' for line in lines)
         if rate is not None:
             table.columns.pop('time', None)
-        while block := list(itertools.islice(lines, BLOCK_ROWS)):
+        while block := list(itertools.islice(lines, CACHE_BLOCK_SAMPLES)):
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
@@ -204,7 +198,7 @@ def _iter_lines(text: io.TextIOWrapper, budget: ExpansionBudget | None) -> Itera
     for line in iter(partial(text.readline, _MAX_LINE_LENGTH + 1), ''):
         if budget:
             budget.spend(len(line))
-        if len(line) < 3 and not line.strip('\r\n') and len(empty) < BLOCK_ROWS:
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < CACHE_BLOCK_SAMPLES:
             empty.append(line)
             continue
         if len(line) > _MAX_LINE_LENGTH:
@@ -241,15 +235,13 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
     found = find_columns(header, columns, axis)
     positions = {column.position for column in found.values()}
     # the other names, made unique: a second x becomes x.1
-    others, taken, numbers = dict[str, int](), set(header), dict[str, int]()
+    others, names, numbers = dict[str, int](), set(header), Counter[str]()
     for index, name in enumerate(header):
-        unique = name
-        while name in numbers and unique in taken:
-            numbers[name] += 1
-            unique = f'{name}.{numbers[name]}'
-        numbers.setdefault(name, 0)
-        taken.add(unique)
         if index not in positions and name not in COLUMNS:
+            unique = name
+            while unique in others or unique != name and unique in names:
+                numbers[name] += 1
+                unique = f'{name}.{numbers[name]}'
             others[unique] = index
     return (_FileHeader(tuple(notes), header, found, others, delimiter),
             len(notes) + rows.line_num + 1)
@@ -279,7 +271,7 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
 
 def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_line: int,
                      table: _FileHeader) -> _ParsedRows:
-    """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
+    """Parse rows with texts, which may span lines; name a faulty row and column."""
     reader = csv.reader(itertools.chain(lines, remaining_lines), delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
@@ -311,7 +303,7 @@ def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_lin
         wrong = mask_invalid(values, quantity)
         if wrong.any():
             number = int(np.argmax(wrong))
-            fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
+            fault = (f'beyond the limit of {_max_magnitude(quantity):g}'
                      if np.isfinite(values[number]) else 'not a finite number')
             raise LogError(f'line {places[number]}, column {header[index]}: '
                            f'{excerpt(texts[number])} is {fault}; remove the row')
@@ -325,9 +317,14 @@ def _to_number(text: str) -> float:
     return float(text)
 
 
+def _max_magnitude(quantity: str) -> float:
+    # a single larger temperature decides a fit, degC
+    return 1e5 if quantity == 'temperature' else MAX_MAGNITUDE
+
+
 def mask_invalid(values: Array, quantity: str) -> Mask:
     """Tell which values a log cannot hold: beyond the limit, or nan where it may not be lost."""
-    valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
+    valid = np.abs(values) <= _max_magnitude(quantity)
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
 
@@ -354,7 +351,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     """
     Return a log from a pandas DataFrame, or from a mapping of names to arrays of shape (n,).
 
-    Raise `LogError` for no output, different lengths, values that are no numbers, unordered time.
+    Raise `LogError` for no output, or values that are no log.
     """
     try:
         header = [str(name) for name in table]
@@ -411,13 +408,12 @@ def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
 
 def _replace_attitude(arrays: dict[str, Array], axis: str) -> None:
     """
-    Replace the parts of a quaternion, in quantity -> values, by the `ROTATIONS`.
+    Replace the parts of a quaternion from sensor to room, in quantity -> values, by `ROTATIONS`.
 
     The rotation about an axis is the angle that a gyro with this axis turns, tilted or not: the
     rotations between neighbouring attitudes are added by their component along the axis of the
-    sensor, less what coning adds to it (Bortz 1971). A quaternion turns axes of the sensor into
-    those of the room. Over a gap in which the axis of the rotation changes, that component is not
-    the angle: there the gyro's own angle is taken, if it drifts by less.
+    sensor, less what coning adds to it (Bortz 1971). Over a gap in which the axis of the rotation
+    changes, the gyro's own angle is taken, if it drifts by less.
     """
     if ATTITUDE[0] not in arrays:
         return
@@ -472,11 +468,10 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     """
     Unwrap a heading, and return it with whether the gyro determined a number of turns.
 
-    Where the reference was lost or is slow, it may turn by more than half a turn from one value to
-    the next. The integral of the gyro then gives the number of turns. Its sign and bias against
-    the reference are estimated from the values that lie close together. A heading in deg instead
-    of rad is left as it is, as its unit is to be corrected first. The reference, s and rad, has
-    shape (m,), nan where it was lost; time and output of the gyro, s and rad/s, shape (n,).
+    Over gaps and of a slow reference, the integral of the gyro gives the number of turns. A
+    heading in deg instead of rad is left as it is, as its unit is to be corrected first. The
+    reference, s and rad, has shape (m,), nan where it was lost; time and output of the gyro, s and
+    rad/s, shape (n,).
     """
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
     if known.sum() < 2:
@@ -514,7 +509,7 @@ def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
 
 
 def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: Array) -> bool:
-    """Tell whether a heading exceeds a turn and, by the gyro, is in deg instead of rad."""
+    """Tell whether a heading exceeds a turn and, by the gyro, is not in rad."""
     _, factor = _heading_by_gyro(reference_time, heading, time, output)
     return (float(np.ptp(heading)) > (1.0 + _FULL_TURN_MARGIN) * 2.0 * math.pi
             and 1.0 / MAX_PLAUSIBLE_FACTOR < DEGREE * abs(factor) < MAX_PLAUSIBLE_FACTOR)
@@ -557,11 +552,7 @@ def refuse_wrapped(log: Log) -> None:
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] = {}) -> None:
-    """
-    Write a log, .csv or .csv.gz, in SI columns and its other columns, atomically.
-
-    `more` holds further columns: name -> array of shape (n,).
-    """
+    """Write a log and more columns, name -> (n,), to .csv or .csv.gz in SI, atomically."""
     columns: dict[str, Any] = {
         name: getattr(log, quantity) for name, (quantity, factor) in COLUMNS.items()
         if factor == 1.0 and getattr(log, quantity) is not None}
@@ -573,8 +564,8 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] = {}) -> Non
           if str(path).endswith('.gz') else nullcontext(file) as data):
         text = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
         text += format_rows([columns])
-        for begin in range(0, len(log), BLOCK_ROWS):
-            parts = (each[begin:begin + BLOCK_ROWS] for each in columns.values())
+        for begin in range(0, len(log), CACHE_BLOCK_SAMPLES):
+            parts = (each[begin:begin + CACHE_BLOCK_SAMPLES] for each in columns.values())
             text += format_rows(zip(*(part if isinstance(part, list) else part.tolist()
                                       for part in parts)))
             data.write(text.encode('utf-8', 'backslashreplace'))

@@ -64,8 +64,7 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
     """
     Return the standard deviation of the white part of a signal, by its differences.
 
-    Those with nan are left out. Their order is 3 in motion, and 1 at rest, which shows filtered
-    noise best.
+    Their order is 3 in motion, and 1 at rest, which shows filtered noise best.
     """
     off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]

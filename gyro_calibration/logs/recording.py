@@ -11,10 +11,9 @@
 """
 Conversion of a ROS 2 recording to a `Log` at the stamps of the gyro.
 
-The gyro is an Imu; temperature and reference are interpolated at its stamps. Other message types
-with a rate, an orientation or a temperature are used where their topic is named. Times are the
-stamps of the headers; times of receipt are used only where headers have no stamps. Notes list this
-and all other corrections.
+Temperature and reference are interpolated at these. Other message types with a rate, an
+orientation or a temperature are used where their topic is named. Times are the stamps of the
+headers; times of receipt are used only where headers have no stamps.
 """
 
 from __future__ import annotations
@@ -73,11 +72,7 @@ def _is_same_topic(topic: str, other: str | None) -> bool:
 
 
 class _Topic:
-    """
-    Messages of one topic.
-
-    `rows` has stamp and time of receipt, ns, and the known quantities by name.
-    """
+    """Messages of one topic: `rows` has stamps and times of receipt, ns, and quantities."""
 
     def __init__(self, name: str, kind: str, definition: str, axis: str):
         self.name, self.kind, self.damaged_count = name, kind, 0
@@ -156,8 +151,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     Read a ROS 2 recording: a folder, or a file .mcap or .db3.
 
     A sample rate, Hz, replaces the stamps. `on_progress` takes the number of bytes read, `on_note`
-    each note on selections and corrections. Raise `LogError` for a recording that cannot be read,
-    or has no gyro or several; it names the topics.
+    each note on selections and corrections. `LogError` names the topics where the gyro is not
+    known.
     """
     contents, found = Contents(), dict[str, _Topic]()
     for message in read_messages(path, contents, on_progress):

@@ -11,11 +11,10 @@
 """
 ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and written as .mcap.
 
-The recording of a killed program lacks its closing part and index, so neither is used: records
-are read from the beginning up to the end, or to the point of truncation. No record may take more
-memory than `MAX_RECORD_BYTES`, and no file may expand to more than an `ExpansionBudget` of its
-size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
-3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
+The recording of a killed program lacks its closing part and index, so neither is used: records are
+read from the beginning to the end, or to a truncation. No record may take more memory than
+`MAX_RECORD_BYTES`, and no file expand to more than an `ExpansionBudget`: rosbags 0.11.9 takes 3.7
+GB for an MCAP file of 131 kB. The records follow https://mcap.dev/spec.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -121,8 +120,7 @@ def read_messages(path: str | Path, contents: Contents,
     """
     Give the messages of a recording with known quantities, and fill in its contents.
 
-    It is a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd; `LogError` for others. The
-    progress is the number of bytes read.
+    The progress is the number of bytes read.
     """
     done = 0
 
@@ -319,7 +317,7 @@ class McapWriter:
     """
     Makes the bytes of an MCAP file of ROS 2 messages, chunk by chunk; `MCAP_END` closes the file.
 
-    It has no index, without which readers scan a file, since a killed recorder leaves none either.
+    It has no index, as the file of a killed recorder: readers scan it.
     """
 
     def __init__(self, library: str = '', notes: Callable[[], Mapping[str, str]] = dict):

@@ -11,9 +11,8 @@
 """
 Stamps of samples on an even grid.
 
-A gyro samples by its own clock, and the stamps of a host jitter. So the samples are numbered, and
-a line fitted to the stamps gives the interval. Samples are lost where the stamps stay late after a
-long step. Where the stamps catch up again, samples were only delayed.
+Samples are numbered, and a line fitted to the stamps gives the interval. Samples are lost where
+the stamps stay late after a long step; where they catch up again, samples were only delayed.
 """
 
 from dataclasses import dataclass
@@ -34,8 +33,6 @@ MIN_WINDOWS = 50
 
 @dataclass(frozen=True)
 class StampGrid:
-    """Stamps on an even grid."""
-
     time: Array  # s, shape (n,)
     lost_after: Integers  # how many samples are lost after each but the last, shape (n - 1,)
     grid_index: Integers  # index on the grid, shape (n,); long gaps are cut to `max_gap`

@@ -307,8 +307,8 @@ class GyroModel:
         """
         Return the rate, rad/s, at the output and the surroundings of channels.
 
-        The second value tells whether no rate of the `rate_domain` has this output; the correction
-        at the end of the domain is held there.
+        The second value tells whether no rate of the `rate_domain` has this output; then the
+        correction at its end is used.
         """
         output, (independent, dependent) = channels.output, self._split_by_rate
         given = output - _sum_errors(independent, channels)

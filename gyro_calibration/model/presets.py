@@ -32,13 +32,11 @@ class Preset:
 
     @property
     def noise(self) -> Noise:
-        """Return the noise figures in SI."""
         return Noise(self.angle_random_walk * DEGREE / 60.0,
                      self.bias_instability * DEGREE / 3600.0)
 
     @property
     def model(self) -> GyroModel:
-        """Return a model with scale factor error, bias and noise."""
         return GyroModel((Term(SCALE_FACTOR_ERROR, (self.scale_factor_error,)),
                           Term(BIAS, (self.bias * DEGREE,))), noise=self.noise)
 

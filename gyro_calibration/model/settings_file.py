@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-YAML files of settings: models, bias tables, limits.
-
-They are data only: nothing in them is run, and they cannot name other files. A schema states what
-each name may hold.
-"""
+"""YAML files of settings, as data only: nothing in them is run, and they name no other files."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -65,8 +60,8 @@ def validate(key_path: str, value: Any, schema: Any) -> Any:
     """
     Return a value, at a place such as `noise.angle_random_walk`, as parsed by its schema.
 
-    A schema is a function of place and value; or a mapping of optional names to schemas; or None,
-    for a mapping of any names. Raise `InvalidValue` for others.
+    A schema is a function of place and value; a mapping of optional names to schemas; or None, for
+    a mapping of any names. Raise `InvalidValue` for others.
     """
     if callable(schema):
         return schema(key_path, value)

@@ -9,10 +9,9 @@
 # under the License.
 
 """
-Export of a gyro model to the formats of robot simulators.
+Export of a gyro model to robot simulators; each lists the parameters that it leaves out.
 
-Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configuration, MuJoCo from
-a `<gyro>` sensor. Each supports some of the parameters; the export lists those that are left out.
+Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from Python, MuJoCo from a `<gyro>`.
 """
 
 from collections.abc import Callable

@@ -58,8 +58,6 @@ _UNMEASURED_AXES = (*5 * (UNMEASURED_VARIANCE, *6 * (0.0,)),)
 
 
 class _NodeClock:
-    """The clocks of a node; see `inputs.Clock`."""
-
     steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
 
     def __init__(self, node: Node):
@@ -314,7 +312,6 @@ class CompensationNode(Node):
         self._receivers = max(count - 1, 0)
 
     def _drive(self) -> None:
-        """Send the next command and check the guards of a drive."""
         self._count_receivers()
         self._pipeline.poll(self._receivers)
         self._answer_finished_run()

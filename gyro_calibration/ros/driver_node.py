@@ -75,9 +75,8 @@ class DriverNode(Node):
     """
     Publishes ``imu/data_raw``, ``imu/temperature`` and ``/diagnostics``; see `PARAMETERS`.
 
-    Stamps are those of the node's clock. With ``use_sim_time`` that is the simulated time, and the
-    system time before a simulation starts. A gyro on a port measures in real time: its rates are
-    wrong in a simulation that runs faster or slower.
+    Stamps are those of the node's clock, and the system time before a simulation starts. A gyro on
+    a port measures in real time, so its rates are wrong in a faster or slower simulation.
     """
 
     def __init__(self) -> None:

@@ -9,12 +9,11 @@
 # under the License.
 
 """
-Tests of the noise and the bias of a gyro at rest against its model.
+Tests of the noise and the bias of a gyro at rest against its model, and for repeats and pulses.
 
-Samples are collected in stretches of `REST_DURATION` s with a steady rate, as at rest. In each
-stretch the mean square of differences of neighbouring blocks is tested against the noise of the
-model, and the mean rate against zero. The levels of both tests follow from a stated rate of false
-alarms.
+Samples are collected in stretches of `REST_DURATION` s with a steady rate. In each the mean square
+of differences of blocks is tested against the noise of the model, and the mean rate against zero,
+at levels by a stated rate of false alarms.
 """
 
 from __future__ import annotations
@@ -50,8 +49,6 @@ _DECIDING_STRETCHES = 3
 
 @dataclass(frozen=True)
 class _RestResult:
-    """The result of one stretch at rest."""
-
     noise_ratio: float  # standard deviation of the noise over that of the model
     is_noise_normal: bool  # within chance and tolerance
     bias: float  # mean rate, rad/s
@@ -64,23 +61,22 @@ class RepeatedOutputDetector:
     """
     Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
-    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the
-    noise is larger than the steps of the output, or if chance is excluded. Some gyros report
-    zero at rest: a repeated zero counts only after a deceleration that no robot has, 20
-    rad/s², unless wheels stand then, or if a whole stretch at rest had the noise of the model
-    before the first such zero. Two neighbouring codes, as of a dead gyro whose last bit
-    toggles, count if chance is excluded; zero as above. What counts does so until the value
-    changes.
+    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
+    larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
+    a repeated zero counts only after a deceleration that no robot has, unless wheels stand then,
+    or if a whole stretch at rest had the noise of the model before the first such zero. Two
+    neighbouring codes, as of a dead gyro whose last bit toggles, count if chance is excluded; zero
+    as above.
 
     A gyro with noise `is_suspected` while it repeats the value of its first sample, whose step is
-    not known, or zero against chance for the first time: it is dead, or shows that at rest. Later
-    such zeros mean that it `is_zeroed`: it has neither noise nor bias now. Where what is suspected
-    ends with an acceleration that no robot has, it was dead, unless wheels stood until then.
+    not known, or zero against chance for the first time. Later such zeros mean that it
+    `is_zeroed`: it has neither noise nor bias now. Where what is suspected ends with an
+    acceleration that no robot has, it was dead, unless wheels stood until then.
 
-    A value that was held for less time, but longer than usual and not by chance, leaves a possible
-    error of the integrated rate, `unseen_turn`, rad, with the sample that ends it; a full turn
-    where the first value shows later, by step and noise, to have been that of a dead gyro. Each
-    value is rounded to the steps of the output, by an error that lasts until the next one.
+    A value held for longer than usual, not by chance, leaves a possible error of the integrated
+    rate, `unseen_turn`, rad; a full turn where the first value shows later to have been that of a
+    dead gyro. Each value is rounded to the steps of the output, by an error that lasts until the
+    next one.
     """
 
     def __init__(self, noise: Noise):
@@ -101,8 +97,8 @@ class RepeatedOutputDetector:
         """
         Add a sample, s and rad/s, and tell if it is repeated.
 
-        The rate by odometry, rad/s, is 0 without any; `stands` is whether wheels show standstill,
-        `rests` whether they or the statistics of the rate do.
+        The rate by odometry, rad/s, is 0 without any; wheels show that the robot `stands`, or the
+        statistics of the rate that it `rests`.
         """
         step = abs(output - self._value)
         if step:
@@ -190,23 +186,15 @@ class RepeatedOutputDetector:
         return self._rounding_variance + self._rounded_turn ** 2
 
     def reset_heading(self) -> None:
-        """Let the heading be exact now."""
         self._rounding_variance = self._rounded_turn = 0.0
 
     @property
     def has_changed(self) -> bool:
-        """Tell whether a second value came."""
         return self._changes > 1
 
     def _excludes_chance(self, width: float, count: float, interval: float,
                          level: float = 100.0) -> bool:
-        """
-        Tell whether a live gyro cannot have `count` samples within a width, rad/s.
-
-        The noise of a sample, of an interval in s, may be lower than that of the model. The
-        probability must be below e^-level: e^-100, since it is e^-25 for a gyro that sends each
-        sample four times.
-        """
+        """Tell whether chance is below e^-level for samples of noise within a width, rad/s."""
         if not (sample := self._noise.angle_random_walk / math.sqrt(interval)):
             return False
         stays = math.erf(_MAX_NOISE_REDUCTION * width / (2.0 * math.sqrt(2.0) * sample))
@@ -218,7 +206,7 @@ class PulseDetector:
     Detector of samples that deviate from those before and after as no rate of a robot does.
 
     A pulse begins with a step of more than 20 rad/s² and ten times the median one of the last 2 s,
-    and ends with such a step back, at most 0.25 s later: a fast turntable swings in 0.5 s.
+    and ends with such a step back, at most 0.25 s later.
     """
 
     def __init__(self) -> None:
@@ -257,21 +245,16 @@ class PulseDetector:
 
 
 class HealthMonitor:
-    """
-    Monitor of noise and bias at rest on a robot.
-
-    The alarms are a sentence each, or ''; `examined_count` is the number of stretches at rest, and
-    `has_noise_at_rest` tells whether one had the noise and the bias of the model.
-    """
+    """Monitor of noise and bias at rest on a robot; its alarms are a sentence each, or ''."""
 
     def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0,
                  largest_bias: float = math.inf):
         """
-        Start without samples; `noise` is that of the model.
+        Take the noise of the model, the largest rate of false alarms, 1/h, and rates in rad/s.
 
-        The largest rate of false alarms at rest is in 1/h. Means below the standstill rate, rad/s,
-        are rest; one above may be a steady turn, and counts only if it stays in several stretches,
-        and, unless a rest is known otherwise, is below the largest bias, rad/s.
+        Means below the standstill rate are rest; one above may be a steady turn, and counts only
+        if it stays in several stretches, and, unless a rest is known otherwise, is below the
+        largest bias.
         """
         self._noise, self.standstill_rate = noise, standstill_rate
         self._largest_bias = largest_bias
@@ -290,7 +273,6 @@ class HealthMonitor:
         self._samples = []
 
     def reset_biases(self) -> None:
-        """Discard past biases after a new calibration."""
         self.restart()
         self._rests.clear()
         self.bias_alarm = ''
@@ -304,11 +286,7 @@ class HealthMonitor:
 
     def examine_stretch(self, bias_variance: float, age: float, is_announced: bool,
                         is_resting: bool = False) -> _RestResult | None:
-        """
-        Test the complete stretch as `examine_stretch` does, and start the next one.
-
-        A rest is announced by a run, or shown by wheels or tracker; else the robot may turn.
-        """
+        """Test the complete stretch, and start the next; a run announces a rest."""
         # the last sample is alone in its part, and may be the first of a turn
         time, output, rate = np.array(self._samples[:-1]).T
         self.restart()
@@ -353,15 +331,12 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
                     step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0
                     ) -> _RestResult | None:
     """
-    Test a stretch of samples against noise and bias of a model.
-
-    A coarsely quantized output does not show the noise: the tests allow for the error by rounding.
+    Test a stretch of samples against noise and bias of a model; None where it tells nothing.
 
     Time, output and rate, after model and self-calibration, are in s and rad/s, of shape (n,); the
     level is the probability of each of the four false alarms, the step that of the quantization,
     rad/s, inf where the output never changed. The variance of the bias, (rad/s)², is that of its
-    calibration of an age in s, nan where it is not known. Return None where the rate is not
-    steady, samples are too few, or values are too large.
+    calibration of an age in s, nan where it is not known.
     """
     if max(np.abs(output).max(), np.abs(rate).max()) > MAX_MAGNITUDE:
         return None  # the squares may overflow

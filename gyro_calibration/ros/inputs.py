@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-What a node takes from outside, without rclpy: parameters, clocks, motion of the wheels.
-
-Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
-ROS time, which may be paused. The motion is that of odometry and commands of the last second.
-"""
+"""What a node takes from outside, without rclpy: parameters, clocks, motion of the wheels."""
 
 from __future__ import annotations
 
@@ -112,18 +107,17 @@ class StampDelay:
     """
     Delay of stamps behind the clock of a node, and tests whether both advance equally.
 
-    `unknown_turn` is the largest error of a heading by the stamps so far, rad. Transport and a
-    busy computer delay samples, but the least delay in the longest duration follows the stamps.
-    Its changes, less the mean one so far since the clock of a gyro may drift, are time that the
-    heading has missed or counted twice, at the rate of that moment.
+    Transport and a busy computer delay samples, but the least delay in the longest duration
+    follows the stamps. Its changes, less the mean one since the clock of a gyro may drift, are
+    time that the heading has missed or counted twice, with an error of up to `unknown_turn`, rad.
     """
 
     def __init__(self, clock: Clock, window: float, *tolerances: tuple[float, float]):
         """
-        Start without samples.
+        Compare with the delays of a window, s, by tolerances, the shortest duration first.
 
-        The test compares with the delays of a window, s. A tolerance is a duration, s, the
-        shortest one first, in which some samples are not late, and a change of their delay, s.
+        A tolerance is a duration, s, in which some samples are not late, and a change of their
+        delay, s.
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
         # Time of arrival and delay, s, and heading, rad, of samples with less delay than any after
@@ -147,7 +141,6 @@ class StampDelay:
         return now - time - self.min_delay
 
     def _use_least(self) -> None:
-        """Compare the least delay with that before."""
         (then, delay, heading), self._least = self._least, self._min_delays[0]
         now, late, turned = self._least
         self._first_time = min(self._first_time, now)
@@ -209,8 +202,8 @@ class ArrivalOrder:
     """
     Order of the stamps of one publisher, of which some may come late: after a later one.
 
-    Three late ones in a row are those of a clock that was set back. Late ones at equal intervals,
-    up to a factor of two, while others come in between are of a second gyro.
+    Three late ones in a row are of a clock that was set back. Late ones at equal intervals, up to
+    a factor of two, while others come in between are of a second gyro.
     """
 
     def __init__(self) -> None:
@@ -233,7 +226,6 @@ class ArrivalOrder:
 
 
 class RosTime:
-    """Whether ROS time advances."""
 
     def __init__(self) -> None:
         # time since its last advance, s of the steady clock; 0 where it is not simulated, inf
@@ -290,14 +282,13 @@ class TurnComparison:
     Comparison of the turns by the gyro with those by odometry or commands, a radian at a time.
 
     Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
-    beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
-    wheels; a robot may be turned by others than the commands, or scale them. So against commands
-    the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+    beyond the geometric mean of 1 and that of deg/s to rad/s. As a robot may be turned by others
+    than the commands, or scale them, the ratio by commands times the rate by the gyro, usually
+    about 1 rad/s, must exceed 57.3 rad/s.
 
     The sensitivity of the gyro is wrong where it turns further than odometry from one standstill
-    to the next, twice in a row and by more than the largest scale factor error that a calibration
-    accepts: wheels that slip turn further than the gyro.
+    to the next, twice in a row and by more than the largest scale factor error of a calibration:
+    wheels that slip turn further than the gyro.
     """
 
     def __init__(self) -> None:
@@ -313,11 +304,7 @@ class TurnComparison:
 
     @property
     def turn_at_rest(self) -> tuple[float, float, float]:
-        """
-        Return duration, s, and turn by the gyro, rad, while odometry shows standstill.
-
-        The least rate in a second of it, rad/s, follows: a push is over, a bias is not.
-        """
+        """Return duration, s, turn, rad, and least rate in a second, at standstill."""
         # two seconds pass before a robot stands, and one until a late odometry shows its turn
         if len(self._at_rest) < 4:
             return 0.0, 0.0, 0.0
@@ -360,7 +347,6 @@ class TurnComparison:
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
     def _check(self, name: str, fault: str) -> None:
-        """Take what a turn shows of a fault, or ''."""
         before, self._last_faults[name] = self._last_faults[name], fault
         self.faults[name] = fault and before and f'the gyro turns by {fault}'
 
@@ -379,12 +365,11 @@ class AlternateTurns:
     """
     Comparison of the turns by every other sample, and by those between, half a radian at a time.
 
-    Both turns are equal, of samples of a single gyro. They contradict each other where they differ
-    by more than the largest scale factor error that a calibration accepts, in the same proportion
-    in turns of a row whose sense changes twice: samples of another gyro, with another axis or
-    without a function, have the same topic and frame. A vibration near half the sample rate has
-    the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
-    biases of the two may differ.
+    Both are equal, of samples of a single gyro. They contradict each other, as with another gyro
+    on the topic, where they differ by more than the largest scale factor error of a calibration,
+    in the same proportion in turns of a row whose sense changes twice: a vibration near half the
+    sample rate has the opposite proportion in the other sense. Turns of less than 0.025 rad/s do
+    not count, as the biases of the two may differ.
     """
 
     def __init__(self) -> None:

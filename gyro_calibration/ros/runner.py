@@ -9,14 +9,10 @@
 # under the License.
 
 """
-Common functions of nodes: parameters, QoS of topics, diagnostics, start and shutdown.
+Start and end of nodes, and what all of them declare and publish.
 
-A node is a subclass of `rclpy.node.Node` that declares its table of parameters in its constructor
-and joins its threads in `destroy_node`. Its ``main`` is ``return run_node(TheNode)``.
-
-Signals set an event, the loop of `spin_once` ends, threads are joined, and then the node is
-destroyed. The handlers of rclpy invalidate the context while a callback still publishes, which
-ends some runs in a traceback.
+Signals set an event, the loop of `spin_once` ends, `destroy_node` joins threads. The handlers of
+rclpy invalidate the context while a callback still publishes, which ends some runs in a traceback.
 """
 
 from __future__ import annotations
@@ -85,10 +81,9 @@ def declare_parameters(
         node: Node, table: Sequence[NodeParameter],
         on_change: Callable[[SimpleNamespace], None] | None = None) -> SimpleNamespace:
     """
-    Declare the parameters of a table and return their values as one record.
+    Declare a table of parameters, and return their values as one record.
 
-    `on_change` is called with the record of all values after a change. `ValueError` says in a
-    sentence that an override has the wrong type or is out of range.
+    `on_change` is called with the new record after a change. `ValueError` names a wrong override.
     """
     known = {each.name: each for each in table}
 
@@ -174,10 +169,10 @@ class Diagnostics:
 
 def run_node(node_class: Callable[[], Node]) -> int:
     """
-    Start a node, spin it until SIGINT, SIGTERM or SIGHUP, and return the exit code of the process.
+    Spin a node until SIGINT, SIGTERM or SIGHUP; return the exit code of the process.
 
-    It is 0 after a signal, and 2 where an argument or a parameter was refused, with a sentence on
-    standard error.
+    It is 0 after a signal, and 2, with a sentence on standard error, where the node refused a
+    value.
     """
     stop = threading.Event()
     handle_end_signals(lambda *_: stop.set())

@@ -36,18 +36,12 @@ class StateStore:
     """
     The files of one gyro: its model, empty if it cannot be read, and its table of biases at rest.
 
-    `problem` says why the rates are uncalibrated, `calibration_hint` and `table_hint` a fault of
-    the calibration file and of the table, `shared_hint` that another process has written to a
-    file, each in a sentence or ''. `table_written_time` is in s since 1970, None before the first.
+    `problem` says why the rates are uncalibrated; each hint names a fault of a file, or is ''.
     """
 
     def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior,
                  max_bias: float = RunLimits.max_bias):
-        """
-        Read the files, and use those without a fault.
-
-        A model with a bias beyond the largest one, rad/s, is a fault.
-        """
+        """Read the files; a model with a bias beyond the largest one, rad/s, is a fault."""
         self._max_bias = max_bias
         self._calibration_file, self._bias_file = calibration_file, bias_file
         self.problem = self.calibration_hint = ''
@@ -142,12 +136,7 @@ class StateStore:
 
 
 def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
-    """
-    Raise `InvalidValue` for a model by which no gyro of a robot can be compensated.
-
-    Bias, rad/s, and scale factor error are limited as those of a run are. By its noise a heading
-    must not be unknown within a second, as one of any direction, with a deviation of pi / sqrt(3).
-    """
+    """Raise `InvalidValue` for a bias, scale factor or noise that no gyro of a robot has."""
     limits = {'scale_factor_error': (RunLimits.max_scale_factor_error, 'a fraction, not in %'),
               'bias': (max_bias, 'in rad/s; calibration.maximum_bias allows another one')}
     for term in model.terms:
@@ -164,7 +153,6 @@ def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
 
 
 def _existing_version(file: Path) -> tuple[int, int] | None:
-    """Return the version of a file; None where there is none."""
     try:
         return file_version(file)
     except OSError:

@@ -56,8 +56,7 @@ def recognize_protocol(data: bytes, settings: Settings) -> Protocol | None:
     """
     Return the format that explains the last 8192 bytes; None if ambiguous, or too few bytes.
 
-    The settings may be incomplete for the recognized format. `csv` is recognized by the number of
-    their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
+    The settings may be incomplete for it; `csv` is recognized by the number of their columns.
     """
     data, scores = data[-8192:], []
     for protocol in PROTOCOLS.values():  # the share of the bytes in frames, and these frames

@@ -146,8 +146,6 @@ class Splitter:
 
 @dataclass(frozen=True)
 class Protocol:
-    """A wire format."""
-
     name: str  # of the parameter ``protocol``
     text: str | None  # what documents state: devices, layout of a frame, sources, unverified
     baud: int  # with 8 data bits, no parity and 1 stop bit
@@ -249,7 +247,6 @@ class Decoder:
 
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
-    What is refused and discarded is added to the counts.
     """
 
     def __init__(self, protocol: Protocol, settings: Settings, counts: Counts):
@@ -307,8 +304,8 @@ class LineSplitter(Splitter):
     """
     Splits bytes into complete, nonempty lines without their ends.
 
-    A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
-    first line is discarded, unless it begins with bytes with which only complete lines begin.
+    The first line, which may be the rest of one, is discarded unless it begins as complete ones
+    do.
     """
 
     def __init__(self, line_starts: tuple[bytes, ...] = ()):
@@ -337,11 +334,10 @@ class LineSplitter(Splitter):
 
 class FrameSplitter(Splitter):
     """
-    Splits bytes into frames that match a pattern and pass their check, from any byte on.
+    Splits bytes into frames that match a pattern (``.`` is any byte) and pass their check.
 
-    In the pattern, a regular expression, ``.`` is any byte; the length is in bytes. If other bytes
-    often pass the check, which is then weak, a frame after other bytes counts only if another one
-    follows directly.
+    If other bytes often pass the check, which is then weak, a frame after other bytes counts only
+    if another one follows directly.
     """
 
     def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool],
