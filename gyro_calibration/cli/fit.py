@@ -46,9 +46,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course'],
-                        help='dwells: means at constant rates; likelihood: by the reference '
-                        'heading; course: by a course over ground. Default: by the columns of the '
-                        'log')
+                        help='means at constant rates; by the reference heading; by a course over '
+                        'ground. Default: by the columns of the log')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
@@ -57,8 +56,8 @@ def add(parser: argparse.ArgumentParser) -> None:
                       help='fit the polynomial over output and temperature of these orders '
                       'instead; default: 3,2')
     parser.add_argument('--technology', choices=list(TECHNOLOGY_EFFECTS), help='of the gyro; '
-                        'selects between effects that the data do not distinguish, and the prior '
-                        'with a reference heading (default there: mems)')
+                        'decides where the data do not, and sets the prior with a reference '
+                        'heading (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
@@ -118,8 +117,8 @@ def run(given: argparse.Namespace) -> Answer:
                        for term in model.terms if term.effect.name == POLYNOMIAL), None)
         lines = list(_dwell_lines(model, found))
         if given.technology and not found.choices:
-            lines.append(f'--technology {given.technology} is stored in the model; it had no '
-                         'influence, since the effects were given.')
+            lines.append(f'--technology {given.technology} had no influence, since the effects '
+                         'were given; it is stored in the model.')
         data |= {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
                  'remarks': [*found.calibration.dwells.remarks,
                              *_describe_excess(found.calibration)]}
@@ -233,8 +232,7 @@ def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
                   else f'two dwells each way at {pair.distinguishing_rate / DEGREE:.0f} deg/s')
         if not pair.is_distinguishable:
             yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
-                            f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
-                            'would distinguish them.')
+                            f'{pair.reason}. They differ beyond these rates; {remedy} would.')
 
 
 def _largest(residual: Array) -> float:
@@ -250,11 +248,10 @@ def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]
         yield (f'Heading error {name}: {rms(residual) / DEGREE:.3f} deg rms, '
                f'{_largest(residual) / DEGREE:.3f} deg at most.')
     if rms(found.residual_after) > 5.0 * DEGREE:
-        remedy = ('The reference has errors of this size, or shows another motion: compare its '
-                  'turns with known ones before using the model.' if found.method == 'course' else
-                  'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
-                  'needs stretches of constant rate in the log.')
-        yield wrap_line(f'The error is above 5 deg rms. {remedy}')
+        yield wrap_line('The error is above 5 deg rms. ' + (
+            'The reference has errors of this size, or shows another motion: compare its turns '
+            'with known ones.' if found.method == 'course' else 'If the gyro is nonlinear or '
+            'depends on temperature, use --method dwells, which needs constant rates.'))
     yield from (wrap_line(as_sentence(remark)) for remark in found.remarks)
 
 
@@ -281,14 +278,14 @@ def _describe_excess(fit: Calibration) -> Iterator[str]:
     if excess > 1.2 and fit.fit_p_value < FALSE_ALARM_RATE:
         yield (f'The residual is {excess:.1f} times the scatter of the dwells about a smooth '
                'surface: the model lacks an effect. The intervals are widened by this factor.')
-    # Where most rates occur once, nothing shows the scatter of dwells beyond their own noise.
+    # where most rates occur once, nothing shows the scatter of dwells beyond their own noise
     places = np.rint(used.rate / max(0.005 * float(np.abs(used.rate).max()), 1e-9))
     squares = float(np.sum((fit.residual[fit.scatter.inliers] / used.deviation) ** 2))
     if 2 * len(np.unique(places)) > len(used) and (
             chi2.sf(squares, fit.dof) < MIN_FIT_PROBABILITY):
         yield (f'The residual is {math.sqrt(squares / fit.dof):.1f} times the noise within the '
-               'dwells. Either they scatter by more than that, or the model lacks an effect, and '
-               'the intervals do not contain its error; repeat the rates in a second sweep.')
+               'dwells: they scatter, or the model lacks an effect, whose error is not in the '
+               'intervals; repeat the rates in a second sweep.')
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
@@ -307,9 +304,7 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
                     f'Condition number {fit.condition_number:.1f}.')
     yield from map(wrap_line, _describe_excess(fit))
     if fit.min_non_monotonic_rate is not None:
-        yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s the modelled '
-                        'output does not increase with the rate, so one output has two rates: do '
-                        'not use the model there.')
+        yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s one modelled '
+                        'output has two rates: do not use the model there.')
     if not fit.dof:
-        yield wrap_line('There are as many values as dwells, so their standard deviations are '
-                        'unknown: add dwells.')
+        yield 'As many values as dwells have no standard deviations: add dwells.'

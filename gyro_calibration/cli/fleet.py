@@ -76,11 +76,11 @@ def run(given: argparse.Namespace) -> Answer:
     tasks = [LogTask(entry, folder, given.technology, pattern, generator, given.gyro_type or '',
                      given.rate) for entry in logs]
     done: dict[str, dict[str, Any]] = {}
-    workers = given.workers or (len(os.sched_getaffinity(0)) if given.scheduler is None else 64)
+    workers = given.workers or len(os.sched_getaffinity(0))
     try:
         with (_make_executor(given, workers) as executor,
               show_progress(f'0 of {len(tasks)} logs') as on_progress):
-            for task, record in run_tasks(process_log, tasks, workers, executor):
+            for task, record in run_tasks(process_log, tasks, executor):
                 if not isinstance(record, dict):
                     reason = f'its worker failed ({type(record).__name__}: {str(record)[:200]})'
                     record = make_refused_record(task.entry, reason)

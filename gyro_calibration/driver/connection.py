@@ -117,13 +117,11 @@ def _describe_error(error: BaseException) -> str:
 
 MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
-#: Longest silence of a board that restarts when its port is opened, and longest delay before a
-#: lost port is opened again, s.
+#: Longest silence of a board that restarts when its port is opened, and of delays to open it, s.
 _RESTART_DURATION = 5.0
 #: Interval of attempts to recognize the protocol, and first delay before a port is reopened, s.
 _ATTEMPT_INTERVAL = 0.1
-#: Listening time at a baud, s, in which a gyro of 10 Hz sends enough; and interval of requests to
-#: send, since a gyro that starts does not receive them.
+#: Listening time at a baud, s, for ten samples of a slow gyro; and interval of requests to send.
 _LISTENING_DURATION = 1.0
 
 
@@ -202,7 +200,6 @@ class Connection:
 
     def chunks(self, stop: threading.Event) -> Iterator[_Chunk]:
         """Give samples as they arrive, until the event is set; the port is then closed."""
-        # While the port is missing, no chunk is given.
         try:
             while not stop.is_set():
                 try:
@@ -225,8 +222,7 @@ class Connection:
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
         """Find protocol and baud; they stay unknown only after a stop."""
-        # The port stays open, since opening it restarts many microcontrollers, which then need
-        # some time until they send.
+        # the port stays open, since opening it restarts many microcontrollers
         self._set_state('listening')
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:
@@ -254,9 +250,8 @@ class Connection:
                                         f'{error}') from error
                     return
             self._report_or_raise(
-                f'bytes come on {self._pattern}, but no protocol was recognized at '
-                f'{", ".join(map(str, self._bauds))} bit/s: set protocol, or for csv name as many '
-                'columns as a line has numbers', end)
+                f'bytes come on {self._pattern}, but of no known protocol at '
+                f'{", ".join(map(str, self._bauds))} bit/s: set protocol, or for csv columns', end)
 
     def _report_or_raise(self, problem: str, deadline: float) -> None:
         """Report a problem while the port stays open; raise `PortError` after a time."""
@@ -307,8 +302,8 @@ class Connection:
                 port.write(protocol.startup)
                 last_request = now
             timeout = max(_SILENCE_TIMEOUT, 3.0 * clock.period)
-            # To open the port again would restart a board that still starts. The second sample
-            # shows the period.
+            # to open the port again would restart a board that still starts; the second sample
+            # shows the period
             deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)
             if now >= min(begin + 0.5 * timeout * (len(seen) + 1), deadline):
                 seen.append((self._read_bytes, counts.device_faults, counts.refused_samples))

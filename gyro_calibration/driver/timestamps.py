@@ -21,8 +21,6 @@ well: all later samples are late by whole periods; and samples counted twice arr
 A computer without a battery starts with a wrong date and is set by months when it finds a time
 server. `NodeTimeConverter` converts a steady clock to stamps of such a clock, `HostTimeConverter`
 converts its stamps to a continuous time.
-
-No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
 """
 
 from collections import deque
@@ -43,8 +41,7 @@ _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock dri
 _SETTLING_DURATION = 2.0
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-#: Largest lateness with a correct sequence, s, above the 16 ms of a burst. Without it, stamps at
-#: 1 kHz are 5.6 ms off instead of 0.06 ms where the host is later by 10 ms for 5 s of each 15 s.
+#: Largest lateness with a correct sequence, s, above the 16 ms of a burst.
 _OUTLIER_LATENESS = 0.02
 _MEDIAN_SIZE = 8  # intervals of a device whose median is the usual one: three may be wrong
 #: Largest difference of a clock that is slewed, not set, s; ntpd sets it from 0.128 s on.
@@ -186,8 +183,8 @@ class _LatenessTest:
         if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
             self.late_since, self._least = arrival, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
-        # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
-        # to a period and falls to zero. So its step is tested, and itself after a longer time.
+        # bursts near a multiple of the sample rate let the lateness grow slowly to a period and
+        # fall to zero: so its step is tested, and itself after a longer time
         self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
                                    else max(0.0, self._least_on_time))
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
@@ -211,13 +208,10 @@ class SampleClock:
         self._last_number, self._slew_offset = 0.0, 0.0
         self._uncertain_losses, self._uncertain_since, self._newly_lost = 0, 0.0, 0
         self._last_stamp, self._last_arrival = min_stamp, -math.inf
-        # while the port was open: missing in the sequence or in the time of the device, damaged,
-        # or shown by the lateness of all later samples
-        self.lost_count = 0
+        self.lost_count = 0  # while the port was open
 
     @property
-    def period(self) -> float:
-        """Seconds from one sample to the next."""
+    def period(self) -> float:  # s
         return self._line.slope * self._counter.mean_advance
 
     @property

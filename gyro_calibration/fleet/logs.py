@@ -56,12 +56,10 @@ import numpy as np
 
 #: Fields of a log in a table, in addition to its path.
 _ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
-#: Ends of files that are logs.
 _LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
 #: Notes, such as "unit: 7".
-_KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
-                         re.IGNORECASE)
+_KEYED_NOTE = re.compile(rf'\b({"|".join(_ENTRY_KEYS)})\s*[:=]\s*([^,;#\s]+)', re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -189,7 +187,7 @@ def _read_header(path: str) -> list[str]:
 
 
 def _resolve_log_path(path: str, log: str) -> str:
-    """Return the path of a log in a table: relative to the table, or to the working folder."""
+    """Return the path of a log in a table, relative to the table or to the working folder."""
     relative = Path(path).parent / log
     return str(relative) if relative.exists() or not Path(log).exists() else log
 
@@ -233,8 +231,6 @@ def _read_notes(path: str) -> dict[str, str]:
 
 # the record of a log
 
-#: Shortest log for the bias at rest, s: in less, white noise hides its wander.
-_MIN_REST_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Schema of the records; records of another one are not read.
@@ -246,8 +242,8 @@ def _fit_rest(log: Log) -> tuple[float, float]:
     output = np.asarray(log.output)
     known = np.isfinite(output)
     time = np.asarray(log.time)[known]
-    if len(time) < 100 or time[-1] - time[0] < _MIN_REST_DURATION:
-        raise DataRefused(f'rests for less than {_MIN_REST_DURATION:.0f} s: record for longer')
+    if len(time) < 100 or time[-1] - time[0] < 60.0:  # white noise hides the wander of the bias
+        raise DataRefused('rests for less than 60 s: record for longer')
     # 60 spans of at least 2 s
     edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
     increments = np.diff(np.interp(edges, time, integrate(time, output[known])))

@@ -90,8 +90,7 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[TypeSummary]:
     for kind in types:
         names = [name for each in logs[kind] for name in each['values']]
         values[kind] = [name for name in dict.fromkeys(names) if names.count(name) > 1]
-    # three tests of each value: outlying units, outlying drives, changes; and three of the effects
-    # of diagnoses: of the type, of a unit, of a drive
+    # of each value outlying units, outlying drives, changes; of effects type, unit, drive
     tests = 3 * sum(map(len, values.values())) + 3 * len(types)
     summaries = []
     for kind in types:

@@ -32,11 +32,11 @@ class CompensatedSamples:
     model_rate: Number  # after the model, before the self-calibration, rad/s
     rate: Number  # rad/s
     temperature: Number  # degC, limited to plausible temperatures
-    # outside the calibrated temperatures; up to `GyroModel.extrapolation_range` the correction is
-    # extrapolated, beyond that held
+    # outside the calibrated temperatures; beyond `GyroModel.extrapolation_range` the correction is
+    # held, up to it extrapolated
     temperature_clipped: Number
-    # the output is outside the calibrated rates, or no rate has it; up to `GyroModel.rate_limit`
-    # the correction is extrapolated, beyond that, or at a fold of the response, held
+    # outside the calibrated rates, or no rate has the output; beyond `GyroModel.rate_limit`, or at
+    # a fold of the response, the correction is held, up to it extrapolated
     beyond_range: Number
 
 

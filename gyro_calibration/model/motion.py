@@ -30,9 +30,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
-#: Largest motion profile, bytes: twice the size of an hour at 100 Hz.
-_MAX_PROFILE_BYTES = 16_000_000
-
 
 class MotionError(InputError):
     """A file is not a motion profile; the message names file and column."""
@@ -156,7 +153,8 @@ def read_motion(path: str | Path) -> Motion:
     or the measured reference of a log, without the rows where it was lost.
     """
     try:
-        lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
+        # twice the size of an hour at 100 Hz
+        lines = io.StringIO(read_bytes(path, 16_000_000).decode('utf-8-sig'), newline=None)
         rows = csv.DictReader(line for line in lines if line.strip() and not line.startswith('#'))
         rows.fieldnames = header = [name.strip() for name in rows.fieldnames or ()]
         found = sorted(name for name in _COLUMN_UNITS if name in header)
@@ -173,7 +171,7 @@ def read_motion(path: str | Path) -> Motion:
                 value = float(row[column] or '')
             except ValueError:
                 value = math.inf
-            # nan is a number where a reference may be lost
+            # a reference may be lost
             if not (abs(value) <= MAX_MAGNITUDE
                     or value != value and column.startswith('reference_')):
                 raise MotionError(

@@ -21,8 +21,6 @@ from gyro_calibration.files import (
 import numpy as np
 import yaml
 
-#: Largest file, bytes: twice the size of a model with the covariance of 150 values.
-_MAX_SETTINGS_BYTES = 1_000_000
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
@@ -34,7 +32,8 @@ def read_settings(path: str | Path) -> Any:
     truncated 9.3e-06 could read as 9.3.
     """
     try:
-        text = read_bytes(path, _MAX_SETTINGS_BYTES).decode('utf-8-sig')
+        # twice the size of a model with the covariance of 150 values
+        text = read_bytes(path, 1_000_000).decode('utf-8-sig')
         content = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         problem, mark = error, None

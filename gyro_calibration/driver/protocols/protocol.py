@@ -12,8 +12,8 @@
 Common parts of wire formats: records, decoder from bytes to samples, and splitters of a stream.
 
 A format is a `Protocol`: a splitter that finds frames in a stream of bytes, a parser from a frame
-to a `Reading`, and a writer. A reading is in the unit of the device; sign, sensitivity and full
-scale are applied here for all formats, as are the counts of discarded, refused and lost data.
+to a `Reading` in the unit of the device, and a writer. Sign, sensitivity and full scale are
+applied here for all formats.
 """
 
 from __future__ import annotations
@@ -35,11 +35,8 @@ GYRO_COLUMNS = {name: factor for name, (quantity, factor) in COLUMNS.items()
                 if quantity in ('output', 'counts')}
 #: Further columns of the log format.
 OPTIONAL_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
-#: Standard deviation of a sample of a gyro whose data sheet is not known, rad/s.
-ASSUMED_NOISE = math.radians(0.5)
-#: Standard deviation of a specific force, m/s²: 0.01 g, beyond the noise of any such unit.
-ASSUMED_FORCE_NOISE = 0.1
-
+ASSUMED_NOISE = math.radians(0.5)  # of a sample of an unknown gyro, rad/s
+ASSUMED_FORCE_NOISE = 0.1  # m/s²; beyond the noise of any such unit
 #: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
@@ -52,12 +49,9 @@ class Sample:
     temperature: float | None = None  # degC
     time: float | None = None  # s, by the clock of the device
     sequence: int | None = None  # count of the device, modulo `Protocol.modulus`
-    #: Estimated samples lost directly before this one: damaged, marked as invalid by the device,
-    #: or refused. A sequence or the elapsed time has priority.
-    missing: int = 0
+    missing: int = 0  # estimated samples lost directly before: damaged, invalid or refused
     specific_force: float | None = None  # m/s², along the input axis
-    #: Further values, by names with units: ``supply_v``, ``source_current_a``.
-    health: Mapping[str, float] = field(default_factory=dict)
+    health: Mapping[str, float] = field(default_factory=dict)  # by names with units: ``supply_v``
 
 
 @dataclass
@@ -154,11 +148,10 @@ class Protocol:
     #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    #: Makes the parser of one connection: a frame to a reading, or None if it is not valid; it
-    #: may use earlier frames.
+    #: Makes the parser of one connection: a frame to a reading, or None if it is not valid.
     parser: Callable[[Settings], Callable[[bytes], Reading | None]]
     #: Makes the writer of one device: a value in its unit and the further values of a sample,
-    #: whose sequence counts from 0 and never wraps, to bytes; it may use earlier samples.
+    #: whose sequence counts from 0 and never wraps, to bytes.
     writer: Callable[[Settings], Callable[[float, Sample], bytes]]
     invert: bool = False  # whether the device counts clockwise turns positive
     full_scale: float = math.radians(2000.0)  # rad/s
@@ -179,7 +172,7 @@ class Protocol:
                              'increments out')
         if settings.sensitivity is None and self.sensitivity is None:
             raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the '
-                             'rad/s of one count, which its data sheet gives')
+                             'rad/s of one count')
         self.check(settings)
 
     def decoder(self, settings: Settings | None = None, counts: Counts | None = None) -> Decoder:
