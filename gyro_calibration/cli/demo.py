@@ -77,16 +77,15 @@ def run(given: argparse.Namespace) -> Answer:
     compensation run as processes of their own.
     """
     if _MISSING:
-        raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); source ROS 2, or '
-                         'install gyro_calibration[ros,plot]')
+        raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); install '
+                         'gyro_calibration[ros,plot]')
     verb.require_folder(given.out)
     out = Path(given.out)
     out.mkdir(parents=True, exist_ok=True)
     calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
                                           out.absolute() / 'gyro')
     calibration_file.unlink(missing_ok=True)
-    # The graph is separate from the network of a robot and from other graphs on this machine, so
-    # it needs no permissions in a secured one.
+    # separate from the network of a robot and other graphs on this machine
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
@@ -224,7 +223,7 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
                    and client.node.count_publishers('cmd_vel') > 1):
             if time.monotonic() > deadline:
                 raise OSError('driver and compensation were not ready within 60 s; stop other '
-                              'programs, and run the demo again')
+                              'programs')
             time.sleep(0.02)
         on_progress(None, 'calibrating on the motion profile')
         for attempt in range(1, _MAX_ATTEMPTS + 1):

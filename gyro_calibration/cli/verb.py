@@ -129,11 +129,10 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
                         'sensor_msgs/Imu or geometry_msgs/Vector3Stamped; default: the only Imu')
-    parser.add_argument('--reference-topic', metavar='TOPIC', help='topic of the reference in a '
-                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, or of geometry_msgs '
-                        'PoseStamped, TwistStamped, TransformStamped and the like; default: none')
-    parser.add_argument('--temperature-topic', metavar='TOPIC', help='topic of the temperature '
-                        'in a recording; default: the name nearest to the topic of the gyro')
+    parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference: Odometry, '
+                        'Imu, PoseStamped, TwistStamped, TransformStamped; default: none')
+    parser.add_argument('--temperature-topic', metavar='TOPIC',
+                        help='of the temperature; default: the name nearest to that of the gyro')
 
 
 def _parse_columns(text: str) -> dict[str, str]:
@@ -188,8 +187,7 @@ def read(given: argparse.Namespace) -> Log:
         log = read_file(given.log, topics, given.rate, given.sensitivity, given.names, on_progress,
                         print_message)
     if log.output is None:
-        raise InputError(f'{given.log}: has gyro_counts only; '
-                         'give the deg/s per count with --sensitivity')
+        raise InputError(f'{given.log}: has gyro_counts only; give deg/s with --sensitivity')
     log = replace(log, output=-log.output) if given.invert else log
     if given.unwrap and log.reference_heading is not None:
         require_time(given, log)
@@ -237,7 +235,6 @@ def require_folder(path: str) -> None:
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise InputError(f'{given.log}: has no time_s, which {given.name} needs; name its '
-                         'column, as by --columns time=NAME:s, or give the sample rate in Hz '
-                         'with --rate')
+        raise InputError(f'{given.log}: has no time_s, which {given.name} needs; name its column, '
+                         'as by --columns time=NAME:s, or give the sample rate with --rate')
     return log.time

@@ -18,8 +18,7 @@ from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
 DEGREE = math.pi / 180.0
 STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
-#: Temperatures, degC, that a sensor in a gyro may have; others are taken for errors.
-PLAUSIBLE_TEMPERATURES = -100.0, 200.0
+PLAUSIBLE_TEMPERATURES = -100.0, 200.0  # degC; others are taken for errors
 
 #: Quantity -> names of its columns, that in SI first; in the order of writing.
 _COLUMN_NAMES = {
@@ -85,9 +84,9 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
     found, by_user = dict[str, Column](), set[str]()
     for name, text in user_columns.items():
         if name not in _OPTION_QUANTITIES:
-            raise InputError(
-                f'{name} is no quantity of a log; wanted one of '
-                f'{", ".join(_OPTION_QUANTITIES)}{suggest_nearest(name, _OPTION_QUANTITIES)}')
+            raise InputError(f'{name} is no quantity of a log, which are '
+                             f'{", ".join(_OPTION_QUANTITIES)}'
+                             f'{suggest_nearest(name, _OPTION_QUANTITIES)}')
         quantity, units = _OPTION_QUANTITIES[name]
         if quantity in by_user:
             raise InputError(f'heading and attitude both give the {quantity}; name one of them')
@@ -121,9 +120,9 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                              f'the {quantity}; keep one of them')
         found[quantity] = Column(index, factor)
     if not {'output', 'counts'} & set(found):
-        raise InputError(f'no gyro column among {excerpt(",".join(header))}; wanted a header '
-                         'with gyro_dps, gyro_rad_s or gyro_counts, and # before the lines above '
-                         'it, or other names, as by --columns time=NAME:s,gyro=NAME:deg/s')
+        raise InputError(f'no gyro column among {excerpt(",".join(header))}; wanted gyro_dps, '
+                         'gyro_rad_s or gyro_counts, and # before the lines above it, or other '
+                         'names, as by --columns time=NAME:s,gyro=NAME:deg/s')
     return found
 
 

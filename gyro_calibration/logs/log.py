@@ -51,11 +51,10 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
-CACHE_BLOCK_SAMPLES = 1 << 15
+CACHE_BLOCK_SAMPLES = 32768
 MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
-_MAX_LINE_LENGTH = 1 << 16  # characters
-#: Largest number of values of a log in memory, 4 GB; a text counts as ten.
-_MAX_LOG_VALUES = 1 << 29
+_MAX_LINE_LENGTH = 65536  # characters
+_MAX_LOG_VALUES = 500_000_000  # in memory, 4 GB; a text counts as ten
 #: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
 MAX_TIME = 1e12
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
@@ -140,8 +139,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
                                       or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if count * (len(arrays) + 10 * len(others)) > _MAX_LOG_VALUES:
-                raise LogError(f'has more than {_MAX_LOG_VALUES} numbers, which is above the '
-                               'limit of memory; split it')
+                raise LogError(f'has more than {_MAX_LOG_VALUES} numbers, the limit; split it')
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
             last = _refuse_unordered_time(places, arrays.get('time'), last)
@@ -151,8 +149,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
                 on_progress(file.tell())
             blocks.append((arrays, others))
         if count < 2:
-            raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
-                           'more')
+            raise LogError(f'has {count} of the 2 rows of data that are needed; record more')
     arrays = {quantity: np.concatenate([part[quantity] for part, _ in blocks])
               for quantity in arrays}
     _replace_attitude(arrays, axis)
@@ -171,8 +168,8 @@ class ExpansionBudget:
         """Count bytes, and raise `LogError` beyond the limit."""
         self._remaining -= size
         if self._remaining < 0:
-            raise LogError(f'decompresses to more than {MAX_EXPANSION_RATIO} times its size, '
-                           'which is the limit; decompress it first if this is intended')
+            raise LogError(f'decompresses to more than {MAX_EXPANSION_RATIO} times its size, the '
+                           'limit; decompress it first')
 
 
 @contextmanager
@@ -184,9 +181,8 @@ def _convert_read_errors(path: str | Path) -> Iterator[None]:
         raise LogError(f'{path}: {error}') from None
     except UnicodeDecodeError as error:
         code = 'UTF-16' if error.object[:1] in (b'\xff', b'\xfe') else 'WINDOWS-1252'
-        raise LogError(
-            f'{path}: cannot be read as a log, since it is not text in UTF-8; if it is '
-            f'text, convert it, as by iconv -f {code} -t UTF-8 {path} > log.csv') from error
+        raise LogError(f'{path}: is not text in UTF-8; convert it, as by iconv -f {code} '
+                       f'-t UTF-8 {path} > log.csv') from error
     except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({describe_error(error)}); '
                        'wanted a CSV file, .csv or .csv.gz') from error
@@ -231,7 +227,7 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not header:
-        raise LogError('has no line with the names of columns; record again, or name another file')
+        raise LogError('has no line with the names of columns; name another file')
     found = find_columns(header, columns, axis)
     positions = {column.position for column in found.values()}
     # the other names, made unique: a second x becomes x.1
@@ -276,7 +272,7 @@ def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_lin
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
-            raise LogError(f'line {places[-1]} has {len(row)} values where the header has '
+            raise LogError(f'line {places[-1]} has {len(row)} values, and the header '
                            f'{len(header)}; correct or remove the line')
         rows.append(row)
         places.append(first_line + reader.line_num)
@@ -336,8 +332,7 @@ def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,
     if (far := np.abs(time) > MAX_TIME).any():
         row = int(np.argmax(far))
         raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is beyond '
-                       f'the limit of {MAX_TIME:g} s; give its unit, as by --columns '
-                       'time=time_s:ns')
+                       f'{MAX_TIME:g} s; give its unit, as by --columns time=time_s:ns')
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
@@ -364,8 +359,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
         for quantity, (index, factor, offset) in found.items()}
     _refuse_invalid(arrays, names)
     if (count := len(next(iter(arrays.values())))) < 2:
-        raise LogError(f'the table has {count} of the 2 rows that are needed at least; record '
-                       'more')
+        raise LogError(f'the table has {count} of the 2 rows that are needed; record more')
     _replace_attitude(arrays, axis)
     return Log(**arrays)
 
@@ -379,8 +373,8 @@ def _to_floats(name: str, values: Any) -> Array:
             raise ValueError(f'its type is {array.dtype}')
         return np.asarray(array, float)
     except (TypeError, ValueError) as error:
-        raise LogError(f'{name} is no column of numbers ({describe_error(error)}); give real '
-                       'numbers, and dates as seconds since the first') from None
+        raise LogError(f'{name} is no column of numbers ({describe_error(error)}); give dates as '
+                       'seconds since the first') from None
 
 
 def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> None:
@@ -458,8 +452,7 @@ def _replace_attitude(arrays: dict[str, Array], axis: str) -> None:
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.
 _FULL_TURN_MARGIN = 0.1
-#: Largest ratio of a gyro's rate to that of its reference, either way, in the same unit: half way,
-#: as a factor, to 2, the least by which full scales are confused.
+#: Largest ratio of the rates of a gyro and its reference, in one unit: full scales differ by 2.
 MAX_PLAUSIBLE_FACTOR = 1.4
 
 
@@ -517,8 +510,7 @@ def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: A
 
 def refuse_wrapped(log: Log) -> None:
     """Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped."""
-    # Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
-    # heading in deg instead of rad are none.
+    # over a gap of the reference, a jump is a full turn that the gyro does not show
     if log.time is None or log.reference_heading is None:
         return
     known = np.flatnonzero(np.isfinite(log.reference_heading))
@@ -545,9 +537,8 @@ def refuse_wrapped(log: Log) -> None:
     if len(jumps) and not (log.output is not None and _is_in_degrees(
             time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
-        where = (', first at' if last == first + 1 else
-                 ' that the gyro does not show, first in the gap that ends at')
-        raise DataRefused(f'the reference heading jumps by a full turn{where} '
+        where = '' if last == first + 1 else ' that the gyro does not show'
+        raise DataRefused(f'the reference heading jumps by a full turn{where}, first at '
                           f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
 
 

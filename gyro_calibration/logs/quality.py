@@ -23,8 +23,7 @@ from scipy.special import ndtri
 #: Standard deviation of the misalignment of the axes of gyro and reference, rad, as the cross-axis
 #: sensitivity in data sheets of MEMS gyros (MPU-6050: 2 %).
 MISALIGNMENT_DEVIATION = 0.02
-#: Least alignment of codes on a lattice (length of the mean phasor): 1 for exact codes, 0 for
-#: continuous values; codes may deviate by 0.13 steps rms.
+#: Least alignment of codes on a lattice (length of the mean phasor): deviations of 0.13 steps rms.
 _MIN_ALIGNMENT = 0.7
 
 
@@ -208,9 +207,7 @@ def mask_repeated_samples(output: Array) -> Mask:
     """Mark repeats of a value in runs longer than its share of the samples explains."""
     repeated = np.zeros(len(output), dtype=bool)
     share = np.unique(output, return_counts=True)[1].max() / len(output)
-    # A coarsely quantized gyro at rest, or a simulation without noise, cannot be distinguished
-    # from a gyro that repeats samples.
-    if share > 0.9:
+    if share > 0.9:  # a coarsely quantized gyro at rest, or a simulation without noise
         return repeated
     longest = math.log(1e-6 / len(output)) / math.log(share)
     for run in find_runs(np.concatenate([[False], np.diff(output) == 0.0])):
@@ -223,9 +220,8 @@ def refuse_dead(output: Array) -> None:
     values, counts = np.unique(output, return_counts=True)
     share, value = counts.max() / len(output), float(values[counts.argmax()])
     if len(values) == 1:
-        raise DataRefused(f'all {len(output)} samples have the same value, '
-                          f'{value / DEGREE:g} deg/s: the gyro is dead or not powered; check '
-                          'power and wires')
+        raise DataRefused(f'all {len(output)} samples have the same value, {value / DEGREE:g} '
+                          'deg/s: the gyro is dead or not powered; check power and wires')
     if share > 0.9:  # the last bit may toggle
         raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, '
                           f'{value / DEGREE:g} deg/s: the gyro is dead, not powered, or did not '

@@ -23,11 +23,8 @@ from numpy.typing import NDArray
 
 Integers = NDArray[np.integer]
 
-#: Ratio to the usual interval of a short one, as in a burst or after a late sample.
-SHORT_RATIO = 0.5
-
-#: Least number of windows in a record. None crosses a gap of more than this part of the record,
-#: and longer windows do not show a motion.
+SHORT_RATIO = 0.5  # to the usual interval of a short one, as in a burst
+#: Least number of windows in a record. None crosses a gap of more than this part of the record.
 MIN_WINDOWS = 50
 
 
@@ -71,16 +68,15 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     alike = 0.8 < interval / usual < 1.25
     if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > 0.9:
         raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
-                          f'{100 * interval:.4g} s: either most samples are lost, or they come in '
-                          'long bursts; give the sample rate with --rate, or record again')
+                          f'{100 * interval:.4g} s: most samples are lost, or come in long '
+                          'bursts; give the sample rate with --rate, or record again')
     whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
     usual = (float(steps[whole & (steps < 1.5 * usual)].mean())
              if alike and float(whole.mean()) > 0.9 else interval)
     bursts = float((steps < SHORT_RATIO * usual).mean()) > 0.02
 
     # The number of lost samples is that of the intervals by which the stamps remain late. Samples
-    # that were delayed at a host arrive in one burst of any size; the time to catch up begins
-    # after it.
+    # that were delayed arrive in one burst of any size; the time to catch up begins after it.
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
     # samples within which delayed stamps catch up, and the least loss beyond their jitter

@@ -39,9 +39,8 @@ class Channels:
     supply: Number | None = None  # V; None where it is not known
     heading: Number = 0.0  # rad
     # of earlier samples, by `model.channels`; without them the past is taken to be constant
-    # (channel, time constant) -> the channel through a first-order lag; channels are
-    # 'temperature', 'specific_force', and 'vibration', the squared deviation of the specific force
-    # from its own mean over 1 s
+    # (channel, time constant) -> the channel through a first-order lag: 'temperature',
+    # 'specific_force', or 'vibration', its squared deviation from its own mean over 1 s
     lagged: Callable[[str, float], Number] | None = None
     # (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell, else 0
     heating: Callable[[float, float], Number] | None = None

@@ -43,7 +43,7 @@ class Preset:
 
 XV3500 = Preset('XV3500', 'Epson XV-3500CB by Hong and Park 2008, sections 1, 2.1 and 4.2; their '
                 'bias is printed in deg/s, but only deg/min explains the drift',
-                2.5, 18.0, 0.0373, 0.75 / 60.0)
+                2.5, 18.0, 0.0373, 0.0125)
 RD2100 = Preset('RD2100', 'KVH E-Core RD2100, open-loop fibre-optic, by Ojeda et al. 2000, '
                 'Table I and section 5: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; '
                 'half of 2 % and of 0.2 deg/s, both over the range of temperatures',

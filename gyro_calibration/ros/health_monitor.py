@@ -35,16 +35,10 @@ import numpy as np
 from scipy.special import chdtr, chdtrc
 
 _PART_DURATION = 1.0  # s; of the parts of a stretch that are compared: a push shows in one
-#: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
-#: less noise in neighbouring blocks.
+#: Largest ratio of the noise of the model to the measured one, 1, as of a filtered output.
 _MAX_NOISE_REDUCTION = 3.0
 _MAX_DECELERATION = 20.0  # rad/s²; of a robot: six times the default of Nav2's controllers
-#: Height of a pulse, in medians of the steps before it, that no vibration has: 5 of 1.2 million
-#: samples of cars and turntables are higher.
-_MIN_PULSE_RATIO = 10.0
-#: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
-#: path may vibrate for some time.
-_DECIDING_STRETCHES = 3
+_DECIDING_STRETCHES = 3  # in a row, in a rest that was not announced: a robot may vibrate
 
 
 @dataclass(frozen=True)
@@ -89,7 +83,7 @@ class RepeatedOutputDetector:
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # of the values before, rad², and standard deviation by this value so far, rad
         self._rounding_variance = self._rounded_turn = 0.0
-        # Smallest and largest value since a time, s, and the number of samples after the first.
+        # smallest and largest value since a time, s, and the number of samples after the first
         self._band = math.nan, math.nan, 0.0, 0
 
     def add(self, time: float, output: float, odometry_rate: float,
@@ -157,8 +151,7 @@ class RepeatedOutputDetector:
             usual, held = self._holds.usual_interval, self._until - self._since
             # a chance of e^-20 is once in 50 days at 100 Hz
             if self._excludes_chance(self._step, held / usual, usual, 20.0):
-                # the mean square of a rate that goes on linearly, or changes at once, and a turn
-                # meanwhile
+                # the mean square of a rate that goes on linearly or changes at once, and a turn
                 self.unseen_turn = math.hypot(
                     math.hypot(step, self._last_step) * (held + usual) / math.sqrt(3.0),
                     0.25 * MAX_ANGULAR_ACCELERATION * (held + usual) ** 2)
@@ -226,7 +219,8 @@ class PulseDetector:
         if self._steps and not 0.0 <= time - self._median_time < 0.05 * RECENT_DURATION:
             self._median_time = time
             self._median_step = float(np.median([size for _, size in self._steps]))
-        is_jump = abs(step) > _MAX_DECELERATION * interval + _MIN_PULSE_RATIO * self._median_step
+        # 5 of 1.2 million samples of cars and turntables are higher than ten medians
+        is_jump = abs(step) > _MAX_DECELERATION * interval + 10.0 * self._median_step
         found = 0.0, 0
         if self._pulse and not 0.0 <= time - self._pulse[1] <= FAULT_DURATION:
             self._pulse = None

@@ -120,8 +120,8 @@ class StampDelay:
         delay, s.
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
-        # Time of arrival and delay, s, and heading, rad, of samples with less delay than any after
-        # them; those of the least delay when the first duration was over, and at present.
+        # time of arrival and delay, s, and heading, rad, of samples with less delay than any after
+        # them; those of the least delay when the first duration was over, and at present
         self._min_delays = deque[tuple[float, float, float]]()
         self._begin: tuple[float, float, float] | None = None
         self._least = -math.inf, math.nan, math.nan
@@ -186,16 +186,12 @@ class StampDelay:
                 # the clocks of gyros are up to 3 % off
                 if abs(late - early) > factor * tolerance + 0.05 * elapsed:
                     return ('this computer was busy, or the clock of the driver is wrong: the '
-                            'stamps on imu/data_raw advanced by '
-                            f'{elapsed - late + early:.2f} s in {elapsed:.2f} s; reduce the load, '
-                            'or check that clock and use_sim_time')
+                            f'stamps on imu/data_raw advanced by {elapsed - late + early:.2f} s '
+                            f'in {elapsed:.2f} s; check load, clock and use_sim_time')
         if self._min_delays and not (
                 self._earlier and now - self._earlier[-1][0] < self._tolerances[-1][0]):
             self._earlier.append((now, least))
         return ''
-
-
-_STEADY_STAMPS = 24  # late ones at equal intervals, which have a clock of their own
 
 
 class ArrivalOrder:
@@ -208,7 +204,7 @@ class ArrivalOrder:
 
     def __init__(self) -> None:
         self.has_two_clocks, self._last, self._late_in_a_row = False, -1, 0
-        self._late = deque[int](maxlen=_STEADY_STAMPS)  # stamps, ns
+        self._late = deque[int](maxlen=24)  # stamps, ns
 
     def is_late(self, stamp: int) -> bool:
         """Add a stamp, ns, and tell whether it is late; not if its clock was set back."""
@@ -220,7 +216,7 @@ class ArrivalOrder:
             return False
         self._late.append(stamp)
         apart = np.diff(self._late)
-        self.has_two_clocks = bool(len(self._late) == _STEADY_STAMPS
+        self.has_two_clocks = bool(len(self._late) == self._late.maxlen
                                    and 0 < apart.max() < 2 * apart.min())
         return True
 
@@ -228,16 +224,14 @@ class ArrivalOrder:
 class RosTime:
 
     def __init__(self) -> None:
-        # time since its last advance, s of the steady clock; 0 where it is not simulated, inf
-        # before a simulation starts
+        # since its last advance, s; 0 where it is not simulated, inf before a simulation starts
         self.paused_duration = 0.0
         self._last: float | None = -1.0
         self._last_change = self._last_poll = 0.0
 
     def poll(self, clock: Clock) -> None:
         """Compare with the last poll; to be called by one timer."""
-        # Only the time up to that poll counts: after a pause of this process, queued messages of
-        # /clock are delivered after its timers.
+        # only up to that poll: after a pause of this process, /clock comes after its timers
         now, time = clock.steady(), clock.simulated()
         if time != self._last:
             self._last, self._last_change, self._last_poll = time, now, now

@@ -91,9 +91,8 @@ class RecorderNode(Node):
                             else DurabilityPolicy.VOLATILE)))
 
     def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> Subscription:
-        # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
-            self.message_count += 1
+            self.message_count += 1  # the steady clock does not jump
             received = self._clock_offset + round(read_steady_clock() * NSEC_PER_SEC)
             self._on_message(self._roles[topic], Message(topic, kind, received, bytes(data)))
         # of a type that `topic_type_fault` has accepted: other nodes choose no module

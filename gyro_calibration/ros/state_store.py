@@ -11,8 +11,8 @@
 """
 The state of a robot in files: the gyro model, the last self-calibration, biases at rest.
 
-The calibration file is a complete model file with the effects that were in use at the calibration.
-If they differ from the model in use, the self-calibration is not used.
+The calibration file is a model file with the effects that were in use at the calibration. If they
+differ from the model in use, the self-calibration is not used.
 """
 
 from __future__ import annotations
@@ -61,9 +61,8 @@ class StateStore:
             found = _existing_version(file)
             if found is not None and found != seen:
                 self.shared_hint = to_printable(
-                    f'{file} was written by another process, and the next writer replaces it: '
-                    'give each node a calibration_file of its own, or restart this one to use '
-                    'that file')
+                    f'{file} was written by another process: give each node a calibration_file '
+                    'of its own, or restart this one to use that file')
 
     def _load_model(self, model_file: str) -> GyroModel:
         model = GyroModel()
@@ -92,9 +91,8 @@ class StateStore:
         elif not have_same_effects(stored, model):
             fault = 'it belongs to another model'
         elif theirs != ours:
-            of = (f'the gyro with the serial number {theirs}' if theirs
-                  else 'a gyro without a serial number')
-            fault = f'it belongs to {of}, and the model to {ours or "one without"}'
+            fault = (f'it belongs to the gyro with the serial number {theirs or "(none)"}, and '
+                     f'the model to {ours or "(none)"}')
         if fault:
             self.calibration_hint = to_printable(
                 f'the self-calibration in {self._calibration_file} is not used: {fault}; '
@@ -130,7 +128,7 @@ class StateStore:
             self._file_versions[self._bias_file] = written
         except OSError as error:
             self.table.mark_write(now, is_written=False)
-            self.table_hint = to_printable('the bias table cannot be written '
+            self.table_hint = to_printable(f'the bias table cannot be written '
                                            f'({describe_error(error)}): '
                                            f'{remedy(error, self._bias_file)}')
 
@@ -147,9 +145,8 @@ def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
                                f'at most {limit:.4g} of either sign, {remedy}')
     for name, value in vars(model.noise).items():
         if not math.sqrt(Noise(**{name: value}).heading_variance(1.0)) < math.pi / math.sqrt(3.0):
-            raise InvalidValue(f'noise.{name}', value,
-                               'SI units, rad and s: with this noise the heading is unknown '
-                               'within 1 s')
+            raise InvalidValue(f'noise.{name}', value, 'SI units, rad and s: with this noise the '
+                               'heading is unknown within 1 s')
 
 
 def _existing_version(file: Path) -> tuple[int, int] | None:
