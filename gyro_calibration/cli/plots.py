@@ -123,9 +123,8 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
         if shade is not None:
             figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom',
                             aspect=40, shrink=0.9)
-    return _save_figure(figure, path,
-                        'Below: dots without a shape and without bands of one colour are noise; a '
-                        'curve or a band is an effect that the model lacks.')
+    return _save_figure(figure, path, 'Below: dots without a shape are noise; a curve or a band '
+                        'of one colour is an effect that the model lacks.')
 
 
 def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:
@@ -145,8 +144,7 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
     return _save_figure(figure, path, 'Colours: temperature. A step between the senses: scale '
                         'factor error; a curve: nonlinearity; growth towards slow turns: bias or '
-                        'noise. Turns slower than '
-                        f'{min_rate / DEGREE:g} deg/s are left out. Scales differ.')
+                        f'noise. Turns below {min_rate / DEGREE:g} deg/s are left out.')
 
 
 def draw_diagnosis(path: str | Path | None, diagnosis: Diagnosis) -> Any:

@@ -65,11 +65,8 @@ def run(given: argparse.Namespace) -> Answer:
 def simulate_log(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
     motion = motion_by_name(given.motion)
-    if motion.duration * given.sample_rate > _MAX_SAMPLES:
-        raise InputError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
-                         f'{_MAX_SAMPLES:g} samples; give a lower rate or a shorter motion')
-    if round(motion.duration * given.sample_rate) < 1:
+    if not 1 <= round(motion.duration * given.sample_rate) <= _MAX_SAMPLES:
         raise InputError(f'{given.motion} at --sample-rate {given.sample_rate:g} has fewer than '
-                         'two samples; give a higher rate or a longer motion')
+                         f'two samples, or more than {_MAX_SAMPLES:g}; give another rate')
     return simulate(read_model(given.model), motion, given.sample_rate,
                     np.random.default_rng(seed), given.temperature), seed

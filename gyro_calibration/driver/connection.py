@@ -34,10 +34,9 @@ import serial
 _REMEDIES = {
     errno.ENOENT: 'it does not exist: plug the gyro in, or set another port',
     errno.ENODEV: 'no device is behind it: plug the gyro in again',
-    errno.EACCES: 'permission denied: add the user to the group that owns it, often dialout',
-    errno.EPERM: 'permission denied: add the user to the group that owns it, often dialout',
-    errno.EBUSY: 'another program has opened it: stop that one',
-    errno.EAGAIN: 'another program has opened it: stop that one',
+    **dict.fromkeys((errno.EACCES, errno.EPERM), 'permission denied: add the user to the group '
+                    'that owns it, often dialout'),
+    **dict.fromkeys((errno.EBUSY, errno.EAGAIN), 'another program has opened it: stop that one'),
     errno.ENOTTY: 'it is no serial port: set another port',
     errno.EISDIR: 'it is a folder, no serial port: set another port',
     errno.EIO: 'the device was disconnected: plug it in again',

@@ -187,10 +187,9 @@ class _LogBuilder:
                 kind for kind, definition in self._contents.definitions.items()
                 if kind not in _REFERENCE_TYPES
                 and 'rate' in cdr.parse_layout(definition).quantities})
-            remedy = (f'select {_join_names(others, "or")} with --topic' if others
-                      else 'record the topic of the gyro')
-            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; '
-                           f'{remedy}')
+            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; ' + (
+                f'select {_join_names(others, "or")} with --topic' if others
+                else 'record the topic of the gyro'))
         gyro = self._read(self._found[found[0]])
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.name} declares that it reports no angular velocity; name '

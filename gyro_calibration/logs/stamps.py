@@ -40,11 +40,9 @@ class StampGrid:
 
     @property
     def burst_remarks(self) -> list[str]:
-        """Return a sentence on the deviation from the grid, if stamps come in bursts."""
-        if not (self.has_bursts and self.max_deviation):
-            return []
         return [f'The stamps come in bursts or with jitter, up to {self.max_deviation:.3g} s off '
-                f'an even interval of {1000 * self.interval:.5g} ms, which is used.']
+                f'an even interval of {1000 * self.interval:.5g} ms, which is used.'
+                ] if self.has_bursts and self.max_deviation else []
 
     @property
     def loss_remarks(self) -> list[str]:

@@ -303,11 +303,10 @@ class HealthMonitor:
         if rest.is_noise_normal:
             self.noise_alarm = ''
         elif is_announced or several and not any(each.is_noise_normal for each in last):
-            remedy = ('record a log at rest, and run allan or diagnose on it'
-                      if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = '' if is_announced or rest.noise_ratio < 1.0 else ', or the robot vibrates'
+            remedy = (': check that the gyro responds to turns' if rest.noise_ratio < 1.0 else
+                      ', unless the robot vibrates: record a log at rest, and run allan on it')
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
-                                f'model{shaken}: {remedy}')
+                                f'model{remedy}')
         if rest.is_bias_normal:
             self.bias_alarm = ''
         elif (is_announced or abs(rest.bias) < self.standstill_rate

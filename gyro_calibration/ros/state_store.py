@@ -66,17 +66,15 @@ class StateStore:
 
     def _load_model(self, model_file: str) -> GyroModel:
         model = GyroModel()
-        if model_file:
-            try:
+        try:
+            if model_file:
                 read = read_model(os.path.expanduser(model_file))
-                try:
-                    refuse_implausible_model(read, self._max_bias)
-                except InvalidValue as error:
-                    raise ModelError(f'{model_file}: {error}') from None
+                refuse_implausible_model(read, self._max_bias)
                 model = read
-            except ModelError as error:
-                self.problem = f'uncalibrated: {error}'
-                return model
+        except (ModelError, InvalidValue) as error:
+            named = '' if isinstance(error, ModelError) else f'{model_file}: '
+            self.problem = f'uncalibrated: {named}{error}'
+            return model
         try:
             stored = read_model(self._calibration_file)
         except ModelNotFound:

@@ -88,7 +88,7 @@ WRONG = {
     'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
     'reproduce newton': 'hong_park',
     'self-calibrate log.csv --turns 3 --profile p.csv': 'give one of them',
-    'self-calibrate log.csv --marking 2': 'give both or none', 'export --to unity model.yaml': 'unity',
+    'self-calibrate log.csv --marking 2': 'both or none', 'export --to unity model.yaml': 'unity',
     'export --to sdf model.yaml --span 0.001': 'is shorter than two samples',
     'export --to sdf model.yaml --sample-rate 0': 'is out of range',
     'simulate --model model.yaml --motion waltz --out x.csv': 'waltz: there is no such motion',
@@ -97,7 +97,7 @@ WRONG = {
        for option, said in {
            '--sample-rate 1e-300': '', '--sample-rate 1e300': '', '--sample-rate 1e9': '',
            '--temperature nan': '', '--temperature 1e9': '',
-           '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
+           '--sample-rate 0.001': 'fewer than two samples'}.items()}}
 
 
 @pytest.mark.parametrize('words, said', WRONG.items(), ids=WRONG)
