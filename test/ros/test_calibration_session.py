@@ -299,7 +299,7 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_lat
     rig.go(1.4)
     assert not rig.session.warning, 'it may still be slowing down'
     rig.go(1.0)
-    assert 'command time-out of its base' in rig.session.warning
+    assert 'command time-out of the base' in rig.session.warning
     rig.robot.deaf = False
     rig.turn(0.0, 5.0)
     assert not rig.begin() and not rig.session.warning, 'a new run has a new chance'
@@ -405,7 +405,7 @@ def test_an_error_in_the_fit_changes_nothing_and_the_next_run_works(tmp_path, mo
 @pytest.mark.parametrize('kind, model, profile, words', [
     (PROFILE, MODEL, 'time_s,speed\n0,1\n1,2\n', 'profile.csv: .*time_s and one of heading_deg'),
     (PROFILE, MODEL, 'time_s,rate_rad_s\n0,0\n1,0\n2,45\n3,0\n20,0\n',
-     'the profile turns at 2578 deg/s, but a robot .* as from 275 deg/s'),
+     'the profile turns at 2578 deg/s, faster than 275 deg/s'),
     (REST, 'effects: {bias: {bias: .nan}}', '', 'effects.bias.bias is nan')],
     ids=['no profile', 'too fast for a robot', 'no model'])
 def test_what_cannot_be_calibrated_by_is_refused_in_one_sentence(
@@ -448,7 +448,7 @@ def test_a_scale_factor_error_by_odometry_has_one_limit_for_both_signs(tmp_path,
     assert success == (abs(scale) < 0.3) != ('% is beyond 30 %' in message), message
 
 
-@pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
+@pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages with an orientation'),
                                            (lambda given: given[:20],
                                             '20 messages came on odom, but in 0 s of 20 s only'),
                                            (lambda given: given[::-1], 'stamps on odom')],
@@ -558,7 +558,7 @@ def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
     rig = rested(tmp_path, calibration_reference=TURNS, calibration_turns=2)
     assert rig.session.finish() == (False, 'no calibration by turns or by odometry is in progress')
     rig.begin(TURNS)
-    assert 'no sample has come since' in rig.session.finish()[1]
+    assert 'no sample has come so far' in rig.session.finish()[1]
     rig.go(3.0)
     rig.turn(0.6, 2.0 * math.tau / 0.6)
     rig.turn(0.0, 4.0)
