@@ -187,7 +187,7 @@ def read(given: argparse.Namespace) -> Log:
         log = read_file(given.log, topics, given.rate, given.sensitivity, given.names, on_progress,
                         print_message)
     if log.output is None:
-        raise InputError(f'{given.log}: has gyro_counts only; give deg/s with --sensitivity')
+        raise InputError(f'{given.log}: has gyro_counts only; set --sensitivity, deg/s a count')
     log = replace(log, output=-log.output) if given.invert else log
     if given.unwrap and log.reference_heading is not None:
         require_time(given, log)
