@@ -57,7 +57,6 @@ except ImportError as error:
 
 _PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
-_MAX_ATTEMPTS = 3  # to calibrate
 _DRIVE_MOTION = constant_rate_motion([
     *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
@@ -226,12 +225,12 @@ def _calibrate_and_drive(client: _DemoClient) -> float:
                               'programs')
             time.sleep(0.02)
         on_progress(None, 'calibrating on the motion profile')
-        for attempt in range(1, _MAX_ATTEMPTS + 1):
+        for is_last in (False, False, True):
             try:
                 client.call_service('compensation_node/calibrate', 60.0)
                 break
             except _CallRefused as refusal:  # this robot turns late on a busy machine
-                if attempt == _MAX_ATTEMPTS:
+                if is_last:
                     raise
                 verb.print_message(f'{refusal}; the run is repeated')
                 time.sleep(2.0)  # until the robot stands

@@ -33,7 +33,7 @@ from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
 from gyro_calibration.files import suggest_nearest
-from gyro_calibration.logs.log import Array, DEGREE, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
@@ -129,9 +129,11 @@ def run(given: argparse.Namespace) -> Answer:
         data |= {'method': found.method, 'time_offset_s': fit.time_offset,
                  'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
                  'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
-                 **{f'{name}_heading_{when}_rad': size(residual)
-                    for name, size in (('rms', rms), ('largest', _largest)) for when, residual in (
-                        ('before', found.residual_before), ('after', found.residual_after))},
+                 **{f'{name}_heading_{when}_rad': size
+                    for when, residual in (('before', found.residual_before),
+                                           ('after', found.residual_after))
+                    for name, size in (('rms', rms(residual)),
+                                       ('largest', float(np.abs(residual).max())))},
                  'remarks': list(found.remarks)}
     return Answer(lines, data, (given.picture, given.out))
 
@@ -235,10 +237,6 @@ def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
                             f'{pair.reason}. They differ beyond these rates; {remedy} would.')
 
 
-def _largest(residual: Array) -> float:
-    return float(np.abs(residual).max())
-
-
 def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
     yield from (*_value_lines(model), '')
     if math.isfinite(found.fit.time_offset):
@@ -246,7 +244,7 @@ def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]
                'the errors are corrected for it.')
     for name, residual in (('before', found.residual_before), ('after', found.residual_after)):
         yield (f'Heading error {name}: {rms(residual) / DEGREE:.3f} deg rms, '
-               f'{_largest(residual) / DEGREE:.3f} deg at most.')
+               f'{np.abs(residual).max() / DEGREE:.3f} deg at most.')
     if rms(found.residual_after) > 5.0 * DEGREE:
         yield wrap_line('The error is above 5 deg rms. ' + (
             'The reference has errors of this size, or shows another motion: compare its turns '

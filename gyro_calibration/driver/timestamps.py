@@ -40,10 +40,8 @@ _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock dri
 #: of two clocks, s.
 _SETTLING_DURATION = 2.0
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
-_LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
 #: Largest lateness with a correct sequence, s, above the 16 ms of a burst.
 _OUTLIER_LATENESS = 0.02
-_MEDIAN_SIZE = 8  # intervals of a device whose median is the usual one: three may be wrong
 #: Largest difference of a clock that is slewed, not set, s; ntpd sets it from 0.128 s on.
 _CLOCK_STEP_THRESHOLD = 0.1
 
@@ -111,7 +109,7 @@ class _SampleCounter:
         self.mean_advance = 1.0  # the usual one
         #: Of how many samples the number may be wrong by a multiple; 0 by the time of the device.
         self.ambiguity = 1
-        self._advances = deque[float](maxlen=_MEDIAN_SIZE)
+        self._advances = deque[float](maxlen=8)  # three may be wrong
         self._sequence: int | None = None
         self._time: float | None = None
         self._outlier_time: float | None = None
@@ -151,7 +149,7 @@ class _SampleCounter:
                         return (1 + lost) * self.mean_advance, lost
                     self._advances.append(by_time)
                     self.mean_advance = median(self._advances)
-                    is_known = len(self._advances) == _MEDIAN_SIZE
+                    is_known = len(self._advances) == self._advances.maxlen
                     return by_time, (max(0, round(by_time / self.mean_advance) - 1)
                                      if is_known else 0)
             self._outlier_time = time  # a single outlier in the time of the device
@@ -174,7 +172,7 @@ class _LatenessTest:
         """Add an arrival; tell whether all since `late_since` have been late, by `step`, s."""
         if lateness <= bound:
             self.late_since = None
-            if arrival - self._window_start > _LONG_LATE_DURATION:
+            if arrival - self._window_start > 5.0 * _LATE_DURATION:
                 self._window_start, self._least_on_time = arrival, math.inf
             self._least_on_time = min(self._least_on_time, lateness)
             return False
@@ -185,7 +183,7 @@ class _LatenessTest:
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
         # bursts near a multiple of the sample rate let the lateness grow slowly to a period and
         # fall to zero: so its step is tested, and itself after a longer time
-        self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
+        self.step = self._least - (0.0 if lasts > 5.0 * _LATE_DURATION
                                    else max(0.0, self._least_on_time))
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
 

@@ -47,12 +47,11 @@ AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as 
 
 RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
               'deg/h': DEGREE / 3600.0}
-_NO_UNIT = {'1': 1.0}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
     'gyro': ('output', RATE_UNITS),
-    'counts': ('counts', _NO_UNIT),
+    'counts': ('counts', {'1': 1.0}),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
     'rate': ('reference_rate', RATE_UNITS),
     'heading': ('reference_heading', {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3,
@@ -60,8 +59,8 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
                                         'mg': 1e-3 * STANDARD_GRAVITY}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
-    'moving': ('moving', _NO_UNIT),
-    'attitude': ('reference_heading', _NO_UNIT),
+    'moving': ('moving', {'1': 1.0}),
+    'attitude': ('reference_heading', {'1': 1.0}),
 }
 
 

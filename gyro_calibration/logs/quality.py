@@ -151,11 +151,6 @@ def quantization_step(values: Array) -> float:
     return find_codes(values).step
 
 
-#: Least share of the changes of an encoder heading that are not collinear with the two before, or
-#: of the bends that return at once; in a calculated motion, rates are constant or change evenly.
-_MIN_IRREGULAR_SHARE = 0.1
-
-
 def encoder_step(heading: Array) -> float:
     """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
     known = heading[np.isfinite(heading)]
@@ -163,8 +158,9 @@ def encoder_step(heading: Array) -> float:
     change = np.diff(known)
     changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
                           for each in (change, np.diff(change, 2)))
-    # at rates of whole steps few changes differ, but the error of each reading shows
-    return step if step and (differing > _MIN_IRREGULAR_SHARE * changes
+    # In a calculated motion, rates are constant or change evenly. At rates of whole steps few
+    # changes differ, but the error of each reading shows.
+    return step if step and (10 * differing > changes
                              or is_rounded_at_each_sample(known, step)) else 0.0
 
 
@@ -172,7 +168,7 @@ def is_rounded_at_each_sample(values: Array, step: float) -> bool:
     """Tell whether changes of values by other numbers of steps return at the next sample."""
     bent = np.diff(values, 2)
     returning = np.count_nonzero(bent[1:] * bent[:-1] < -0.5 * step ** 2)
-    return bool(returning > _MIN_IRREGULAR_SHARE * np.count_nonzero(np.abs(bent) > 0.5 * step))
+    return bool(10 * returning > np.count_nonzero(np.abs(bent) > 0.5 * step))
 
 
 def find_runs(mask: Mask) -> list[slice]:

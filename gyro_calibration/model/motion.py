@@ -125,7 +125,7 @@ ROBOT_MOTION = _turns_and_rests(10.0, (
 NAMED_MOTIONS = {
     'calibration': CALIBRATION_MOTION,
     'robot': ROBOT_MOTION,
-    'rest': motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+    'rest': constant_rate_motion([(60.0, 0.0)]),
 }
 
 

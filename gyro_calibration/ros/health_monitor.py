@@ -38,7 +38,6 @@ _PART_DURATION = 1.0  # s; of the parts of a stretch that are compared: a push s
 #: Largest ratio of the noise of the model to the measured one, 1, as of a filtered output.
 _MAX_NOISE_REDUCTION = 3.0
 _MAX_DECELERATION = 20.0  # rad/s²; of a robot: six times the default of Nav2's controllers
-_DECIDING_STRETCHES = 3  # in a row, in a rest that was not announced: a robot may vibrate
 
 
 @dataclass(frozen=True)
@@ -256,7 +255,8 @@ class HealthMonitor:
         self._level = 0.25 * false_alarm_rate * REST_DURATION / 3600.0
         self.is_enabled = noise.angle_random_walk > 0.0 and self._level > 0.0
         self._samples: list[tuple[float, float, float]] = []
-        self._rests: list[_RestResult] = []
+        # in a row, which decide in a rest that was not announced: a robot may vibrate
+        self._rests = deque[_RestResult](maxlen=3)
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
         self.last_rest: _RestResult | None = None
@@ -295,8 +295,8 @@ class HealthMonitor:
         self.has_noise_at_rest = (
             self.has_noise_at_rest or rest.is_noise_normal and rest.is_bias_normal
             and 1.0 / _MAX_NOISE_REDUCTION < rest.noise_ratio < _MAX_NOISE_REDUCTION)
-        self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
-        last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
+        self._rests.append(rest)
+        last, several = self._rests, len(self._rests) == self._rests.maxlen
         # the mean was the same in the last stretches, unlike in turns
         biases = [each.bias for each in last]
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)

@@ -247,9 +247,6 @@ MAX_VELOCITY_AGE = 1.0  # largest age of a velocity that is used, s; slower odom
 #: Longest motion after the last command to move, s: the default time-out of ros2_control's
 #: diff_drive_controller.
 COASTING_DURATION = 0.5
-#: Largest speeds of wheels at standstill, m/s and rad/s: what turns slower adds to the bias at
-#: rest, 0.011 deg/s at most.
-_STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s: 2.9 deg/s, beyond the bias of a gyro.
 MIN_ODOMETRY_TURN_RATE = 0.05
 #: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
@@ -266,9 +263,9 @@ class Velocity:
 
     @property
     def is_moving(self) -> bool:
-        """Tell whether it exceeds the speeds at standstill."""
-        return (any(abs(part) > _STANDSTILL_SPEED for part in self.linear)
-                or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
+        # what turns slower adds 0.011 deg/s at most to the bias at rest
+        return (any(abs(part) > 0.001 for part in self.linear)
+                or any(abs(part) > 0.0002 for part in self.angular))
 
 
 class TurnComparison:
