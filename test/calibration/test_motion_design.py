@@ -150,12 +150,12 @@ def test_the_verb_prints_a_summary(run, limits, tmp_path):
 WRONG = {
     'unknown': ({'maximum_speed': 3}, 'maximum_speed'),
     'no acceleration': ({'maximum_acceleration_dps2': 0},
-                        'maximum_acceleration_dps2 is 0; wanted a number from 0.01'),
+                        'maximum_acceleration_dps2 is 0; wanted a finite number of at least 0.01'),
     'a text': ({'maximum_rate_dps': 'fast'}, "maximum_rate_dps is 'fast'"),
     'not a number': ({'maximum_rate_dps': math.nan}, 'maximum_rate_dps is nan'),
     'yes': ({'rest_s': True}, 'rest_s is True'),
     'start outside the headings': ({'minimum_heading_deg': 10},
-                                   'minimum_heading_deg is 10; wanted a number from -1e+09 to 0'),
+                                   'minimum_heading_deg is 10; wanted a number from -1e+20 to 0'),
     'slowest above fastest': ({'minimum_rate_dps': 70},
                               'minimum_rate_dps is above maximum_rate_dps'),
 }
