@@ -154,8 +154,6 @@ class _DiskFull(OSError):
 class _Recorder:
     """A new file that grows by complete pieces, and is removed at the end if it has none."""
 
-    ending = b''  # closes a file with pieces, also after one that failed
-
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
         # size of the complete pieces, bytes, and whether one could not be written
@@ -184,6 +182,10 @@ class _Recorder:
         """Write what was added as a piece; a silence or the end makes it due."""
         raise NotImplementedError
 
+    def end(self) -> bytes:
+        """Return what closes a file with pieces, also after one that failed."""
+        return b''
+
     def close(self) -> None:
         """Write what remains, unless a piece failed, and close the file."""
         try:
@@ -191,7 +193,7 @@ class _Recorder:
                 self.flush(is_due=True)
             if self.size:
                 with suppress(_DiskFull) if self.is_full else nullcontext():
-                    self.append(self.ending)
+                    self.append(self.end())
         finally:
             self._file.close()
             if not self.size:
@@ -200,8 +202,6 @@ class _Recorder:
 
 class McapRecorder(_Recorder):
     """Messages in an MCAP file; `variance` is that of the rate of a sample, (rad/s)²."""
-
-    ending = MCAP_END
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         super().__init__(path, notes)
@@ -215,7 +215,12 @@ class McapRecorder(_Recorder):
             self.writer.add(Message(f'/{topic}', kind, stamp, data))
 
     def flush(self, is_due: bool = False) -> None:
-        self.append(self.writer.pack_chunk())
+        if piece := self.writer.pack_chunk():
+            self.append(piece)
+
+    def end(self) -> bytes:
+        """Return the summary, on a full disk a short end that readers understand."""
+        return MCAP_END if self.is_full else self.writer.pack_summary()
 
 
 class CsvRecorder(_Recorder):

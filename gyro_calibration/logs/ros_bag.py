@@ -17,6 +17,7 @@ read from the beginning to the end, or to a truncation. No record may take more 
 GB for an MCAP file of 131 kB. The records follow https://mcap.dev/spec.
 """
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, ExitStack, suppress
 from dataclasses import dataclass, field
@@ -47,7 +48,7 @@ MAX_RECORD_BYTES = 250_000_000
 _READ_BYTES = 1_000_000
 
 _MAGIC = b'\x89MCAP0\r\n'
-_METADATA_NAME = 'gyro_calibration'  # name of the metadata record of this program
+METADATA_NAME = 'gyro_calibration'  # name of the metadata record of this program
 
 OnProgress = Callable[[int], object]  # is called with the number of bytes read of all files
 
@@ -281,7 +282,7 @@ class _McapReader:
             elif code == _RecordCode.METADATA:
                 name, place = _read_text(body, 0)
                 place += 4
-                while name == _METADATA_NAME and place < len(body):  # written by this program
+                while name == METADATA_NAME and place < len(body):  # written by this program
                     key, place = _read_text(body, place)
                     value, place = _read_text(body, place)
                     self._contents.recorder_notes.append(_to_short_line(f'{key}: {value}'))
@@ -305,59 +306,107 @@ def _pack_record(code: _RecordCode, *content: bytes) -> bytes:
     return struct.pack('<BQ', code, len(data)) + data
 
 
-def _pack_text(text: str) -> bytes:
-    data = text.encode()
+def _pack_sized(data: bytes | str) -> bytes:
+    data = data.encode() if isinstance(data, str) else data
     return struct.pack('<I', len(data)) + data
 
 
 class McapWriter:
-    """
-    Makes the bytes of an MCAP file of ROS 2 messages, chunk by chunk; `MCAP_END` closes the file.
-
-    It has no index, as the file of a killed recorder: readers scan it.
-    """
+    """Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk."""
 
     def __init__(self, library: str = '', notes: Callable[[], Mapping[str, str]] = dict):
         """Take the name of the program, and the notes, which are called for with the header."""
-        self._library, self._notes, self._has_header = library, notes, False
-        self._records, self._times = bytearray(), list[int]()  # of the next chunk
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
+        self._library, self._notes = library, notes
+        self._offset = 0
+        self._records = bytearray()
+        self._schemas: dict[str, tuple[int, bytes]] = {}
+        self._channels: dict[str, tuple[int, bytes]] = {}
+        self._indexes: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+        self._counts: Counter[int] = Counter()
+        self._spans: list[tuple[int, int]] = []
+        self._chunk_indexes: list[bytes] = []
+        self._metadata_index = b''
+
+    def _pack_header(self) -> bytes:
+        """Return the beginning of a file: header with the program, and the notes."""
+        head = _MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'),
+                                     _pack_sized(self._library))
+        name = _pack_sized(METADATA_NAME)
+        pairs = b''.join(map(_pack_sized, chain.from_iterable(self._notes().items())))
+        metadata = _pack_record(_RecordCode.METADATA, name, _pack_sized(pairs))
+        self._metadata_index = _pack_record(_RecordCode.METADATA_INDEX,
+                                            struct.pack('<QQ', len(head), len(metadata)), name)
+        return head + metadata
 
     def add(self, message: Message) -> None:
         """Add a message of a type of `DEFINITIONS` to the next chunk."""
         kind, topic, received = message.kind, message.topic, message.received
         if kind not in self._schemas:
-            self._schemas[kind] = len(self._schemas) + 1
-            self._records += _pack_record(
-                _RecordCode.SCHEMA, struct.pack('<H', self._schemas[kind]),
-                *map(_pack_text, (kind, 'ros2msg', DEFINITIONS[kind])))
+            schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H', len(self._schemas) + 1),
+                                  _pack_sized(kind), _pack_sized('ros2msg'),
+                                  _pack_sized(DEFINITIONS[kind]))
+            self._schemas[kind] = len(self._schemas) + 1, schema
+            self._records += schema
         if topic not in self._channels:
-            self._channels[topic] = len(self._channels) + 1
-            self._records += _pack_record(
-                _RecordCode.CHANNEL,
-                struct.pack('<HH', self._channels[topic], self._schemas[kind]),
-                *map(_pack_text, (topic, 'cdr', '')))
-        head = struct.pack('<HIQQ', self._channels[topic], 0, received, received)
+            ends = len(self._channels) + 1, self._schemas[kind][0]
+            channel = _pack_record(_RecordCode.CHANNEL, struct.pack('<HH', *ends),
+                                   _pack_sized(topic), _pack_sized('cdr'), _pack_sized(b''))
+            self._channels[topic] = ends[0], channel
+            self._records += channel
+        number = self._channels[topic][0]
+        self._indexes[number].append((received, len(self._records)))
+        head = struct.pack('<HIQQ', number, 0, received, received)
         self._records += _pack_record(_RecordCode.MESSAGE, head, message.data)
-        self._times.append(received)
 
     def pack_chunk(self) -> bytes:
-        """Return the messages since the last chunk, the first ones after a header; or b''."""
-        if not self._times:
+        """
+        Return the messages since the last chunk as a chunk with index; b'' without any.
+
+        The first one follows the header.
+        """
+        if not self._indexes:
             return b''
-        records, header = bytes(self._records), b''
-        if not self._has_header:
-            pairs = b''.join(map(_pack_text, chain.from_iterable(self._notes().items())))
-            header = (_MAGIC + _pack_record(_RecordCode.HEADER,
-                                            *map(_pack_text, ('ros2', self._library)))
-                      + _pack_record(_RecordCode.METADATA, _pack_text(_METADATA_NAME),
-                                     struct.pack('<I', len(pairs)), pairs))
-        span = struct.pack('<QQQI', min(self._times), max(self._times), len(records),
-                           zlib.crc32(records))
-        self._records, self._times, self._has_header = bytearray(), [], True
-        return header + _pack_record(_RecordCode.CHUNK, span, _pack_text(''),
-                                     struct.pack('<Q', len(records)), records)
+        header = b'' if self._offset else self._pack_header()
+        self._offset += len(header)
+        times = [time for index in self._indexes.values() for time, _ in index]
+        self._spans.append((min(times), max(times)))
+        records = bytes(self._records)
+        head = struct.pack('<QQQI', *self._spans[-1], len(records), zlib.crc32(records))
+        chunk = _pack_record(_RecordCode.CHUNK, head, _pack_sized(''),
+                             struct.pack('<Q', len(records)), records)
+        indexes, offsets = b'', b''
+        for number, index in self._indexes.items():
+            offsets += struct.pack('<HQ', number, self._offset + len(chunk) + len(indexes))
+            pairs = b''.join(struct.pack('<QQ', *pair) for pair in sorted(index))
+            indexes += _pack_record(_RecordCode.MESSAGE_INDEX, struct.pack('<H', number),
+                                    _pack_sized(pairs))
+            self._counts[number] += len(index)
+        self._chunk_indexes.append(
+            _pack_record(_RecordCode.CHUNK_INDEX,
+                         struct.pack('<QQQQ', *self._spans[-1], self._offset, len(chunk)),
+                         _pack_sized(offsets), struct.pack('<Q', len(indexes)), _pack_sized(''),
+                         struct.pack('<QQ', len(records), len(records))))
+        self._records.clear()
+        self._indexes.clear()
+        self._offset += len(chunk + indexes)
+        return header + chunk + indexes
+
+    def pack_summary(self) -> bytes:
+        """Return the end of a file: the summary with the index of all chunks."""
+        data_end = _pack_record(_RecordCode.DATA_END, struct.pack('<I', 0))
+        sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
+        span = (min((span[0] for span in self._spans), default=0),
+                max((span[1] for span in self._spans), default=0))
+        counts = b''.join(struct.pack('<HQ', *pair) for pair in self._counts.items())
+        statistics = _pack_record(
+            _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
+            struct.pack('<QQ', *span), _pack_sized(counts))
+        summary = b''.join([*(record for _, record in self._schemas.values()),
+                            *(record for _, record in self._channels.values()),
+                            statistics, *self._chunk_indexes, self._metadata_index])
+        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, self._offset + len(data_end), 0)
+        checked = struct.pack('<I', zlib.crc32(summary + footer))
+        return data_end + summary + footer + checked + _MAGIC
 
 
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.

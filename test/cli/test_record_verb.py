@@ -200,13 +200,19 @@ def test_rosbags_and_mcap_read_what_is_recorded(tmp_path):
         assert covariance.tolist() == [1e6, 0.0, 0.0, 0.0, 1e6, 0.0, 0.0, 0.0, deviation ** 2]
     times = [stamp for stamp, _ in samples()]
     with open(tmp_path / 'a.mcap', 'rb') as file:
-        reader = reading.make_reader(file, validate_crcs=True)
+        reader = reading.NonSeekingReader(file, validate_crcs=True)
         assert [message.log_time for _, channel, message in reader.iter_messages()
                 if channel.topic == '/imu/temperature'] == times
-        assert reader.get_header().profile == 'ros2'
         file.seek(0)
-        metadata, = reading.NonSeekingReader(file).iter_metadata()
+        reader = reading.SeekingReader(file, validate_crcs=True)
+        said = reader.get_summary().statistics
+        assert (said.message_count, said.chunk_count, said.message_start_time,
+                said.message_end_time) == (600, 4, times[0], times[-1])
+        assert reader.get_header().profile == 'ros2'
+        metadata, = reader.iter_metadata()
         assert metadata.metadata == notes()
+        assert [message.log_time
+                for *_, message in reader.iter_messages(['/imu/data_raw'])] == times
 
 
 def test_a_file_that_is_there_is_never_written_to(tmp_path):
