@@ -46,8 +46,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course'],
-                        help='means at constant rates; by the reference heading; by a course over '
-                        'ground. Default: by the columns of the log')
+                        help='dwells: means at constant rates; likelihood: by the reference '
+                        'heading; course: by a course over ground. Default: by the columns')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
@@ -305,4 +305,5 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
         yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s one modelled '
                         'output has two rates: do not use the model there.')
     if not fit.dof:
-        yield 'As many values as dwells have no standard deviations: add dwells.'
+        yield wrap_line('There are as many values as dwells, so their standard deviations are '
+                        'unknown: add dwells.')

@@ -22,7 +22,7 @@ from gyro_calibration.calibration.motion_design import (
     CalibrationForecast, can_follow, find_best_motion, plain_motion, RobotLimits)
 from gyro_calibration.calibration.self_calibration import default_reference_errors
 from gyro_calibration.cli.verb import Answer, non_negative_integer, positive_number, show_progress
-from gyro_calibration.files import describe_error, InputError, MAX_MAGNITUDE, write_atomically
+from gyro_calibration.files import describe_error, InputError, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_by_name, NAMED_MOTIONS
@@ -37,7 +37,7 @@ _LIMIT_FIELDS: dict[str, tuple[str, tuple[float, ...]]] = {
     'maximum_acceleration_dps2': ('acceleration', (0.01,)),
     'maximum_jerk_dps3': ('jerk', (0.01,)),
     'minimum_rate_dps': ('slowest', (0.0,)),
-    'minimum_heading_deg': ('lowest', (-MAX_MAGNITUDE, 0.0)),
+    'minimum_heading_deg': ('lowest', (-1e9, 0.0)),
     'maximum_heading_deg': ('highest', (0.0,)),
     'rest_s': ('rest', (0.1, 100.0)),
 }

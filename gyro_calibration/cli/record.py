@@ -295,7 +295,8 @@ class _PortSession:
         if given.topic or given.temperature_topic or given.reference_topic:
             raise InputError('--port and topics were both given; record one of them')
         if not 0 <= given.baud <= MAX_BAUD:
-            raise InputError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}')
+            raise InputError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}; '
+                             'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:
             self._settings = Settings(

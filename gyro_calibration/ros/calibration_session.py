@@ -176,9 +176,10 @@ class Drive:
     def describe_lateness(self, limits: RunLimits) -> str:
         """Return a sentence where commands or samples were late beyond the residual limit."""
         late = max(self.command_lateness, self.sample_lateness)
-        return (late * _max_rate(self._motion) > limits.max_stretch_residual) * (
-            f'this computer was busy: commands were up to {self.command_lateness:.2f} s late and '
-            f'samples up to {self.sample_lateness:.2f} s; reduce its load and run again')
+        if late * _max_rate(self._motion) <= limits.max_stretch_residual:
+            return ''
+        return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s late '
+                f'and samples up to {self.sample_lateness:.2f} s; reduce its load and run again')
 
 
 def read_profile(file: str) -> Motion:

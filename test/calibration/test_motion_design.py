@@ -155,7 +155,7 @@ WRONG = {
     'not a number': ({'maximum_rate_dps': math.nan}, 'maximum_rate_dps is nan'),
     'yes': ({'rest_s': True}, 'rest_s is True'),
     'start outside the headings': ({'minimum_heading_deg': 10},
-                                   'minimum_heading_deg is 10; wanted a number from -1e+20 to 0'),
+                                   'minimum_heading_deg is 10; wanted a number from -1e+09 to 0'),
     'slowest above fastest': ({'minimum_rate_dps': 70},
                               'minimum_rate_dps is above maximum_rate_dps'),
 }
