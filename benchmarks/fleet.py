@@ -298,7 +298,7 @@ def scale(_: Generator, logs: int = 10_000) -> Iterator[str]:
     begin = time.process_time()
     memory, used = [], {}
     with process_executor(2, preload=['fleet', 'processes']) as executor:
-        for number, (_, found) in enumerate(run_tasks(calibrate, range(logs), 2, executor), 1):
+        for number, (_, found) in enumerate(run_tasks(calibrate, range(logs), executor), 1):
             used[found[1]] = found[2]
             if number % max(logs // 4, 1) == 0:
                 memory.append(resident_memory() / 1e6)

@@ -39,4 +39,4 @@ def begun(folder):
 
 if __name__ == '__main__':
     with process_executor(1) as executor:
-        list(run_tasks(begun, sys.argv[1:], 1, executor))
+        list(run_tasks(begun, sys.argv[1:], executor))

@@ -226,7 +226,7 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
     """Check that a log is refused in a line, or read the same whole, in blocks, and rewritten."""
     path = _file(data, suffix)
     log = _read(read_log, LogError, path)
-    with mock.patch('gyro_calibration.logs.log.BLOCK_ROWS', 2):
+    with mock.patch('gyro_calibration.logs.log.CACHE_BLOCK_SAMPLES', 2):
         other = _read(read_log, LogError, path)
     assert (log is None) == (other is None), 'refused as a whole or in blocks only'
     if log is None:

@@ -102,8 +102,7 @@ class NoiseFigures(PrintedResult):
         floor_line = (f'Lowest Allan deviation: {deviation} {unit} at {time:.4g} s, '
                       f'95 %: {lower} to {upper}.')
         if not fit.is_floor_reached:
-            floor_line += (' The deviation still falls at the end of the chart; record longer to '
-                           'reach its minimum.')
+            floor_line += ' It still falls at the end of the chart; record longer.'
         lines = [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
                  f'{len(record.rate) * record.interval:.5g} s at rest.',
                  *record.remarks, floor_line]
@@ -129,12 +128,10 @@ class NoiseFigures(PrintedResult):
         if fit.process:
             size = fit.process.standard_deviation * _DISPLAY_UNITS['B'][1]
             text += (f'; a Gauss-Markov process of {size:.3g} deg/h with a correlation time of '
-                     f'{fit.process.correlation_time:.3g} s describes them better than B and K, '
-                     'which approximate it and may be zero')
+                     f'{fit.process.correlation_time:.3g} s describes them better than B and K')
         return '\n'.join([*lines, f'{text}.'])
 
     def put_into(self, model: GyroModel) -> GyroModel:
-        """Return a model with these figures as its noise."""
         return replace(model, noise=self.fit.noise, noise_bounds=self.fit.noise_bounds)
 
     def plot(self, path: str | Path | None = None) -> Any:

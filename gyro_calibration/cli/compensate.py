@@ -34,7 +34,7 @@ from gyro_calibration.heading.log_compensation import (
     LogCompensation, no_plausible_row_message, plausible_rows, rows_of, smooth_track)
 from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.log import (
-    Array, BLOCK_ROWS, DataRefused, DEGREE, Log, Mask, write_log)
+    Array, CACHE_BLOCK_SAMPLES, DataRefused, DEGREE, Log, Mask, write_log)
 from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model
@@ -94,19 +94,17 @@ def run(given: argparse.Namespace) -> Answer:
     lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
               if term.effect.not_compensated]
     if MAX_GAP < (interval := found.intervals.usual_interval) < math.inf:
-        lines.append(f'The samples are {interval:g} s apart, and the heading is that of a rate '
-                     f'which is constant meanwhile; {_INTERVAL_REMEDY}.')
+        lines.append(f'The samples are {interval:g} s apart, between which the rate is taken to '
+                     f'be constant; {_INTERVAL_REMEDY}.')
     for name, words in (
             ('rows_without_output',
              'rows have no output of the gyro; the heading is integrated across them.'),
             ('refused_samples', 'rows have an implausible rate or temperature and are not used; '
              'they count as lost.'),
             ('lost_samples', 'samples are lost; the heading is integrated over gaps of up to '
-             f'{MAX_GAP:g} s, not over longer ones, in which the robot may have turned to any '
-             'direction; its standard deviation includes both.'),
-            ('temperature_clipped',
-             'rows are outside the calibrated temperatures; the correction is extrapolated, and '
-             'the standard deviation increases.'),
+             f'{MAX_GAP:g} s, and unknown over longer ones, as its standard deviation tells.'),
+            ('temperature_clipped', 'rows are outside the calibrated temperatures; the correction '
+             'is extrapolated, and the standard deviation increases.'),
             ('beyond_range', 'rows are beyond the calibrated rates; the correction is '
              'extrapolated, or held where the model has no rate for the output.')):
         if data[name]:
@@ -127,8 +125,7 @@ def _describe_heading(log: Log, found: CompensatedLog, model: GyroModel,
     yield f'Heading at the end: {heading / DEGREE:.2f}{spread} deg.'
     if is_known and not data['noise_is_known']:
         yield ('The model has no noise figures: noise and wander of the bias are not in the '
-               'standard deviation; record the gyro at rest, and run allan to add them to the '
-               'model.')
+               'standard deviation; record a rest, and run allan to add them.')
     if log.reference_heading is None:
         return
     error = headings - log.reference_heading
@@ -138,10 +135,8 @@ def _describe_heading(log: Log, found: CompensatedLog, model: GyroModel,
         mean, last = float(np.abs(error).mean()), float(error[-1])
         data.update(mean_heading_error_rad=mean, last_heading_error_rad=last)
         yield (f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the end '
-               f'{last / DEGREE:.3f} deg.')
-        yield ('Both headings start at 0 at the first row with a reference. This error includes '
-               'its mean and a delay of the reference; the heading errors that fit prints exclude '
-               'both.')
+               f'{last / DEGREE:.3f} deg. Both start at 0 at the first row with a reference; '
+               'unlike those of fit, this error includes its mean and a delay of the reference.')
 
 
 def _describe_bias(estimator: HeadingEstimator | None, has_wheels: bool,
@@ -155,13 +150,11 @@ def _describe_bias(estimator: HeadingEstimator | None, has_wheels: bool,
     if estimator.is_bias_assumed and not has_wheels:
         yield ('The bias is not known from a calibration: the first steady rate within '
                f'{Assumptions.bias / DEGREE:g} deg/s was taken for that of a rest. If the log '
-               'begins in a turn or a bend, the heading may be off by more than its standard '
-               'deviation; run self-calibrate, begin the log with a rest, or record the column '
-               'moving.')
+               'begins in a turn, the heading may be off by more than its standard deviation; run '
+               'self-calibrate, begin with a rest, or record the column moving.')
     if not (estimator.is_bias_assumed or data['rows_at_rest']):
-        yield ('No rest was found: the bias of the calibration was used, and a change since then '
-               'is not in the standard deviation; rest for some seconds now and then, or '
-               'calibrate before each drive.')
+        yield ('No rest was found: a change of the bias since the calibration is not in the '
+               'standard deviation; rest now and then, or calibrate before each drive.')
     if estimator.is_scale_assumed:
         yield ('The scale factor error is not known from a calibration: '
                f'{100.0 * Assumptions.scale_factor_error:g} % is in the standard deviation; run '
@@ -228,12 +221,12 @@ def integrate_log(log: Log, model: GyroModel, threshold: Threshold, name: str) -
         # The noise of a rate depends on the interval between samples. That of the first block is
         # used for all rates, since a lost sample does not reduce the noise of a gyro. Rows without
         # output may lie between samples.
-        first = log.time[:BLOCK_ROWS]
-        of_output = first[known[:BLOCK_ROWS]]
+        first = log.time[:CACHE_BLOCK_SAMPLES]
+        of_output = first[known[:CACHE_BLOCK_SAMPLES]]
         variance = model.noise.rate_variance(
             float(np.median(np.diff(of_output if len(of_output) > 1 else first))))
     # in blocks, which limit the memory, unless rates are interpolated to the stamps
-    size = len(log) if model.moves_stamps else BLOCK_ROWS
+    size = len(log) if model.moves_stamps else CACHE_BLOCK_SAMPLES
     for begin in range(0, len(log), size):
         rows = rows_of(log, begin + np.flatnonzero(known[begin:begin + size]))
         result, sensitivity = compensation.add(rows)

@@ -57,7 +57,6 @@ except ImportError as error:
 
 _PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
-_MAX_ATTEMPTS = 3  # to calibrate
 _DRIVE_MOTION = constant_rate_motion([
     *((5.0 if rate else 4.0, rate) for rate in (0, 20, 0, -20, 0, 20, -20, 0, -20, 0)), (1.0, 0)])
 
@@ -73,21 +72,19 @@ def run(given: argparse.Namespace) -> Answer:
     """
     Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
 
-    The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
-    motion of the robot; driver and compensation run as processes of their own, as on a robot. The
-    compensation drives the calibration, then a drive follows.
+    The gyro of the robot, which follows ``cmd_vel``, is emulated on a pseudo-terminal; driver and
+    compensation run as processes of their own.
     """
     if _MISSING:
-        raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); source ROS 2, or '
-                         'install gyro_calibration[ros,plot]')
+        raise InputError(f'the demo needs ROS 2 and matplotlib ({_MISSING}); install '
+                         'gyro_calibration[ros,plot]')
     verb.require_folder(given.out)
     out = Path(given.out)
     out.mkdir(parents=True, exist_ok=True)
     calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
                                           out.absolute() / 'gyro')
     calibration_file.unlink(missing_ok=True)
-    # The graph is separate from the network of a robot and from other graphs on this machine, so
-    # it needs no permissions in a secured one.
+    # separate from the network of a robot and other graphs on this machine
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
@@ -145,7 +142,6 @@ class _DemoClient:
     """Subscribes to the nodes and calls their services, spinning in a thread of its own."""
 
     def __init__(self, robot: _SimulatedRobot):
-        """Subscribe; the robot receives ``cmd_vel`` from now on."""
         self.raw_rates: list[tuple[float, float]] = []  # s and rad/s
         self.headings: list[tuple[float, float]] = []  # s and rad
         self.node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
@@ -175,7 +171,6 @@ class _DemoClient:
         self._thread.start()
 
     def call_service(self, name: str, timeout: float) -> None:
-        """Call a service, and wait until it has succeeded."""
         client = self.node.create_client(Trigger, name)
         if not client.wait_for_service(20.0):
             raise OSError(f'the service {name} did not appear within 20 s')
@@ -221,22 +216,21 @@ def _node_process(module: str, **parameters: object) -> Iterator[None]:
 
 
 def _calibrate_and_drive(client: _DemoClient) -> float:
-    """Calibrate and drive; return the time at which the drive began, s."""
     with verb.show_progress('starting driver and compensation') as on_progress:
         deadline = time.monotonic() + 60.0
         while not (client.raw_rates and client.headings
                    and client.node.count_publishers('cmd_vel') > 1):
             if time.monotonic() > deadline:
                 raise OSError('driver and compensation were not ready within 60 s; stop other '
-                              'programs, and run the demo again')
+                              'programs')
             time.sleep(0.02)
         on_progress(None, 'calibrating on the motion profile')
-        for attempt in range(1, _MAX_ATTEMPTS + 1):
+        for is_last in (False, False, True):
             try:
                 client.call_service('compensation_node/calibrate', 60.0)
                 break
             except _CallRefused as refusal:  # this robot turns late on a busy machine
-                if attempt == _MAX_ATTEMPTS:
+                if is_last:
                     raise
                 verb.print_message(f'{refusal}; the run is repeated')
                 time.sleep(2.0)  # until the robot stands

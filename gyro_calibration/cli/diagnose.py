@@ -70,11 +70,7 @@ def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind:
                   names: Sequence[str] = (),
                   on_progress: OnProgress = lambda share, words: None,
                   time_limit: float | None = None) -> Diagnosis:
-    """
-    Diagnose logs in time, or a rate table.
-
-    The search for causes ends after half of a time limit, s, as what follows may take as long.
-    """
+    """Diagnose logs in time, or a rate table; the search ends after half of a time limit, s."""
     begin = time.monotonic()
 
     def on_step(share: float | None, words: str) -> bool:

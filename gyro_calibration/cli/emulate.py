@@ -66,11 +66,10 @@ def run(given: argparse.Namespace) -> None:
         raise InputError(str(error)) from None
     log = verb.read(given) if given.log else simulate_log(given)[0]
     time, output = verb.require_time(given, log), np.asarray(log.output)
-    if np.isfinite(output).sum() < 2:
-        raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
-                          'have an output; give a log with two or more')
+    if (known := np.isfinite(output)).sum() < 2:
+        raise DataRefused(f'{given.log}: {known.sum()} of {len(output)} samples have an output; '
+                          'give a log with two or more')
     # the samples that have an output, once or, on request, again and again
-    known = np.isfinite(output)
     times, outputs = time[known] - time[known][0], output[known].tolist()
     temperatures = repeat(None) if log.temperature is None else log.temperature[known].tolist()
     starts = count(0.0, float(times[-1] + np.median(np.diff(times))))

@@ -38,8 +38,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     model = read_model(given.model)
     if given.span * given.sample_rate < 2.0:
-        raise InputError(f'--span {given.span:g} is shorter than two samples; give at least '
-                         f'{2.0 / given.sample_rate:g} s')
+        raise InputError(f'--span {given.span:g} is shorter than two samples; give a longer one')
     temperature = model.reference_temperature if given.temperature is None else given.temperature
     noise_figures, error = simulator_parameters(model, given.sample_rate, temperature, given.span)
     text, left_out = export_model(noise_figures, model, given.to)
@@ -50,8 +49,8 @@ def run(given: argparse.Namespace) -> Answer:
     write_atomically(given.out, text.encode())
     lines = [f'Written to {given.out}.']
     if noise_figures.wander.density and given.to == 'sdf':
-        lines.append('One Gauss-Markov process replaces the drift of the bias: the Allan '
-                     f'deviation is accurate to {100.0 * error:.0f} % up to {given.span:g} s.')
+        lines.append('A Gauss-Markov process replaces the drift of the bias: the Allan deviation '
+                     f'is accurate to {100.0 * error:.0f} % up to {given.span:g} s.')
     if left_out:
         lines += [f'{given.to} does not hold:', *(f'  {each}' for each in left_out)]
     return Answer(lines, data)

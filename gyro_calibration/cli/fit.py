@@ -33,7 +33,7 @@ from gyro_calibration.cli.verb import Answer, PrintedResult, show_progress
 from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import as_sentence, display_unit, wrap_line
 from gyro_calibration.files import suggest_nearest
-from gyro_calibration.logs.log import Array, DEGREE, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect, polynomial_to_matrix, rate_temperature_polynomial, STATIC_EFFECTS)
 from gyro_calibration.model.gyro_model import GyroModel
@@ -47,8 +47,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course'],
                         help='dwells: means at constant rates; likelihood: by the reference '
-                        'heading; course: by a course over ground. Default: by the columns of the '
-                        'log')
+                        'heading; course: by a course over ground. Default: by the columns')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
@@ -57,8 +56,8 @@ def add(parser: argparse.ArgumentParser) -> None:
                       help='fit the polynomial over output and temperature of these orders '
                       'instead; default: 3,2')
     parser.add_argument('--technology', choices=list(TECHNOLOGY_EFFECTS), help='of the gyro; '
-                        'selects between effects that the data do not distinguish, and the prior '
-                        'with a reference heading (default there: mems)')
+                        'decides where the data do not, and sets the prior with a reference '
+                        'heading (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
@@ -118,8 +117,8 @@ def run(given: argparse.Namespace) -> Answer:
                        for term in model.terms if term.effect.name == POLYNOMIAL), None)
         lines = list(_dwell_lines(model, found))
         if given.technology and not found.choices:
-            lines.append(f'--technology {given.technology} is stored in the model; it had no '
-                         'influence, since the effects were given.')
+            lines.append(f'--technology {given.technology} had no influence, since the effects '
+                         'were given; it is stored in the model.')
         data |= {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
                  'remarks': [*found.calibration.dwells.remarks,
                              *_describe_excess(found.calibration)]}
@@ -130,9 +129,11 @@ def run(given: argparse.Namespace) -> Answer:
         data |= {'method': found.method, 'time_offset_s': fit.time_offset,
                  'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
                  'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
-                 **{f'{name}_heading_{when}_rad': size(residual)
-                    for name, size in (('rms', rms), ('largest', _largest)) for when, residual in (
-                        ('before', found.residual_before), ('after', found.residual_after))},
+                 **{f'{name}_heading_{when}_rad': size
+                    for when, residual in (('before', found.residual_before),
+                                           ('after', found.residual_after))
+                    for name, size in (('rms', rms(residual)),
+                                       ('largest', float(np.abs(residual).max())))},
                  'remarks': list(found.remarks)}
     return Answer(lines, data, (given.picture, given.out))
 
@@ -233,12 +234,7 @@ def _dwell_lines(model: GyroModel, selection: SelectedEffects) -> Iterator[str]:
                   else f'two dwells each way at {pair.distinguishing_rate / DEGREE:.0f} deg/s')
         if not pair.is_distinguishable:
             yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
-                            f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
-                            'would distinguish them.')
-
-
-def _largest(residual: Array) -> float:
-    return float(np.abs(residual).max())
+                            f'{pair.reason}. They differ beyond these rates; {remedy} would.')
 
 
 def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]:
@@ -248,13 +244,12 @@ def _heading_lines(model: GyroModel, found: EncoderCalibration) -> Iterator[str]
                'the errors are corrected for it.')
     for name, residual in (('before', found.residual_before), ('after', found.residual_after)):
         yield (f'Heading error {name}: {rms(residual) / DEGREE:.3f} deg rms, '
-               f'{_largest(residual) / DEGREE:.3f} deg at most.')
+               f'{np.abs(residual).max() / DEGREE:.3f} deg at most.')
     if rms(found.residual_after) > 5.0 * DEGREE:
-        remedy = ('The reference has errors of this size, or shows another motion: compare its '
-                  'turns with known ones before using the model.' if found.method == 'course' else
-                  'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
-                  'needs stretches of constant rate in the log.')
-        yield wrap_line(f'The error is above 5 deg rms. {remedy}')
+        yield wrap_line('The error is above 5 deg rms. ' + (
+            'The reference has errors of this size, or shows another motion: compare its turns '
+            'with known ones.' if found.method == 'course' else 'If the gyro is nonlinear or '
+            'depends on temperature, use --method dwells, which needs constant rates.'))
     yield from (wrap_line(as_sentence(remark)) for remark in found.remarks)
 
 
@@ -281,14 +276,14 @@ def _describe_excess(fit: Calibration) -> Iterator[str]:
     if excess > 1.2 and fit.fit_p_value < FALSE_ALARM_RATE:
         yield (f'The residual is {excess:.1f} times the scatter of the dwells about a smooth '
                'surface: the model lacks an effect. The intervals are widened by this factor.')
-    # Where most rates occur once, nothing shows the scatter of dwells beyond their own noise.
+    # where most rates occur once, nothing shows the scatter of dwells beyond their own noise
     places = np.rint(used.rate / max(0.005 * float(np.abs(used.rate).max()), 1e-9))
     squares = float(np.sum((fit.residual[fit.scatter.inliers] / used.deviation) ** 2))
     if 2 * len(np.unique(places)) > len(used) and (
             chi2.sf(squares, fit.dof) < MIN_FIT_PROBABILITY):
         yield (f'The residual is {math.sqrt(squares / fit.dof):.1f} times the noise within the '
-               'dwells. Either they scatter by more than that, or the model lacks an effect, and '
-               'the intervals do not contain its error; repeat the rates in a second sweep.')
+               'dwells: they scatter, or the model lacks an effect, whose error is not in the '
+               'intervals; repeat the rates in a second sweep.')
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
@@ -307,9 +302,8 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
                     f'Condition number {fit.condition_number:.1f}.')
     yield from map(wrap_line, _describe_excess(fit))
     if fit.min_non_monotonic_rate is not None:
-        yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s the modelled '
-                        'output does not increase with the rate, so one output has two rates: do '
-                        'not use the model there.')
+        yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s one modelled '
+                        'output has two rates: do not use the model there.')
     if not fit.dof:
         yield wrap_line('There are as many values as dwells, so their standard deviations are '
                         'unknown: add dwells.')

@@ -62,7 +62,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--workers', type=verb.positive_integer, metavar='N',
                         help='number of processes; default: one per core')
     parser.add_argument('--memory', type=verb.positive_number, metavar='GB',
-                        help='memory limit per worker; default: an equal share of this machine')
+                        help='limit per worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
                         'as tcp://host:8786; its workers need the same files')
 
@@ -76,11 +76,11 @@ def run(given: argparse.Namespace) -> Answer:
     tasks = [LogTask(entry, folder, given.technology, pattern, generator, given.gyro_type or '',
                      given.rate) for entry in logs]
     done: dict[str, dict[str, Any]] = {}
-    workers = given.workers or (len(os.sched_getaffinity(0)) if given.scheduler is None else 64)
+    workers = given.workers or len(os.sched_getaffinity(0))
     try:
         with (_make_executor(given, workers) as executor,
               show_progress(f'0 of {len(tasks)} logs') as on_progress):
-            for task, record in run_tasks(process_log, tasks, workers, executor):
+            for task, record in run_tasks(process_log, tasks, executor):
                 if not isinstance(record, dict):
                     reason = f'its worker failed ({type(record).__name__}: {str(record)[:200]})'
                     record = make_refused_record(task.entry, reason)
@@ -180,8 +180,8 @@ def _exclude_invalid(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                       if one['unit'] and one['unit'] != each['unit']), None)
         if each['status'] == DONE and each['unit'] and other is not None:
             exclusion = (f'it is of unit {to_printable(each["unit"])} and has the values of '
-                         f'{other["log"]}, of unit {to_printable(other["unit"])}: delete the one '
-                         'that is a copy, or correct its unit')
+                         f'{other["log"]}, of unit {to_printable(other["unit"])}: delete the '
+                         'copy, or correct its unit')
         elif each['status'] == DONE and first is not each:
             exclusion = f'it is a copy of {first["log"]}'
         elif each['status'] == DONE and not each['unit']:
@@ -189,8 +189,7 @@ def _exclude_invalid(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         elif (_rest_noise(each)
                 and is_degree_ratio(ratio := _rest_noise(each) / median_noise[each['type']])):
             exclusion = (f'its white noise is {ratio:.3g} times the median of its type, as by '
-                         'deg/s in place of rad/s; correct the unit of its column, or state its '
-                         'type')
+                         'deg/s in place of rad/s; correct the unit of its column, or its type')
         found.append({**each, 'status': NO_EVIDENCE, 'reason': exclusion} if exclusion else each)
     return found
 

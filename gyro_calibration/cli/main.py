@@ -42,15 +42,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = make_parser(str(words[0]) if words else '').parse_args(words)
     try:
         for name, value in vars(given).items():
-            # for example from a shell variable that is not set
-            if value == '' or isinstance(value, list) and '' in value:
+            if value == '' or isinstance(value, list) and '' in value:  # a variable of the shell
                 raise InputError(f'{name.replace("_", "-")} is empty; give a value or omit it')
         # Only the command line names Python files to be run; models and logs cannot.
         for path in given.catalogue:
             spec = spec_from_file_location('effects_of_the_user', path)
             if spec is None or spec.loader is None or not Path(path).is_file():
-                raise InputError(f'{path} is not a Python file; wanted one, .py, with a list '
-                                 'EFFECTS')
+                raise InputError(f'{path} is not a Python file; wanted .py with a list EFFECTS')
             module = module_from_spec(spec)
             try:
                 spec.loader.exec_module(module)
@@ -90,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports wrong arguments without control characters, which names of files may contain."""
+    """Reports wrong arguments, without the control characters that names of files may contain."""
 
     def _print_message(self, message: str, file: Any = None) -> None:
         super()._print_message(to_printable(message, allowed='\n'), file)

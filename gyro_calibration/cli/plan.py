@@ -31,19 +31,16 @@ from gyro_calibration.model.settings_file import (
     InvalidValue, parse_number, read_settings, validate)
 import numpy as np
 
-#: Ranges of the numbers of a file; the largest stand for any.
-_POSITIVE, _NOT_NEGATIVE = (0.01, 1e9), (0.0, 1e9)
-#: Name of a limit in a file -> its name in `RobotLimits`, and the range of its numbers.
-_LIMIT_FIELDS = {
-    'maximum_rate_dps': ('rate', _POSITIVE),
-    'maximum_acceleration_dps2': ('acceleration', _POSITIVE),
-    'maximum_jerk_dps3': ('jerk', _POSITIVE),
-    'minimum_rate_dps': ('slowest', _NOT_NEGATIVE),
+#: Name of a limit in a file -> its name in `RobotLimits`, and the ends of its numbers.
+_LIMIT_FIELDS: dict[str, tuple[str, tuple[float, ...]]] = {
+    'maximum_rate_dps': ('rate', (0.01,)),
+    'maximum_acceleration_dps2': ('acceleration', (0.01,)),
+    'maximum_jerk_dps3': ('jerk', (0.01,)),
+    'minimum_rate_dps': ('slowest', (0.0,)),
     'minimum_heading_deg': ('lowest', (-1e9, 0.0)),
-    'maximum_heading_deg': ('highest', _NOT_NEGATIVE),
+    'maximum_heading_deg': ('highest', (0.0,)),
     'rest_s': ('rest', (0.1, 100.0)),
 }
-_MAX_DURATION = 300.0  # s, of a motion that is planned
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -56,8 +53,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
-                        help='drive after the calibration whose heading error is predicted, one '
-                        f'of {", ".join(NAMED_MOTIONS)} or a profile; default: robot')
+                        help='drive whose heading error is predicted, a profile or one of '
+                        f'{", ".join(NAMED_MOTIONS)}; default: robot')
     parser.add_argument('--drive', type=positive_number, metavar='S',
                         help='length of that drive, which is repeated; default: its own length')
     parser.add_argument('--seed', type=non_negative_integer, default=1,
@@ -65,9 +62,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    if given.seconds > _MAX_DURATION:
-        raise InputError(f'--seconds {given.seconds:g} is above {_MAX_DURATION:g}; '
-                         'plan a shorter motion and repeat it')
+    if given.seconds > 300.0:
+        raise InputError(f'--seconds {given.seconds:g} is above 300; plan a shorter motion')
     robot = _read_limits(given.limits)
     noise = read_model(given.model).noise if given.model else XV3500.noise
     if not noise.angle_random_walk:
@@ -104,9 +100,8 @@ def run(given: argparse.Namespace) -> Answer:
                for name, row in rows.items()),
              '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} '
              f'times as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
-             f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
-             f'Angle random walk contributes {planned.floor / DEGREE:.3f} deg to the error, '
-             'independent of the calibration.',
+             f'{"smaller" if heading_gain >= 0.0 else "larger"}; by angle random walk alone it is '
+             f'{planned.floor / DEGREE:.3f} deg.',
              'The scale is that by an exact reference. For wheels that follow the profile, '
              f'self-calibrate adds {100 * wheels:.2f} %, or --reference-scale-deviation.']
     data = {'duration_s': motion.duration, 'time_s': time.tolist(),
@@ -133,15 +128,13 @@ def _read_limits(path: str) -> RobotLimits:
         given = validate('the file', content, dict.fromkeys(_LIMIT_FIELDS, check))
     except InvalidValue as error:
         raise InputError(f'{path}: {error}; config/limits.yaml is an example') from None
-    missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
-               if name not in given]
-    if missing:
-        raise InputError(f'{path}: {missing[0]} is missing; add the limit of the robot')
+    for name in ('maximum_rate_dps', 'maximum_acceleration_dps2'):
+        if name not in given:
+            raise InputError(f'{path}: {name} is missing; add the limit of the robot')
     robot = RobotLimits(**{_LIMIT_FIELDS[name][0]: value if name == 'rest_s' else value * DEGREE
                            for name, value in given.items()})
     if robot.slowest > robot.rate:
-        raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
-                         'them')
+        raise InputError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one')
     return robot
 
 

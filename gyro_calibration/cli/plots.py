@@ -9,11 +9,10 @@
 # under the License.
 
 """
-Pictures for people: PNG or SVG, units on the axes, readable in black and white.
+Pictures: PNG or SVG, units on the axes, readable in black and white.
 
-Each function returns its figure, and writes it where a path is given; the ending of the path,
-.png or .svg, sets the format. The caption below a picture explains it. Arrays are in SI, with one
-value for each sample or dwell, shape (n,).
+Each function returns its figure, and writes it where a path is given. Arrays are in SI, of shape
+(n,).
 """
 
 from __future__ import annotations
@@ -42,11 +41,7 @@ _LINE_STYLES = ('-', '--', '-.', ':')
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
                   headings: Mapping[str, Array], name: str = 'reference') -> Any:
-    """
-    Draw headings, rad, against a reference (figure 10 of Hong and Park).
-
-    The error of each has a panel on its own scale.
-    """
+    """Draw headings, rad, and their errors against a reference (figure 10 of Hong and Park)."""
     count = len(headings)
     figure, panels = _panels(1 + count, 1, (9, 5 + 2 * count), (1.3, *[1.7 / count] * count))
     above, *below = panels[:, 0]
@@ -128,9 +123,8 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
         if shade is not None:
             figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom',
                             aspect=40, shrink=0.9)
-    return _save_figure(figure, path,
-                        'Below: dots without a shape and without bands of one colour are noise; a '
-                        'curve or a band is an effect that the model lacks.')
+    return _save_figure(figure, path, 'Below: dots without a shape are noise; a curve or a band '
+                        'of one colour is an effect that the model lacks.')
 
 
 def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:
@@ -150,8 +144,7 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
     return _save_figure(figure, path, 'Colours: temperature. A step between the senses: scale '
                         'factor error; a curve: nonlinearity; growth towards slow turns: bias or '
-                        'noise. Turns slower than '
-                        f'{min_rate / DEGREE:g} deg/s are left out. Scales differ.')
+                        f'noise. Turns below {min_rate / DEGREE:g} deg/s are left out.')
 
 
 def draw_diagnosis(path: str | Path | None, diagnosis: Diagnosis) -> Any:

@@ -48,7 +48,6 @@ from gyro_calibration.ros.start import handle_end_signals
 _EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +86,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> Answer:
     if not given.out.endswith(_FILE_SUFFIXES):
         raise InputError(f'{given.out} is no recording file; give a name that ends in '
-                         f'{", ".join(_FILE_SUFFIXES[:-1])} or {_FILE_SUFFIXES[-1]}')
+                         f'{", ".join(_FILE_SUFFIXES)}')
     if os.path.exists(given.out):
         raise InputError(_EXISTS.format(given.out))
     with _stop_event(given.seconds) as stop:
@@ -97,7 +96,7 @@ def run(given: argparse.Namespace) -> Answer:
 
         def on_chunk() -> None:
             nonlocal last_flush
-            if time.monotonic() - last_flush >= _WRITE_INTERVAL:
+            if time.monotonic() - last_flush >= 0.5:  # s
                 recorder.flush()
                 last_flush = time.monotonic()
                 samples, lost = session.counts()
@@ -110,9 +109,8 @@ def run(given: argparse.Namespace) -> Answer:
                 finally:
                     recorder.close()
         except _DiskFull as error:
-            written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but '
-                       f'for the last {_WRITE_INTERVAL:g} s' if recorder.size
-                       else 'nothing was written')
+            written = (f'{recorder.size} bytes remain in {recorder.path}, complete but for the '
+                       'last moment' if recorder.size else 'nothing was written')
             raise DataRefused(
                 f'{error.strerror}; {written}: make room, then record again') from None
         (samples, lost), seconds = session.counts(), time.monotonic() - start
@@ -227,10 +225,9 @@ class McapRecorder(_Recorder):
 
 class CsvRecorder(_Recorder):
     """
-    Samples as rows of the log format.
+    Samples as rows of the log format, whose columns are fixed with the first piece.
 
-    The columns are fixed with the first piece. Values that come less often than samples, such as
-    the temperature, are repeated until the next one.
+    Values that come less often than samples, such as the temperature, are repeated.
     """
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
@@ -296,8 +293,7 @@ class _PortSession:
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         if given.topic or given.temperature_topic or given.reference_topic:
-            raise InputError('--port and topics were both given; record one of them, '
-                             'or the topics of a driver on that port')
+            raise InputError('--port and topics were both given; record one of them')
         if not 0 <= given.baud <= MAX_BAUD:
             raise InputError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}; '
                              'leave it out for that of the protocol')
@@ -367,8 +363,8 @@ class _PortSession:
                                                               found.clock.period))):
             remarks.append(f'{warning}.')
         if isinstance(recorder, CsvRecorder) and recorder.late_columns:
-            remarks.append(f'{", ".join(sorted(recorder.late_columns))} began after the header '
-                           'of the log was written, and is not in it; record into .mcap instead.')
+            remarks.append(f'{", ".join(sorted(recorder.late_columns))} came too late for the '
+                           'header of the log, and is not in it; record into .mcap instead.')
         return {'protocol': found.protocol and found.protocol.name, 'baud': found.baud,
                 'openings': found.open_count}, remarks
 
@@ -384,8 +380,7 @@ class _TopicSession:
         port_options = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
                         given.sample_rate)
         if any(port_options) or given.increments != 'default':
-            raise InputError('options of a port were given without --port; '
-                             'give --port or omit them')
+            raise InputError('options of a port need --port; give it or omit them')
         self._is_mcap = given.out.endswith('.mcap')
         if not self._is_mcap and len(given.reference_topic) > 1:
             raise InputError(f'{given.out}: a log has one gyro and one reference; '
@@ -401,8 +396,7 @@ class _TopicSession:
                  *((topic, 'reference') for topic in given.reference_topic)]
         self._roles = {'/' + topic.lstrip('/'): role for topic, role in roles}
         if len(self._roles) < len(roles):
-            raise InputError('one topic was named twice, of '
-                             f'{", ".join(topic for topic, _ in roles)}; name one for each')
+            raise InputError(f'a topic was named twice: {", ".join(topic for topic, _ in roles)}')
         self._messages, self._samples, self._damaged, self._is_waiting = 0, 0, 0, True
         self._received: dict[str, str] = {}  # role -> topic
         self._previous, self._intervals, self._clock_steps = (0, 0), Intervals(), 0

@@ -53,15 +53,15 @@ _NEAREST = 'nearest'
 
 def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
-    parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
-                        'rate_dps, which were commanded, or a measured '
-                        'reference_heading_deg; default: the reference of the log')
+    parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and commanded '
+                        'heading_deg or rate_dps, or measured reference_heading_deg; default: '
+                        'the reference of the log')
     parser.add_argument('--turns', type=_parse_turns, metavar='N', help='number of full turns '
                         'from a mark to the same mark with standstill at both ends, '
                         f'counter-clockwise positive; {_NEAREST}: the number nearest to the gyro')
     parser.add_argument('--marking', type=verb.non_negative_number, metavar='DEG',
-                        help='standard deviation of the angle between both standstills on the '
-                        f'mark, deg; default: {MARK_DEVIATION / DEGREE:g}')
+                        help='standard deviation of the angle between both marks, deg; default: '
+                        f'{MARK_DEVIATION / DEGREE:g}')
     parser.add_argument('--method', choices=list(METHODS), default='likelihood',
                         help='default: likelihood; the others as published')
     parser.add_argument('--model', metavar='MODEL.yaml', help='model to compensate by first')
@@ -85,15 +85,11 @@ def _parse_turns(text: str) -> int | str:
 
 
 def run(given: argparse.Namespace) -> Answer:
-    if given.turns is not None and given.profile:
-        raise InputError('--turns and --profile were both given; '
-                         'give one of them as the reference')
-    if given.turns is not None and given.picture:
-        raise InputError('--picture draws a run against a motion, which --turns does not have; '
-                         'omit one of the two')
+    if given.turns is not None and (given.profile or given.picture):
+        raise InputError('--turns has no motion, which --profile gives and --picture draws; give '
+                         'one of them')
     if given.turns is None and given.marking is not None:
-        raise InputError('--marking needs --turns, whose mark it is the error of; '
-                         'omit it, or give --turns')
+        raise InputError('--marking is the error of the mark of --turns; give both or none')
     model = read_model(given.model) if given.model else GyroModel()
     log = verb.read(given)
     verb.require_time(given, log)
@@ -172,9 +168,9 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel,
                      f'deg/s; limit: {check.limit / DEGREE:.4f} deg/s.')
     elif motion.name == 'profile' and given.method == 'likelihood':
         wanted = max(fit.time_offset, 0.0) + SETTLING_TIME + RunLimits().rest_duration
-        lines.append(f'The log has no rest up to {wanted:.1f} s after the profile (3 s and the '
-                     'delay). A steady turn of the robot throughout has the effect of a bias: '
-                     'leave it at rest after the run, and record until then.')
+        lines.append(f'The log has no rest up to {wanted:.1f} s after the profile. A steady turn '
+                     'throughout has the effect of a bias: let the robot rest after the run, and '
+                     'record until then.')
     technology = model.gyro.get('technology', 'mems')
     lines += [as_sentence(remark) for remark in (
         describe_commanded_headings(motion), describe_implausible_scale(

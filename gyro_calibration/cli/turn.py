@@ -66,11 +66,11 @@ def run(given: argparse.Namespace) -> Answer:
             calibration = select_effects(found, given.technology).calibration
             names, used = [effect.name for effect in calibration.effects], calibration.used
             parts = int(cross_validation_parts(used).max()) + 1
-            left_out = ('sweep to the other sweeps' if parts == len(np.unique(used.sweep))
-                        else f'{"turn" if parts == len(used) else f"of {parts} parts of the log"} '
-                        'to the others, as there are fewer than four sweeps')
+            left_out = ('sweep' if parts == len(np.unique(used.sweep)) else
+                        'turn' if parts == len(used) else f'of {parts} parts of the log')
             remarks = [f'the model is {", ".join(names)}, which the data support; its values are '
-                       f'fitted for each {left_out}, so no turn is in the data of its model']
+                       f'fitted for each {left_out} to the others, so no turn is in the data of '
+                       'its model']
             rate, is_inlier = calibration.left_out_rate, calibration.scatter.inliers
             data = {'effects': names, 'left_out': True}
         errors = compute_turn_errors(select_dwells(found, is_inlier), rate[is_inlier],
@@ -81,27 +81,19 @@ def run(given: argparse.Namespace) -> Answer:
     if places := [place for place, good in zip(found.location, is_inlier) if not good]:
         remarks.append(f'{len(places)} outlying dwells are left out: {format_list(places)}')
 
-    # bins around 1, 2, 4, ... times the slowest rate, in each sense. A limit just below the
-    # fastest turn would make a nearly empty bin. Limits lie between the doubled rates, as those
-    # are the rates that are commanded.
     turns, slowest = errors.turns, given.slowest * DEGREE
-    speed = np.abs(turns.rate)
-    bins = max(1, math.floor(math.log2(2.13 * speed.max() / slowest)))
-    edges = [slowest, *(0.75 * slowest * 2.0 ** number for number in range(1, bins)),
-             float(speed.max())]
-    in_bin = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, bins - 1)
-    both = [each for place, (low, high) in enumerate(zip(edges, edges[1:])) for each in (
-        (low, high, (in_bin == place) & (turns.rate > 0.0)),
-        (-high, -low, (in_bin == place) & (turns.rate < 0.0)))]
-    rates = sorted((each for each in both if each[2].any()), key=lambda each: each[0])
-    temperatures = [] if turns.temperature is None else [
-        each for each in equal_bins(turns.temperature, 8) if each[2].any()]
+    # of equal width in the logarithm of the speed, in each sense
+    speeds = [(math.exp(low), math.exp(high), mask)
+              for low, high, mask in equal_bins(np.log(np.abs(turns.rate)), 4)]
+    rates = [*((-high, -low, mask & (turns.rate < 0.0)) for low, high, mask in speeds[::-1]),
+             *((low, high, mask & (turns.rate > 0.0)) for low, high, mask in speeds)]
+    temperatures = [] if turns.temperature is None else [*equal_bins(turns.temperature, 8)]
     sizes = _error_sizes(errors, np.ones(len(turns), dtype=bool))
     pairs = list(zip(*(each.values() for each in sizes.values())))
     ratios = [before / after if after > 0.0 else None for before, after in pairs]
     by_rate, by_temperature = (
         [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
-          **_error_sizes(errors, mask)} for low, high, mask in bins]
+          **_error_sizes(errors, mask)} for low, high, mask in bins if mask.any()]
         for unit, bins in (('rad_s', rates), ('degc', temperatures)))
     rms_phrase, largest_phrase = (
         (f'{before / DEGREE:.3g} deg ({100.0 * before / math.tau:.2g} %)',
@@ -135,16 +127,14 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
                        for each in (result.temperature_clipped, result.beyond_range))
     used = [*names, *(['self-calibration'] if model.self_calibration else [])]
     remark = f'the model is {given.model}: {", ".join(used) or "no effects"}'
-    of_fit = 'these are errors of a fit, not of a prediction'
-    if any(sha256_digest(file) in str(model.origin)
-           for file in list_recording_files(given.log)):
-        remark += f'; it was fitted to this log, so {of_fit}'
-    elif 'sha256' not in str(model.origin):
-        remark += f'; if it was fitted to this log, {of_fit}'
+    is_fitted = any(sha256_digest(file) in str(model.origin)
+                    for file in list_recording_files(given.log))
+    if is_fitted or 'sha256' not in str(model.origin):
+        remark += (f'; {"" if is_fitted else "if "}it was fitted to this log, '
+                   f'{"so " if is_fitted else ""}these are errors of a fit, not of a prediction')
     remarks = [remark]
     if found.temperature is None and model.uses_channel('temperature'):
-        remarks.append('the log has no temperature: '
-                       'the model was used at its reference temperature')
+        remarks.append('the log has no temperature: that of reference was used')
     for count, where in ((clipped, 'outside the calibrated temperatures'),
                          (beyond, 'beyond the calibrated rates')):
         if count:

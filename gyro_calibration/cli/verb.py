@@ -93,7 +93,6 @@ class Answer:
 
     @property
     def text(self) -> str:
-        """Return the lines, and a sentence for each file."""
         return '\n'.join([*self.lines, *(f'Written to {each}.' for each in self.files if each)])
 
 
@@ -130,11 +129,10 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
                         'sensor_msgs/Imu or geometry_msgs/Vector3Stamped; default: the only Imu')
-    parser.add_argument('--reference-topic', metavar='TOPIC', help='topic of the reference in a '
-                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, or of geometry_msgs '
-                        'PoseStamped, TwistStamped, TransformStamped and the like; default: none')
-    parser.add_argument('--temperature-topic', metavar='TOPIC', help='topic of the temperature '
-                        'in a recording; default: the name nearest to the topic of the gyro')
+    parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference: Odometry, '
+                        'Imu, PoseStamped, TwistStamped, TransformStamped; default: none')
+    parser.add_argument('--temperature-topic', metavar='TOPIC',
+                        help='of the temperature; default: the name nearest to that of the gyro')
 
 
 def _parse_columns(text: str) -> dict[str, str]:
@@ -189,8 +187,7 @@ def read(given: argparse.Namespace) -> Log:
         log = read_file(given.log, topics, given.rate, given.sensitivity, given.names, on_progress,
                         print_message)
     if log.output is None:
-        raise InputError(f'{given.log}: has gyro_counts only; '
-                         'give the deg/s per count with --sensitivity')
+        raise InputError(f'{given.log}: has gyro_counts only; set --sensitivity, deg/s a count')
     log = replace(log, output=-log.output) if given.invert else log
     if given.unwrap and log.reference_heading is not None:
         require_time(given, log)
@@ -199,13 +196,11 @@ def read(given: argparse.Namespace) -> Log:
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the logs of a verb that takes several."""
     for path in given.log:
         yield read(argparse.Namespace(**{**vars(given), 'log': path}))
 
 
 def cut_to_range(given: argparse.Namespace, log: Log) -> Log:
-    """Return the part of a log between --from and --to."""
     if given.begin <= 0.0 and given.end == math.inf:
         return log
     since = require_time(given, log) - require_time(given, log)[0]
@@ -234,14 +229,12 @@ def add_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 
 
 def require_folder(path: str) -> None:
-    """Refuse a file where a folder of results is wanted."""
     if os.path.exists(path) and not os.path.isdir(path):
         raise InputError(f'{path}: is a file, but must be a folder; give another name')
 
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise InputError(f'{given.log}: has no time_s, which {given.name} needs; name its '
-                         'column, as by --columns time=NAME:s, or give the sample rate in Hz '
-                         'with --rate')
+        raise InputError(f'{given.log}: has no time_s, which {given.name} needs; name its column, '
+                         'as by --columns time=NAME:s, or give the sample rate with --rate')
     return log.time

@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-A gyro on a serial port: opens, recognizes and reads it, and opens it again after a loss.
-
-This module has no ROS and starts no thread: `Connection.chunks` gives the samples in the thread of
-the caller.
-"""
+"""A gyro on a serial port: opens, recognizes and reads it, and opens it again after a loss."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -39,10 +34,9 @@ import serial
 _REMEDIES = {
     errno.ENOENT: 'it does not exist: plug the gyro in, or set another port',
     errno.ENODEV: 'no device is behind it: plug the gyro in again',
-    errno.EACCES: 'permission denied: add the user to the group that owns it, often dialout',
-    errno.EPERM: 'permission denied: add the user to the group that owns it, often dialout',
-    errno.EBUSY: 'another program has opened it: stop that one',
-    errno.EAGAIN: 'another program has opened it: stop that one',
+    **dict.fromkeys((errno.EACCES, errno.EPERM), 'permission denied: add the user to the group '
+                    'that owns it, often dialout'),
+    **dict.fromkeys((errno.EBUSY, errno.EAGAIN), 'another program has opened it: stop that one'),
     errno.ENOTTY: 'it is no serial port: set another port',
     errno.EISDIR: 'it is a folder, no serial port: set another port',
     errno.EIO: 'the device was disconnected: plug it in again',
@@ -57,8 +51,7 @@ class SerialPort:
     """
     A port that can be lost and opened again, with 8 data bits, no parity and 1 stop bit.
 
-    Each method raises `PortError` where the device cannot do it or was disconnected; the port is
-    then closed.
+    Each method raises `PortError` where the device fails; the port is then closed.
     """
 
     def __init__(self, path: str, baud: int):
@@ -123,13 +116,11 @@ def _describe_error(error: BaseException) -> str:
 
 MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
-#: Longest silence of a board that restarts when its port is opened, and longest delay before a
-#: lost port is opened again, s.
+#: Longest silence of a board that restarts when its port is opened, and of delays to open it, s.
 _RESTART_DURATION = 5.0
 #: Interval of attempts to recognize the protocol, and first delay before a port is reopened, s.
 _ATTEMPT_INTERVAL = 0.1
-#: Listening time at a baud, s, in which a gyro of 10 Hz sends enough; and interval of requests to
-#: send, since a gyro that starts does not receive them.
+#: Listening time at a baud, s, for ten samples of a slow gyro; and interval of requests to send.
 _LISTENING_DURATION = 1.0
 
 
@@ -172,13 +163,11 @@ class Connection:
     again after 0.1 s, then with twice the delay each time, up to 5 s, until samples come. Many
     boards restart when their port is opened, so the port then stays open for 5 s more, and the
     gyro is requested to send each second, until the first sample. With the protocol ``'auto'`` it
-    first listens, at each baud in turn unless one is given, and sends nothing. The recognized
-    protocol is kept after a loss of the port, as long as its samples come.
+    first listens, at each baud in turn unless one is given, and sends nothing.
 
     The port is a path, or a pattern that finds it under any name; the baud is in bit/s, 0 for that
-    of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` where the
-    protocol is unknown, or settings that it needs are missing. Tests have a clock of their own, s,
-    and ports in place of a `SerialPort`.
+    of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` for an
+    unknown protocol, or missing settings. Tests have a clock of their own, s, and ports.
     """
 
     def __init__(self, port: str, protocol: str, baud: int = 0,
@@ -210,7 +199,6 @@ class Connection:
 
     def chunks(self, stop: threading.Event) -> Iterator[_Chunk]:
         """Give samples as they arrive, until the event is set; the port is then closed."""
-        # While the port is missing, no chunk is given.
         try:
             while not stop.is_set():
                 try:
@@ -233,8 +221,7 @@ class Connection:
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
         """Find protocol and baud; they stay unknown only after a stop."""
-        # The port stays open, since opening it restarts many microcontrollers, which then need
-        # some time until they send.
+        # the port stays open, since opening it restarts many microcontrollers
         self._set_state('listening')
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:
@@ -262,9 +249,8 @@ class Connection:
                                         f'{error}') from error
                     return
             self._report_or_raise(
-                f'bytes come on {self._pattern}, but no protocol was recognized at '
-                f'{", ".join(map(str, self._bauds))} bit/s: set protocol, or for csv name as many '
-                'columns as a line has numbers', end)
+                f'bytes come on {self._pattern}, but of no known protocol at '
+                f'{", ".join(map(str, self._bauds))} bit/s: set protocol, or for csv columns', end)
 
     def _report_or_raise(self, problem: str, deadline: float) -> None:
         """Report a problem while the port stays open; raise `PortError` after a time."""
@@ -315,8 +301,8 @@ class Connection:
                 port.write(protocol.startup)
                 last_request = now
             timeout = max(_SILENCE_TIMEOUT, 3.0 * clock.period)
-            # To open the port again would restart a board that still starts. The second sample
-            # shows the period.
+            # to open the port again would restart a board that still starts; the second sample
+            # shows the period
             deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)
             if now >= min(begin + 0.5 * timeout * (len(seen) + 1), deadline):
                 seen.append((self._read_bytes, counts.device_faults, counts.refused_samples))
@@ -363,7 +349,7 @@ class Connection:
 def sample_messages(sample: Sample, stamp: int, frame: str,
                     variance: float) -> list[tuple[str, bytes]]:
     """
-    Return message types and serialized messages of a sample: its temperature if known, its rate.
+    Return types and serialized messages of a sample: its temperature if known, its rate.
 
     The stamp is in ns, the variance of the rate in (rad/s)².
     """

@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-A gyro on a pseudo-terminal: samples of a simulation or a recording, sent at their times.
-
-A program opens the path of the emulator like the port of a real gyro. Bytes from the program are
-read and ignored.
-"""
+"""A gyro on a pseudo-terminal, which programs open like the port of a real one."""
 
 from __future__ import annotations
 
@@ -34,18 +29,15 @@ _POLL_INTERVAL = 0.05  # s; interval of checks for a reader or a stop
 
 class Emulator:
     """
-    An emulated gyro that programs can open as a port.
+    An emulated gyro: `open`, `run` and `close` it, or use it as a context manager with a thread.
 
-    Use it as a context manager, which sends from a thread of its own, or call `open` and `run`,
-    which sends until the samples end, and `close`. Each sample is taken from the source after the
-    one before it was sent, so a source may be endless and may depend on commands. The first sample
-    is sent at once, or when a reader has opened the port. Samples have a time, s; those without a
-    sequence are numbered from 0 on.
+    Each sample, with a time, s, is taken from the source after the one before it was sent, so a
+    source may be endless and may depend on commands. Samples without a sequence are numbered from
+    0.
 
     The speed is a factor of real time; inf is the speed of the reader. Up to 1, bytes that are not
-    read are lost, as on a real line; above 1 the emulator waits for the reader. A symbolic link to
-    the pseudo-terminal, whose name differs from run to run, is removed at the end. Raise
-    `ValueError` where settings that the protocol needs are missing.
+    read are lost, as on a real line; above 1 the emulator waits for the reader. Raise `ValueError`
+    where settings that the protocol needs are missing.
     """
 
     def __init__(self, protocol: Protocol, samples: Iterable[Sample],

@@ -21,8 +21,6 @@ well: all later samples are late by whole periods; and samples counted twice arr
 A computer without a battery starts with a wrong date and is set by months when it finds a time
 server. `NodeTimeConverter` converts a steady clock to stamps of such a clock, `HostTimeConverter`
 converts its stamps to a continuous time.
-
-No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
 """
 
 from collections import deque
@@ -42,11 +40,8 @@ _WINDOW_BLOCKS = 64  # in the window: a block takes 0.3 s, in which no clock dri
 #: of two clocks, s.
 _SETTLING_DURATION = 2.0
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
-_LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-#: Largest lateness with a correct sequence, s, above the 16 ms of a burst. Without it, stamps at
-#: 1 kHz are 5.6 ms off instead of 0.06 ms where the host is later by 10 ms for 5 s of each 15 s.
+#: Largest lateness with a correct sequence, s, above the 16 ms of a burst.
 _OUTLIER_LATENESS = 0.02
-_MEDIAN_SIZE = 8  # intervals of a device whose median is the usual one: three may be wrong
 #: Largest difference of a clock that is slewed, not set, s; ntpd sets it from 0.128 s on.
 _CLOCK_STEP_THRESHOLD = 0.1
 
@@ -114,7 +109,7 @@ class _SampleCounter:
         self.mean_advance = 1.0  # the usual one
         #: Of how many samples the number may be wrong by a multiple; 0 by the time of the device.
         self.ambiguity = 1
-        self._advances = deque[float](maxlen=_MEDIAN_SIZE)
+        self._advances = deque[float](maxlen=8)  # three may be wrong
         self._sequence: int | None = None
         self._time: float | None = None
         self._outlier_time: float | None = None
@@ -154,7 +149,7 @@ class _SampleCounter:
                         return (1 + lost) * self.mean_advance, lost
                     self._advances.append(by_time)
                     self.mean_advance = median(self._advances)
-                    is_known = len(self._advances) == _MEDIAN_SIZE
+                    is_known = len(self._advances) == self._advances.maxlen
                     return by_time, (max(0, round(by_time / self.mean_advance) - 1)
                                      if is_known else 0)
             self._outlier_time = time  # a single outlier in the time of the device
@@ -177,7 +172,7 @@ class _LatenessTest:
         """Add an arrival; tell whether all since `late_since` have been late, by `step`, s."""
         if lateness <= bound:
             self.late_since = None
-            if arrival - self._window_start > _LONG_LATE_DURATION:
+            if arrival - self._window_start > 5.0 * _LATE_DURATION:
                 self._window_start, self._least_on_time = arrival, math.inf
             self._least_on_time = min(self._least_on_time, lateness)
             return False
@@ -186,9 +181,9 @@ class _LatenessTest:
         if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
             self.late_since, self._least = arrival, math.inf
         self._least, lasts = min(self._least, lateness), arrival - self.late_since
-        # Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly
-        # to a period and falls to zero. So its step is tested, and itself after a longer time.
-        self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
+        # bursts near a multiple of the sample rate let the lateness grow slowly to a period and
+        # fall to zero: so its step is tested, and itself after a longer time
+        self.step = self._least - (0.0 if lasts > 5.0 * _LATE_DURATION
                                    else max(0.0, self._least_on_time))
         return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
 
@@ -197,10 +192,10 @@ class SampleClock:
     """
     Stamps samples; stamps increase strictly.
 
-    Corrections by the line are slewed. A stamp jumps only where later arrivals show that samples
-    were lost. The nominal rate of the gyro, Hz, is used for the first samples only: its clock is
-    2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0 without one, and
-    `min_stamp` the last stamp of another clock.
+    Corrections by the line are slewed; a stamp jumps only where later arrivals show a loss. The
+    nominal rate, Hz, is used for the first samples only: clocks of gyros are 2 to 3 % off.
+    `modulus` is that of `Sample.sequence`, 0 without one, and `min_stamp` the last stamp of
+    another clock.
     """
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
@@ -211,13 +206,10 @@ class SampleClock:
         self._last_number, self._slew_offset = 0.0, 0.0
         self._uncertain_losses, self._uncertain_since, self._newly_lost = 0, 0.0, 0
         self._last_stamp, self._last_arrival = min_stamp, -math.inf
-        # while the port was open: missing in the sequence or in the time of the device, damaged,
-        # or shown by the lateness of all later samples
-        self.lost_count = 0
+        self.lost_count = 0  # while the port was open
 
     @property
-    def period(self) -> float:
-        """Seconds from one sample to the next."""
+    def period(self) -> float:  # s
         return self._line.slope * self._counter.mean_advance
 
     @property
@@ -402,11 +394,10 @@ class HostTimeConverter:
     def convert_sample(self, stamp: float, previous_time: float, usual_interval: float,
                        arrival_interval: float = 0.0) -> float:
         """
-        Return the time of a sample, s; all arguments are in s.
+        Return the time of a sample, s; the usual interval, s, is inf while it is not known.
 
-        The previous time is -inf for the first sample, which shows no step, and the usual interval
-        inf while it is not known. Over a gap the jump of the stamps equals the time between their
-        arrivals, but not over a step of the clock.
+        Over a gap the stamps jump by the time between their arrivals, but not over a step of the
+        clock.
         """
         if previous_time == -math.inf:
             self._unshown_steps.clear()

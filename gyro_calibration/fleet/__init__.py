@@ -11,7 +11,5 @@
 """
 A fleet: many logs of many gyros, with errors attributed to the unit, the type and the reference.
 
-Reading order, each imports only from those before it: `logs` (the unit of each log, and the work
-on it), `run` (of many tasks), `pooling` (of one value over the logs of a type, and its outliers),
-`summary` (of a type: sentences, data, models, the page and tables).
+Reading order: `logs`, `run`, `pooling`, `summary`.
 """

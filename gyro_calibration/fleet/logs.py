@@ -9,10 +9,9 @@
 # under the License.
 
 """
-The logs of a fleet: of which unit, type and drive each is, and its record.
+The logs of a fleet: of which unit, type and drive each is, by a table, file names or notes.
 
-Unit, type and drive are in a table, in the names of files, or in notes. The record has the
-calibration and the diagnosis.
+The record of a log has its calibration and its diagnosis.
 """
 
 from __future__ import annotations
@@ -57,12 +56,10 @@ import numpy as np
 
 #: Fields of a log in a table, in addition to its path.
 _ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
-#: Ends of files that are logs.
 _LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 _MAX_NOTE_BYTES = 4096  # largest number of bytes that are read of the notes of a log
 #: Notes, such as "unit: 7".
-_KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
-                         re.IGNORECASE)
+_KEYED_NOTE = re.compile(rf'\b({"|".join(_ENTRY_KEYS)})\s*[:=]\s*([^,;#\s]+)', re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -113,9 +110,8 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     """
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
 
-    A log that is named several times is one entry. A table inside a folder is used as well; the
-    results of an earlier fleet, and of this one in `excluded_folder`, are not. Raise `InputError`
-    where there is none, or a table is wrong or contradicts another one.
+    A table inside a folder is used as well; the results of a fleet, also in `excluded_folder`, are
+    not. Raise `InputError` where there is none, or a table is wrong or contradicts another one.
     """
     found: dict[str, FleetLog] = {}
     visited = {os.path.realpath(excluded_folder)} if excluded_folder else set()
@@ -191,7 +187,7 @@ def _read_header(path: str) -> list[str]:
 
 
 def _resolve_log_path(path: str, log: str) -> str:
-    """Return the path of a log in a table: relative to the table, or to the working folder."""
+    """Return the path of a log in a table, relative to the table or to the working folder."""
     relative = Path(path).parent / log
     return str(relative) if relative.exists() or not Path(log).exists() else log
 
@@ -235,8 +231,6 @@ def _read_notes(path: str) -> dict[str, str]:
 
 # the record of a log
 
-#: Shortest log for the bias at rest, s: in less, white noise hides its wander.
-_MIN_REST_DURATION = 60.0
 #: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Schema of the records; records of another one are not read.
@@ -248,8 +242,8 @@ def _fit_rest(log: Log) -> tuple[float, float]:
     output = np.asarray(log.output)
     known = np.isfinite(output)
     time = np.asarray(log.time)[known]
-    if len(time) < 100 or time[-1] - time[0] < _MIN_REST_DURATION:
-        raise DataRefused(f'rests for less than {_MIN_REST_DURATION:.0f} s: record for longer')
+    if len(time) < 100 or time[-1] - time[0] < 60.0:  # white noise hides the wander of the bias
+        raise DataRefused('rests for less than 60 s: record for longer')
     # 60 spans of at least 2 s
     edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
     increments = np.diff(np.interp(edges, time, integrate(time, output[known])))
@@ -261,8 +255,6 @@ def _fit_rest(log: Log) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class LogTask:
-    """The work on a log, with its options."""
-
     entry: FleetLog
     folder: str  # of the results
     technology: str = 'mems'  # of the gyros, one of `selection.TECHNOLOGY_PRIORS`
@@ -285,12 +277,9 @@ def process_log(task: LogTask) -> dict[str, Any]:
     """
     Return the record of a log, and store it; a stored record of the same content is used again.
 
-    It is JSON data, and equal to the bit on all machines. A change of unit, type or drive in a
-    table does not cause a new computation.
-
-    ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
-    ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
-    ``diagnosis`` is a summary.
+    It is JSON data, equal to the bit on all machines: a ``status``, `DONE` or `NO_EVIDENCE` with a
+    ``reason``; ``sha256`` of the file and ``content`` of its values; ``values`` by name, with
+    standard deviation and unit; a summary of the ``diagnosis``.
     """
     try:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
@@ -379,12 +368,7 @@ def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
 
 
 def _calibrate_log(log: Log, technology: str) -> tuple[str, GyroModel, tuple[float, float] | None]:
-    """
-    Return the method of calibration of a log, its model, and the time offset of its reference.
-
-    The offset, s, comes with its standard deviation. A log at rest gives the bias only, and any
-    other one is calibrated by `calibrate`. Raise `DataRefused` with the reason and the remedy.
-    """
+    """Return method, model, and time offset of the reference of a log, s, with its deviation."""
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
     refuse_mismatch(log)

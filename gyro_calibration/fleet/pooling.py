@@ -21,24 +21,21 @@ Value ``y`` of the log ``i`` of unit ``u`` on drive ``d`` is taken as::
   power-ons*;
 * ``error``: of the variance ``sigma_i²`` that the calibration of the log states, the share
   ``lambda`` is independent between logs. The rest is an error of the reference, which all units of
-  a drive have in common, so it is part of the variance between drives; or the stated variance is
-  too large, since a single log does not distinguish the error of its reference from that of its
-  gyro.
+  a drive have in common, so it is part of the variance between drives.
 
 The restricted likelihood (REML) of the variances is integrated, not maximized, so that intervals
 hold with few units and few drives: estimates are averaged over points of a quasi-random sequence,
 weighted by likelihood times a prior. The prior is that of Jeffreys for the variance of groups,
 ``sqrt(sum 1 / (tau² + v_g)²)`` with ``v_g`` the variance of the mean of a group; in balanced data
-it is flat in the logarithms of the expected mean squares, and the intervals are those of Student.
+the intervals are those of Student.
 
 The equations are those of mixed models (Henderson 1975): units are eliminated first, as each log
 is of one unit, so that only the columns of drives and ``beta`` are solved for.
 
-An outlying unit or drive is given an effect of its own and the others are pooled again, so that it
-is compared with their prediction for one more unit. Its p-value is multiplied by the number of
-those that it was chosen from (Bonferroni). With 15 or more, the next one is tested together with
-it, since two outliers mask each other; the last one below the level, and all before it, are
-outliers (generalized extreme studentized deviate, Rosner 1983).
+An outlying unit or drive is given an effect of its own and the others are pooled again. Its
+p-value is multiplied by the number of those that it was chosen from (Bonferroni). With 15 or more,
+the next one is tested together with it, since two outliers mask each other; the last one below the
+level, and all before it, are outliers (generalized extreme studentized deviate, Rosner 1983).
 """
 
 from __future__ import annotations
@@ -63,7 +60,6 @@ _IntegerArray = NDArray[np.intp]
 UNITS, DRIVES, POWER_ONS, OWN_SHARE = 'units', 'drives', 'power_ons', 'own_share'
 #: Standard deviations of the slopes of units over the first column and the second.
 SLOPES = ('slopes_0', 'slopes_1')
-_SAMPLE_POINTS = 512  # points of the sequence over the variances
 
 
 @dataclass(frozen=True)
@@ -107,7 +103,7 @@ class _Equations:
     Sums over logs of the mixed-model equations, as matrices that multiply the weights of logs.
 
     The columns are the fixed effects, the drives, and the values, whose last row is the right
-    side. Units are eliminated; they have the parts value and slopes.
+    side.
     """
 
     def __init__(self, observed: Observations, fixed: Array, has_drives: bool):
@@ -312,9 +308,8 @@ class PooledValue:
     def _sample_variances(self) -> tuple[Array, Array]:
         """Return points of the variances, shape (points, names), and their weights."""
         # Each coordinate is drawn by a slice through the likeliest point.
-        uniform = qmc.Halton(len(self.variance_names), scramble=False).random(
-            _SAMPLE_POINTS + 1)[1:]
-        sample, log_density = np.empty_like(uniform), np.zeros(_SAMPLE_POINTS)
+        uniform = qmc.Halton(len(self.variance_names), scramble=False).random(513)[1:]
+        sample, log_density = np.empty_like(uniform), np.zeros(len(uniform))
         for place, name in enumerate(self.variance_names):
             axis = np.linspace(*self._bounds[name], 41)
             along = self._log_likelihood(_replace_coordinate(self._best_point, place, axis),
@@ -409,8 +404,8 @@ class PooledValue:
         """
         Add the most significant one of several fixed effects.
 
-        Return its place, the value pooled with it, its size, and the p-value of the largest of so
-        many.
+        Return its place, the value pooled with it, its size, and its p-value times the number of
+        effects.
         """
         scores, none = [], np.array([-1])
         for column in columns:
@@ -498,8 +493,7 @@ def find_changes(pooled: PooledValue, date: _IntegerArray, units: Sequence[str],
     """
     Return the most significant change of a unit between dates, beyond the scatter of power-ons.
 
-    `date` is the number of the date of each log, or -1, shape (n,); the significance is the
-    probability of a change where there is none.
+    `date` is the number of the date of each log, or -1, shape (n,).
     """
     unit = pooled.observed.unit
     candidates = [(int(one), int(since)) for one in np.unique(unit)

@@ -8,24 +8,17 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-Many tasks on the processes of this machine, or on another executor of `concurrent.futures`.
-
-Two tasks for each worker are submitted at a time, so that the memory does not depend on the number
-of tasks.
-"""
+"""Many tasks on the processes of this machine, or on another executor of `concurrent.futures`."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    BrokenExecutor, Executor, FIRST_COMPLETED, Future, ProcessPoolExecutor, wait)
+from concurrent.futures import as_completed, BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from fcntl import F_GETFL, F_SETFL, F_SETOWN, fcntl
-from itertools import islice
 from multiprocessing import get_context, parent_process
 import os
 import resource
 import signal
-from typing import Any, TypeVar
+from typing import TypeVar
 
 _Task = TypeVar('_Task')
 _Found = TypeVar('_Found')
@@ -37,8 +30,7 @@ def process_executor(workers: int, memory: float | None = None,
     """
     Give an executor of processes on this machine, and shut it down at the end.
 
-    `memory` is the number of bytes that each of the workers may allocate; modules of `preload` are
-    imported once, and not by each new worker.
+    `memory` is the number of bytes that each worker may allocate; `preload` are modules.
     """
     context = get_context('forkserver')
     context.set_forkserver_preload(list(preload))
@@ -68,8 +60,7 @@ def cluster_executor(address: str) -> Iterator[Executor]:
     """
     Give an executor of a Dask cluster.
 
-    Raise `ImportError` where `distributed` is not installed, `OSError` or `ValueError` where no
-    scheduler answers at the address, or it is none.
+    Raise `ImportError` without `distributed`, `OSError` or `ValueError` without a scheduler there.
     """
     from distributed import Client
     if '://' not in address:  # a client without a scheduler blocks when it is deleted
@@ -78,22 +69,16 @@ def cluster_executor(address: str) -> Iterator[Executor]:
         yield client.get_executor(pure=False, retries=0)
 
 
-def run_tasks(work: Callable[[_Task], _Found], tasks: Iterable[_Task], workers: int,
+def run_tasks(work: Callable[[_Task], _Found], tasks: Iterable[_Task],
               executor: Executor) -> Iterator[tuple[_Task, _Found | BaseException]]:
     """
     Yield each task with its result when it is finished, or with the exception of its worker.
 
-    `work` is a function of a module, which raises nothing; `tasks` may be endless. Raise
-    `BrokenExecutor` where a worker of `process_executor` was killed.
+    `work` is a function of a module. `BrokenExecutor` tells that a worker was killed.
     """
-    remaining, pending = iter(tasks), dict[Future[Any], Any]()
-    while True:
-        for task in islice(remaining, 2 * workers - len(pending)):
-            pending[executor.submit(work, task)] = task
-        if not pending:
-            return
-        for each in wait(pending, return_when=FIRST_COMPLETED)[0]:
-            task, error = pending.pop(each), each.exception()
-            if isinstance(error, BrokenExecutor):
-                raise error
-            yield task, each.result() if error is None else error
+    submitted = {executor.submit(work, task): task for task in tasks}
+    for each in as_completed(submitted):
+        error = each.exception()
+        if isinstance(error, BrokenExecutor):
+            raise error
+        yield submitted[each], each.result() if error is None else error

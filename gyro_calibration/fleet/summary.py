@@ -8,11 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-From the records of logs to the errors of the type, the unit and the reference.
-
-They are sentences, data, models, and a table of the logs.
-"""
+"""From the records of logs to the errors of the type, the unit and the reference."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -78,8 +74,6 @@ class _ValueSummary:
 
 @dataclass(frozen=True)
 class TypeSummary:
-    """The results of one type."""
-
     name: str  # or ''
     units: Sequence[str]  # names in natural order
     drives: Sequence[str]
@@ -96,8 +90,7 @@ def summarize_types(records: Sequence[_LogRecord]) -> list[TypeSummary]:
     for kind in types:
         names = [name for each in logs[kind] for name in each['values']]
         values[kind] = [name for name in dict.fromkeys(names) if names.count(name) > 1]
-    # three tests of each value: outlying units, outlying drives, changes; and three of the effects
-    # of diagnoses: of the type, of a unit, of a drive
+    # of each value outlying units, outlying drives, changes; of effects type, unit, drive
     tests = 3 * sum(map(len, values.values())) + 3 * len(types)
     summaries = []
     for kind in types:
@@ -175,7 +168,6 @@ def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
 
 
 def describe_type(summary: TypeSummary) -> Iterator[str]:
-    """Give the sentences on the origin of each value, its outliers and its changes."""
     meanings = {UNITS: 'is an error of the unit: most of its variance is between units',
                 DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
                 'between drives, and common to the units of a drive',
@@ -224,9 +216,9 @@ def count_effects(summary: TypeSummary) -> list[_EffectCount]:
     """
     Assign the established effects of diagnoses by the numbers of logs that show them.
 
-    A diagnosis names a false effect at a stated rate. An effect is assigned to the type where more
-    logs show it than that rate explains, even without the unit, and without the drive, that show
-    it most; else to the unit or the drive whose own logs show it more often.
+    An effect is assigned to the type where more logs show it than the rate of false effects
+    explains, even without the unit, and without the drive, that show it most; else to the unit or
+    the drive whose own logs show it more often.
     """
     logs = [each for each in summary.records if each['diagnosis']]
     shown = [{one['effect'] for one in each['diagnosis']['findings']
@@ -299,9 +291,8 @@ def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
     """
     Give for a further unit of a type, with the name '', and for each unit: name and model.
 
-    They hold the mean values, and as tolerance the deviation of a power-on from them, so that
-    their interval of 95 % is that of the fleet. The compensation adds the tolerance until there is
-    a self-calibration, which uses it as its prior (`GyroModel.prior_deviations`).
+    The tolerance is the deviation of a power-on from the mean values, so that their interval of 95
+    % is that of the fleet. A self-calibration uses it as its prior.
     """
     for unit in ('', *summary.units):
         terms, variances, tolerances = [], [], {'bias': 0.0, 'scale_factor_error': 0.0}

@@ -47,8 +47,6 @@ def z_axis_covariance(variance: float) -> tuple[float, ...]:
 
 NOT_REPORTED_COVARIANCE = (NOT_REPORTED, *8 * (0.0,))
 
-#: Largest number of fields, and length of a definition in characters.
-_MAX_FIELDS, _MAX_DEFINITION_LENGTH = 5000, 100_000
 _DEFINITION_SEPARATOR = '=' * 80
 _STRUCT_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
                  'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
@@ -122,8 +120,8 @@ class _MessageLayout:
 @cache
 def parse_layout(definition: str, axis: str = 'z') -> _MessageLayout:
     """Return the layout of a message type by its definition, with the rate about an axis."""
-    if len(definition) > _MAX_DEFINITION_LENGTH:
-        raise MessageError(f'it has more than {_MAX_DEFINITION_LENGTH} characters')
+    if len(definition) > 100_000:
+        raise MessageError('it has more than 100000 characters')
     parts: dict[str, list[re.Match[str]]] = {}
     for part in f'MSG: /\n{definition}'.split(f'{_DEFINITION_SEPARATOR}\n'):
         name, _, text = part.partition('\n')
@@ -135,8 +133,8 @@ def parse_layout(definition: str, axis: str = 'z') -> _MessageLayout:
             field for field in fields if not field['constant']]
     names, runs = list[str](), [['', '']]
     for number, (name, code) in enumerate(_flatten_fields(parts, '/', '', 0)):
-        if number > _MAX_FIELDS:
-            raise MessageError(f'it has more than {_MAX_FIELDS} parts')
+        if number > 5000:
+            raise MessageError('it has more than 5000 parts')
         if name and code:
             names.append(name)
             runs[-1][1] += code

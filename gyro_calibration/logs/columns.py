@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-Names and units of the columns of a log.
-
-A name of the log format states quantity and unit. The user assigns other names, with a unit, as
-`gyro=wz:deg/s`; without a unit, SI is assumed.
-"""
+"""Names and units of the columns of a log; the user may assign others, as `gyro=wz:deg/s`."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -23,8 +18,7 @@ from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
 DEGREE = math.pi / 180.0
 STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
-#: Temperatures, degC, that a sensor in a gyro may have; others are taken for errors.
-PLAUSIBLE_TEMPERATURES = -100.0, 200.0
+PLAUSIBLE_TEMPERATURES = -100.0, 200.0  # degC; others are taken for errors
 
 #: Quantity -> names of its columns, that in SI first; in the order of writing.
 _COLUMN_NAMES = {
@@ -53,12 +47,11 @@ AXES = ('x', 'y', 'z')  # axes of a gyro; column names may contain one, such as 
 
 RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
               'deg/h': DEGREE / 3600.0}
-_NO_UNIT = {'1': 1.0}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
     'gyro': ('output', RATE_UNITS),
-    'counts': ('counts', _NO_UNIT),
+    'counts': ('counts', {'1': 1.0}),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
     'rate': ('reference_rate', RATE_UNITS),
     'heading': ('reference_heading', {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3,
@@ -66,8 +59,8 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': STANDARD_GRAVITY,
                                         'mg': 1e-3 * STANDARD_GRAVITY}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
-    'moving': ('moving', _NO_UNIT),
-    'attitude': ('reference_heading', _NO_UNIT),
+    'moving': ('moving', {'1': 1.0}),
+    'attitude': ('reference_heading', {'1': 1.0}),
 }
 
 
@@ -84,16 +77,15 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
     """
     Return the column of each quantity of a log, and of each part of an `ATTITUDE`.
 
-    `user_columns` has the name of a quantity in options -> name of its column, or name:unit. The
-    axis is that of names that contain one. Raise `InputError` for an unknown quantity, column or
-    unit, a quantity in two columns, or no output.
+    `user_columns` has the name of a quantity in options -> name of its column, or name:unit. Raise
+    `InputError` for an unknown quantity, column or unit, a quantity in two columns, or no output.
     """
     found, by_user = dict[str, Column](), set[str]()
     for name, text in user_columns.items():
         if name not in _OPTION_QUANTITIES:
-            raise InputError(
-                f'{name} is no quantity of a log; wanted one of '
-                f'{", ".join(_OPTION_QUANTITIES)}{suggest_nearest(name, _OPTION_QUANTITIES)}')
+            raise InputError(f'{name} is no quantity of a log, which are '
+                             f'{", ".join(_OPTION_QUANTITIES)}'
+                             f'{suggest_nearest(name, _OPTION_QUANTITIES)}')
         quantity, units = _OPTION_QUANTITIES[name]
         if quantity in by_user:
             raise InputError(f'heading and attitude both give the {quantity}; name one of them')
@@ -127,9 +119,9 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str],
                              f'the {quantity}; keep one of them')
         found[quantity] = Column(index, factor)
     if not {'output', 'counts'} & set(found):
-        raise InputError(f'no gyro column among {excerpt(",".join(header))}; wanted a header '
-                         'with gyro_dps, gyro_rad_s or gyro_counts, and # before the lines above '
-                         'it, or other names, as by --columns time=NAME:s,gyro=NAME:deg/s')
+        raise InputError(f'no gyro column among {excerpt(",".join(header))}; wanted gyro_dps, '
+                         'gyro_rad_s or gyro_counts, and # before the lines above it, or other '
+                         'names, as by --columns time=NAME:s,gyro=NAME:deg/s')
     return found
 
 

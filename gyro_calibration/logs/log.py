@@ -9,14 +9,14 @@
 # under the License.
 
 """
-Read and write logs.
+Logs, read from CSV files and written to them.
 
-A log is a CSV file, one row a sample or, without time, one row a dwell of a rate table. The header
-names each column with its unit.
+A row is a sample or, without time, a dwell of a rate table. The header names columns and units.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv
@@ -51,17 +51,12 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
-CACHE_BLOCK_SAMPLES = 1 << 15
-BLOCK_ROWS = 1 << 16  # rows in a block of a log
+CACHE_BLOCK_SAMPLES = 32768
 MIN_SAMPLE_INTERVAL = 1e-9  # least interval between samples, s
-_MAX_LINE_LENGTH = 1 << 16  # characters
-#: Largest number of values of a log in memory, 4 GB; a text counts as ten.
-_MAX_LOG_VALUES = 1 << 29
-
+_MAX_LINE_LENGTH = 65536  # characters
+_MAX_LOG_VALUES = 500_000_000  # in memory, 4 GB; a text counts as ten
 #: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
 MAX_TIME = 1e12
-#: Largest magnitudes where they are not `MAX_MAGNITUDE`: a single larger one decides a fit, degC.
-_MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', *ROTATIONS, *ATTITUDE)
 #: Line numbers of the rows and the line after, quantity -> values in SI, other columns as text.
 _ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
@@ -104,7 +99,6 @@ class Log:
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Convert lists and columns of a DataFrame to arrays, and refuse what is no log."""
         arrays = {quantity: _to_floats(quantity, values) for quantity in QUANTITIES
                   if (values := getattr(self, quantity)) is not None}
         _refuse_invalid(arrays, {})
@@ -127,8 +121,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     Read a log file (.csv or .csv.gz), with the parameters of `api.read_log`.
 
     Values are separated by commas or spaces, or by semicolons or tabs; then the decimal mark may
-    be a comma.
-    `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
+    be a comma. `on_progress` takes the number of bytes read. A `LogError` names file, row, column.
     """
     blocks: list[tuple[dict[str, Any], dict[str, tuple[str, ...]]]] = []
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
@@ -141,13 +134,12 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
             lines = (' '.join(line.split()) + '\n' for line in lines)
         if rate is not None:
             table.columns.pop('time', None)
-        while block := list(itertools.islice(lines, BLOCK_ROWS)):
+        while block := list(itertools.islice(lines, CACHE_BLOCK_SAMPLES)):
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if count * (len(arrays) + 10 * len(others)) > _MAX_LOG_VALUES:
-                raise LogError(f'has more than {_MAX_LOG_VALUES} numbers, which is above the '
-                               'limit of memory; split it')
+                raise LogError(f'has more than {_MAX_LOG_VALUES} numbers, the limit; split it')
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
             last = _refuse_unordered_time(places, arrays.get('time'), last)
@@ -157,8 +149,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
                 on_progress(file.tell())
             blocks.append((arrays, others))
         if count < 2:
-            raise LogError(f'has {count} of the 2 rows of data that are needed at least; record '
-                           'more')
+            raise LogError(f'has {count} of the 2 rows of data that are needed; record more')
     arrays = {quantity: np.concatenate([part[quantity] for part, _ in blocks])
               for quantity in arrays}
     _replace_attitude(arrays, axis)
@@ -177,8 +168,8 @@ class ExpansionBudget:
         """Count bytes, and raise `LogError` beyond the limit."""
         self._remaining -= size
         if self._remaining < 0:
-            raise LogError(f'decompresses to more than {MAX_EXPANSION_RATIO} times its size, '
-                           'which is the limit; decompress it first if this is intended')
+            raise LogError(f'decompresses to more than {MAX_EXPANSION_RATIO} times its size, the '
+                           'limit; decompress it first')
 
 
 @contextmanager
@@ -190,9 +181,8 @@ def _convert_read_errors(path: str | Path) -> Iterator[None]:
         raise LogError(f'{path}: {error}') from None
     except UnicodeDecodeError as error:
         code = 'UTF-16' if error.object[:1] in (b'\xff', b'\xfe') else 'WINDOWS-1252'
-        raise LogError(
-            f'{path}: cannot be read as a log, since it is not text in UTF-8; if it is '
-            f'text, convert it, as by iconv -f {code} -t UTF-8 {path} > log.csv') from error
+        raise LogError(f'{path}: is not text in UTF-8; convert it, as by iconv -f {code} '
+                       f'-t UTF-8 {path} > log.csv') from error
     except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({describe_error(error)}); '
                        'wanted a CSV file, .csv or .csv.gz') from error
@@ -204,7 +194,7 @@ def _iter_lines(text: io.TextIOWrapper, budget: ExpansionBudget | None) -> Itera
     for line in iter(partial(text.readline, _MAX_LINE_LENGTH + 1), ''):
         if budget:
             budget.spend(len(line))
-        if len(line) < 3 and not line.strip('\r\n') and len(empty) < BLOCK_ROWS:
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < CACHE_BLOCK_SAMPLES:
             empty.append(line)
             continue
         if len(line) > _MAX_LINE_LENGTH:
@@ -237,19 +227,17 @@ def _read_header(lines: Iterator[str], columns: Mapping[str, str],
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not header:
-        raise LogError('has no line with the names of columns; record again, or name another file')
+        raise LogError('has no line with the names of columns; name another file')
     found = find_columns(header, columns, axis)
     positions = {column.position for column in found.values()}
     # the other names, made unique: a second x becomes x.1
-    others, taken, numbers = dict[str, int](), set(header), dict[str, int]()
+    others, names, numbers = dict[str, int](), set(header), Counter[str]()
     for index, name in enumerate(header):
-        unique = name
-        while name in numbers and unique in taken:
-            numbers[name] += 1
-            unique = f'{name}.{numbers[name]}'
-        numbers.setdefault(name, 0)
-        taken.add(unique)
         if index not in positions and name not in COLUMNS:
+            unique = name
+            while unique in others or unique != name and unique in names:
+                numbers[name] += 1
+                unique = f'{name}.{numbers[name]}'
             others[unique] = index
     return (_FileHeader(tuple(notes), header, found, others, delimiter),
             len(notes) + rows.line_num + 1)
@@ -279,12 +267,12 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
 
 def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_line: int,
                      table: _FileHeader) -> _ParsedRows:
-    """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
+    """Parse rows with texts, which may span lines; name a faulty row and column."""
     reader = csv.reader(itertools.chain(lines, remaining_lines), delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
-            raise LogError(f'line {places[-1]} has {len(row)} values where the header has '
+            raise LogError(f'line {places[-1]} has {len(row)} values, and the header '
                            f'{len(header)}; correct or remove the line')
         rows.append(row)
         places.append(first_line + reader.line_num)
@@ -311,7 +299,7 @@ def _parse_text_rows(lines: list[str], remaining_lines: Iterator[str], first_lin
         wrong = mask_invalid(values, quantity)
         if wrong.any():
             number = int(np.argmax(wrong))
-            fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
+            fault = (f'beyond the limit of {_max_magnitude(quantity):g}'
                      if np.isfinite(values[number]) else 'not a finite number')
             raise LogError(f'line {places[number]}, column {header[index]}: '
                            f'{excerpt(texts[number])} is {fault}; remove the row')
@@ -325,9 +313,14 @@ def _to_number(text: str) -> float:
     return float(text)
 
 
+def _max_magnitude(quantity: str) -> float:
+    # a single larger temperature decides a fit, degC
+    return 1e5 if quantity == 'temperature' else MAX_MAGNITUDE
+
+
 def mask_invalid(values: Array, quantity: str) -> Mask:
     """Tell which values a log cannot hold: beyond the limit, or nan where it may not be lost."""
-    valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
+    valid = np.abs(values) <= _max_magnitude(quantity)
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
 
@@ -339,8 +332,7 @@ def _refuse_unordered_time(line_numbers: Sequence[int], time: Array | None,
     if (far := np.abs(time) > MAX_TIME).any():
         row = int(np.argmax(far))
         raise LogError(f'{place} {line_numbers[row]}, column time_s: {time[row]:g} s is beyond '
-                       f'the limit of {MAX_TIME:g} s; give its unit, as by --columns '
-                       'time=time_s:ns')
+                       f'{MAX_TIME:g} s; give its unit, as by --columns time=time_s:ns')
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
@@ -354,7 +346,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     """
     Return a log from a pandas DataFrame, or from a mapping of names to arrays of shape (n,).
 
-    Raise `LogError` for no output, different lengths, values that are no numbers, unordered time.
+    Raise `LogError` for no output, or values that are no log.
     """
     try:
         header = [str(name) for name in table]
@@ -367,8 +359,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
         for quantity, (index, factor, offset) in found.items()}
     _refuse_invalid(arrays, names)
     if (count := len(next(iter(arrays.values())))) < 2:
-        raise LogError(f'the table has {count} of the 2 rows that are needed at least; record '
-                       'more')
+        raise LogError(f'the table has {count} of the 2 rows that are needed; record more')
     _replace_attitude(arrays, axis)
     return Log(**arrays)
 
@@ -382,8 +373,8 @@ def _to_floats(name: str, values: Any) -> Array:
             raise ValueError(f'its type is {array.dtype}')
         return np.asarray(array, float)
     except (TypeError, ValueError) as error:
-        raise LogError(f'{name} is no column of numbers ({describe_error(error)}); give real '
-                       'numbers, and dates as seconds since the first') from None
+        raise LogError(f'{name} is no column of numbers ({describe_error(error)}); give dates as '
+                       'seconds since the first') from None
 
 
 def _refuse_invalid(arrays: Mapping[str, Array], names: Mapping[str, str]) -> None:
@@ -411,13 +402,12 @@ def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
 
 def _replace_attitude(arrays: dict[str, Array], axis: str) -> None:
     """
-    Replace the parts of a quaternion, in quantity -> values, by the `ROTATIONS`.
+    Replace the parts of a quaternion from sensor to room, in quantity -> values, by `ROTATIONS`.
 
     The rotation about an axis is the angle that a gyro with this axis turns, tilted or not: the
     rotations between neighbouring attitudes are added by their component along the axis of the
-    sensor, less what coning adds to it (Bortz 1971). A quaternion turns axes of the sensor into
-    those of the room. Over a gap in which the axis of the rotation changes, that component is not
-    the angle: there the gyro's own angle is taken, if it drifts by less.
+    sensor, less what coning adds to it (Bortz 1971). Over a gap in which the axis of the rotation
+    changes, the gyro's own angle is taken, if it drifts by less.
     """
     if ATTITUDE[0] not in arrays:
         return
@@ -462,8 +452,7 @@ def _replace_attitude(arrays: dict[str, Array], axis: str) -> None:
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.
 _FULL_TURN_MARGIN = 0.1
-#: Largest ratio of a gyro's rate to that of its reference, either way, in the same unit: half way,
-#: as a factor, to 2, the least by which full scales are confused.
+#: Largest ratio of the rates of a gyro and its reference, in one unit: full scales differ by 2.
 MAX_PLAUSIBLE_FACTOR = 1.4
 
 
@@ -472,11 +461,10 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     """
     Unwrap a heading, and return it with whether the gyro determined a number of turns.
 
-    Where the reference was lost or is slow, it may turn by more than half a turn from one value to
-    the next. The integral of the gyro then gives the number of turns. Its sign and bias against
-    the reference are estimated from the values that lie close together. A heading in deg instead
-    of rad is left as it is, as its unit is to be corrected first. The reference, s and rad, has
-    shape (m,), nan where it was lost; time and output of the gyro, s and rad/s, shape (n,).
+    Over gaps and of a slow reference, the integral of the gyro gives the number of turns. A
+    heading in deg instead of rad is left as it is, as its unit is to be corrected first. The
+    reference, s and rad, has shape (m,), nan where it was lost; time and output of the gyro, s and
+    rad/s, shape (n,).
     """
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
     if known.sum() < 2:
@@ -514,7 +502,7 @@ def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
 
 
 def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: Array) -> bool:
-    """Tell whether a heading exceeds a turn and, by the gyro, is in deg instead of rad."""
+    """Tell whether a heading exceeds a turn and, by the gyro, is not in rad."""
     _, factor = _heading_by_gyro(reference_time, heading, time, output)
     return (float(np.ptp(heading)) > (1.0 + _FULL_TURN_MARGIN) * 2.0 * math.pi
             and 1.0 / MAX_PLAUSIBLE_FACTOR < DEGREE * abs(factor) < MAX_PLAUSIBLE_FACTOR)
@@ -522,8 +510,7 @@ def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: A
 
 def refuse_wrapped(log: Log) -> None:
     """Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped."""
-    # Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
-    # heading in deg instead of rad are none.
+    # over a gap of the reference, a jump is a full turn that the gyro does not show
     if log.time is None or log.reference_heading is None:
         return
     known = np.flatnonzero(np.isfinite(log.reference_heading))
@@ -550,18 +537,13 @@ def refuse_wrapped(log: Log) -> None:
     if len(jumps) and not (log.output is not None and _is_in_degrees(
             time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
-        where = (', first at' if last == first + 1 else
-                 ' that the gyro does not show, first in the gap that ends at')
-        raise DataRefused(f'the reference heading jumps by a full turn{where} '
+        where = '' if last == first + 1 else ' that the gyro does not show'
+        raise DataRefused(f'the reference heading jumps by a full turn{where}, first at '
                           f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] = {}) -> None:
-    """
-    Write a log, .csv or .csv.gz, in SI columns and its other columns, atomically.
-
-    `more` holds further columns: name -> array of shape (n,).
-    """
+    """Write a log and more columns, name -> (n,), to .csv or .csv.gz in SI, atomically."""
     columns: dict[str, Any] = {
         name: getattr(log, quantity) for name, (quantity, factor) in COLUMNS.items()
         if factor == 1.0 and getattr(log, quantity) is not None}
@@ -573,8 +555,8 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] = {}) -> Non
           if str(path).endswith('.gz') else nullcontext(file) as data):
         text = ''.join(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
         text += format_rows([columns])
-        for begin in range(0, len(log), BLOCK_ROWS):
-            parts = (each[begin:begin + BLOCK_ROWS] for each in columns.values())
+        for begin in range(0, len(log), CACHE_BLOCK_SAMPLES):
+            parts = (each[begin:begin + CACHE_BLOCK_SAMPLES] for each in columns.values())
             text += format_rows(zip(*(part if isinstance(part, list) else part.tolist()
                                       for part in parts)))
             data.write(text.encode('utf-8', 'backslashreplace'))

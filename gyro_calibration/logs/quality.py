@@ -23,8 +23,7 @@ from scipy.special import ndtri
 #: Standard deviation of the misalignment of the axes of gyro and reference, rad, as the cross-axis
 #: sensitivity in data sheets of MEMS gyros (MPU-6050: 2 %).
 MISALIGNMENT_DEVIATION = 0.02
-#: Least alignment of codes on a lattice (length of the mean phasor): 1 for exact codes, 0 for
-#: continuous values; codes may deviate by 0.13 steps rms.
+#: Least alignment of codes on a lattice (length of the mean phasor): deviations of 0.13 steps rms.
 _MIN_ALIGNMENT = 0.7
 
 
@@ -155,11 +154,6 @@ def quantization_step(values: Array) -> float:
     return find_codes(values).step
 
 
-#: Least share of the changes of an encoder heading that are not collinear with the two before, or
-#: of the bends that return at once; in a calculated motion, rates are constant or change evenly.
-_MIN_IRREGULAR_SHARE = 0.1
-
-
 def encoder_step(heading: Array) -> float:
     """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
     known = heading[np.isfinite(heading)]
@@ -167,8 +161,9 @@ def encoder_step(heading: Array) -> float:
     change = np.diff(known)
     changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
                           for each in (change, np.diff(change, 2)))
-    # at rates of whole steps few changes differ, but the error of each reading shows
-    return step if step and (differing > _MIN_IRREGULAR_SHARE * changes
+    # In a calculated motion, rates are constant or change evenly. At rates of whole steps few
+    # changes differ, but the error of each reading shows.
+    return step if step and (10 * differing > changes
                              or is_rounded_at_each_sample(known, step)) else 0.0
 
 
@@ -176,7 +171,7 @@ def is_rounded_at_each_sample(values: Array, step: float) -> bool:
     """Tell whether changes of values by other numbers of steps return at the next sample."""
     bent = np.diff(values, 2)
     returning = np.count_nonzero(bent[1:] * bent[:-1] < -0.5 * step ** 2)
-    return bool(returning > _MIN_IRREGULAR_SHARE * np.count_nonzero(np.abs(bent) > 0.5 * step))
+    return bool(10 * returning > np.count_nonzero(np.abs(bent) > 0.5 * step))
 
 
 def find_runs(mask: Mask) -> list[slice]:
@@ -210,9 +205,7 @@ def mask_repeated_samples(output: Array) -> Mask:
     """Mark repeats of a value in runs longer than its share of the samples explains."""
     repeated = np.zeros(len(output), dtype=bool)
     share = np.unique(output, return_counts=True)[1].max() / len(output)
-    # A coarsely quantized gyro at rest, or a simulation without noise, cannot be distinguished
-    # from a gyro that repeats samples.
-    if share > 0.9:
+    if share > 0.9:  # a coarsely quantized gyro at rest, or a simulation without noise
         return repeated
     longest = math.log(1e-6 / len(output)) / math.log(share)
     for run in find_runs(np.concatenate([[False], np.diff(output) == 0.0])):
@@ -225,9 +218,8 @@ def refuse_dead(output: Array) -> None:
     values, counts = np.unique(output, return_counts=True)
     share, value = counts.max() / len(output), float(values[counts.argmax()])
     if len(values) == 1:
-        raise DataRefused(f'all {len(output)} samples have the same value, '
-                          f'{value / DEGREE:g} deg/s: the gyro is dead or not powered; check '
-                          'power and wires')
+        raise DataRefused(f'all {len(output)} samples have the same value, {value / DEGREE:g} '
+                          'deg/s: the gyro is dead or not powered; check power and wires')
     if share > 0.9:  # the last bit may toggle
         raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, '
                           f'{value / DEGREE:g} deg/s: the gyro is dead, not powered, or did not '

@@ -11,10 +11,9 @@
 """
 Conversion of a ROS 2 recording to a `Log` at the stamps of the gyro.
 
-The gyro is an Imu; temperature and reference are interpolated at its stamps. Other message types
-with a rate, an orientation or a temperature are used where their topic is named. Times are the
-stamps of the headers; times of receipt are used only where headers have no stamps. Notes list this
-and all other corrections.
+Temperature and reference are interpolated at these. Other message types with a rate, an
+orientation or a temperature are used where their topic is named. Times are the stamps of the
+headers; times of receipt are used only where headers have no stamps.
 """
 
 from __future__ import annotations
@@ -45,9 +44,6 @@ _ROLES = {
     'reference': ('--reference-topic', _REFERENCE_TYPES, {'rate', 'orientation.w'}),
 }
 
-#: Largest step back of stamps by messages out of order, s; at a larger one a clock was set.
-_MAX_STEP_BACK = 1.0
-_MAX_LISTED_TOPICS = 20  # in a message, which hundreds of topics would make unreadable
 #: Time without a temperature beyond which a note is made, s; gyros take minutes to warm up.
 _MAX_TEMPERATURE_GAP = 30.0
 
@@ -73,11 +69,7 @@ def _is_same_topic(topic: str, other: str | None) -> bool:
 
 
 class _Topic:
-    """
-    Messages of one topic.
-
-    `rows` has stamp and time of receipt, ns, and the known quantities by name.
-    """
+    """Messages of one topic: `rows` has stamps and times of receipt, ns, and quantities."""
 
     def __init__(self, name: str, kind: str, definition: str, axis: str):
         self.name, self.kind, self.damaged_count = name, kind, 0
@@ -156,8 +148,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     Read a ROS 2 recording: a folder, or a file .mcap or .db3.
 
     A sample rate, Hz, replaces the stamps. `on_progress` takes the number of bytes read, `on_note`
-    each note on selections and corrections. Raise `LogError` for a recording that cannot be read,
-    or has no gyro or several; it names the topics.
+    each note on selections and corrections. `LogError` names the topics where the gyro is not
+    known.
     """
     contents, found = Contents(), dict[str, _Topic]()
     for message in read_messages(path, contents, on_progress):
@@ -195,10 +187,9 @@ class _LogBuilder:
                 kind for kind, definition in self._contents.definitions.items()
                 if kind not in _REFERENCE_TYPES
                 and 'rate' in cdr.parse_layout(definition).quantities})
-            remedy = (f'select {_join_names(others, "or")} with --topic' if others
-                      else 'record the topic of the gyro')
-            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; '
-                           f'{remedy}')
+            raise LogError(f'no message of {cdr.IMU} in it{reasons}{self._list_topics()}; ' + (
+                f'select {_join_names(others, "or")} with --topic' if others
+                else 'record the topic of the gyro'))
         gyro = self._read(self._found[found[0]])
         if not gyro.is_reported('rate'):
             raise LogError(f'{gyro.name} declares that it reports no angular velocity; name '
@@ -208,8 +199,8 @@ class _LogBuilder:
             temperature = self._find_topic(self._topics.temperature, 'temperature')
         elif found := self._topics_of_type({cdr.TEMPERATURE}):
             if len(found) > 1:
-                self._notes.append(f'of the temperatures {_join_names(found)}, the one whose name '
-                                   'is nearest to the topic of the gyro is used')
+                self._notes.append(f'of the temperatures {_join_names(found)}, the one nearest to '
+                                   'the topic of the gyro is used')
             temperature = self._found[max(found, key=lambda topic: len(os.path.commonprefix(
                 [topic.strip('/'), gyro.name.strip('/')])))]
         temperature = temperature and self._read(temperature)
@@ -221,8 +212,7 @@ class _LogBuilder:
                                f'{_join_names(possible)}')
         use_stamps = all(each.has_stamps for each in (gyro, reference) if each is not None)
         if not use_stamps:
-            self._notes.append('headers have no stamps: times are those at which messages were '
-                               'received')
+            self._notes.append('headers have no stamps: times are those of receipt')
         gyro.use_times(use_stamps)
         self._order_samples(gyro, rate)
         begin = gyro.stamps[0]
@@ -232,8 +222,7 @@ class _LogBuilder:
         output = gyro.values('rate')
         lost = mask_invalid(output, 'output') | np.isnan(output)
         if lost.any():
-            self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
-                               'as lost')
+            self._notes.append(f'{np.count_nonzero(lost)} samples are not finite and are lost')
             output[lost] = np.nan
         arrays: dict[str, Any] = {'output': output}
         force = gyro.values('force')
@@ -279,8 +268,8 @@ class _LogBuilder:
 
     def _read(self, topic: _Topic) -> _Topic:
         if topic.damaged_count:
-            self._notes.append(f'{topic.damaged_count} messages of {topic.name} could not be read '
-                               'and were left out')
+            self._notes.append(f'{topic.damaged_count} messages of {topic.name} are damaged and '
+                               'were left out')
         if len(topic.frames) > 1:
             raise LogError(f'messages of the frames {_join_names(sorted(topic.frames))} are on '
                            f'{topic.name}, as of several sensors: record each on a topic of its '
@@ -294,14 +283,13 @@ class _LogBuilder:
         if rate is not None:
             gyro.rows['stamp'] = latest
         elif back.any():
-            if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
-                place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
+            if back.max() > NSEC_PER_SEC:
+                place = int(np.argmax(back > NSEC_PER_SEC))
                 raise LogError(f'the stamps of {gyro.name} step back by '
                                f'{format_seconds(back[place])} s at sample {place + 1}, as after '
                                'setting a clock; split the recording there, or give the sample '
                                'rate with --rate')
-            self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were '
-                               'sorted')
+            self._notes.append(f'{np.count_nonzero(back)} samples out of order were sorted')
             gyro.rows = gyro.rows[np.argsort(gyro.stamps, kind='stable')]
         doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
         if rate is None and doubled.any():
@@ -315,8 +303,7 @@ class _LogBuilder:
                                'one were left out')
             gyro.rows = gyro.rows[~doubled]
         if (count := len(gyro.rows)) < 2:
-            raise LogError(f'{gyro.name} has {count} samples with a time; a log has at least two: '
-                           'record more')
+            raise LogError(f'{gyro.name} has {count} of 2 samples with a time; record more')
 
     def _interpolate_temperature(self, topic: _Topic, begin: np.int64,
                                  time: Array) -> Array | None:
@@ -326,8 +313,7 @@ class _LogBuilder:
         at = (topic.stamps - begin) / NSEC_PER_SEC
         if (not len(at) or at[0] > time[-1] + _MAX_TEMPERATURE_GAP
                 or at[-1] < -_MAX_TEMPERATURE_GAP):
-            self._notes.append(f'temperature: {topic.name} has none at the times of the gyro, '
-                               'and was left out')
+            self._notes.append(f'temperature: {topic.name} has none at the times of the gyro')
             return None
         self._notes.append(f'temperature: {topic.name} ({topic.kind}), {len(at)} readings')
         inside = at[(at >= 0.0) & (at <= time[-1])]
@@ -357,8 +343,8 @@ class _LogBuilder:
             heading, by_gyro = unwrap_heading(
                 at, np.asarray(cdr.quaternion_heading(x, y, z, w)), time, output)
             if by_gyro:
-                self._notes.append('the reference turned by more than half a turn between two '
-                                   'values; the number of turns was taken from the gyro')
+                self._notes.append('the reference turned by more than half a turn between values; '
+                                   'the number of turns is that of the gyro')
         if (rate is not None and heading is not None and not rate.any()
                 and np.nanmax(heading) - np.nanmin(heading) > 0.1):
             self._notes.append('the rates of the reference are all zero, and were left out')
@@ -389,6 +375,6 @@ def format_seconds(nanoseconds: int | np.int64) -> str:
 
 
 def _join_names(names: Sequence[str], word: str = 'and') -> str:
-    if len(names) > _MAX_LISTED_TOPICS:
-        names = [*names[:_MAX_LISTED_TOPICS], f'{len(names) - _MAX_LISTED_TOPICS} more']
+    if len(names) > 20:  # hundreds of topics would make a message unreadable
+        names = [*names[:20], f'{len(names) - 20} more']
     return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} {word} {names[-1]}'

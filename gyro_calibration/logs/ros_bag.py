@@ -11,11 +11,10 @@
 """
 ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and written as .mcap.
 
-The recording of a killed program lacks its closing part and index, so neither is used: records
-are read from the beginning up to the end, or to the point of truncation. No record may take more
-memory than `MAX_RECORD_BYTES`, and no file may expand to more than an `ExpansionBudget` of its
-size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
-3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
+The recording of a killed program lacks its closing part and index, so neither is used: records are
+read from the beginning to the end, or to a truncation. No record may take more memory than
+`MAX_RECORD_BYTES`, and no file expand to more than an `ExpansionBudget`: rosbags 0.11.9 takes 3.7
+GB for an MCAP file of 131 kB. The records follow https://mcap.dev/spec.
 """
 
 from collections import Counter, defaultdict
@@ -45,8 +44,8 @@ from gyro_calibration.logs.columns import excerpt
 from gyro_calibration.logs.log import ExpansionBudget, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
-MAX_RECORD_BYTES = 1 << 28
-_READ_BYTES = 1 << 20
+MAX_RECORD_BYTES = 250_000_000
+_READ_BYTES = 1_000_000
 
 _MAGIC = b'\x89MCAP0\r\n'
 METADATA_NAME = 'gyro_calibration'  # name of the metadata record of this program
@@ -111,8 +110,7 @@ def list_recording_files(path: str | Path) -> list[Path]:
         raise LogError(f'{path}: cannot be read ({describe_error(error)}); '
                        f'{remedy(error, path)}') from error
     if not found:
-        raise LogError(f'{path}: a folder without an .mcap or .db3 file; '
-                       'name the folder of a ROS 2 recording, or a log file')
+        raise LogError(f'{path}: a folder without an .mcap or .db3 file; name a recording or log')
     return sorted(found, key=lambda file: [int(part) if part.isdigit() else part
                                            for part in re.split(r'(\d+)', file.name)])
 
@@ -122,8 +120,7 @@ def read_messages(path: str | Path, contents: Contents,
     """
     Give the messages of a recording with known quantities, and fill in its contents.
 
-    It is a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd; `LogError` for others. The
-    progress is the number of bytes read.
+    The progress is the number of bytes read.
     """
     done = 0
 
@@ -148,9 +145,7 @@ def read_messages(path: str | Path, contents: Contents,
             raise LogError(f'{file}: cannot be read ({describe_error(error)}); '
                            f'{remedy(error, file)}') from error
     if contents.skipped_parts:
-        parts = ('part of the recording was' if contents.skipped_parts == 1
-                 else 'parts of the recording were')
-        contents.notes.append(f'{contents.skipped_parts} damaged or oversized {parts} left out')
+        contents.notes.append(f'damaged or oversized parts left out: {contents.skipped_parts}')
 
 
 def _recording_suffix(path: Path) -> str | None:
@@ -420,8 +415,7 @@ _MESSAGES_QUERY = """
            CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
            CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
     FROM messages"""
-#: Errors of SQLite in a damaged file: its own, with texts that may not be UTF-8, and lengths
-#: beyond the memory.
+#: Errors of SQLite in a damaged file: its own, texts other than UTF-8, lengths beyond the memory.
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
@@ -461,8 +455,7 @@ def _read_database(source: Path, path: Path, contents: Contents,
 def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """Open a database read-only, and give it with the names of its tables of stored columns."""
     # Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
-    # count corrected. Computed columns are not read: their cost is not limited by the size of the
-    # file.
+    # count corrected. Computed columns, whose cost has no limit, are not read.
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
         for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
@@ -484,8 +477,8 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
             with closing(database):
                 try:
                     database.text_factory = partial(str, encoding='utf-8', errors='replace')
-                    # The smallest row of a file has a dozen bytes and takes some 30 steps of
-                    # SQLite. A query is ended after a million steps plus ten per byte.
+                    # A query ends after a million steps of SQLite plus ten per byte; the smallest
+                    # row, of a dozen bytes, takes some 30.
                     thousands = repeat(0, file.stat().st_size // 100 + 1000)
                     database.set_progress_handler(partial(next, thousands, 1), 1000)
                     if sys.version_info >= (3, 11):
@@ -501,8 +494,7 @@ def _open_database(source: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]
                     reason = error
                     continue
                 if not {'topics', 'messages'} <= tables:
-                    raise LogError('is a database, but not a ROS 2 recording with tables of '
-                                   'stored columns; name a recording')
+                    raise LogError('is a database, but no ROS 2 recording; name one')
                 yield database, tables
                 return
     raise LogError(f'cannot be read as a ROS 2 recording ({_describe_database_error(reason)}); '

@@ -11,9 +11,8 @@
 """
 Stamps of samples on an even grid.
 
-A gyro samples by its own clock, and the stamps of a host jitter. So the samples are numbered, and
-a line fitted to the stamps gives the interval. Samples are lost where the stamps stay late after a
-long step. Where the stamps catch up again, samples were only delayed.
+Samples are numbered, and a line fitted to the stamps gives the interval. Samples are lost where
+the stamps stay late after a long step; where they catch up again, samples were only delayed.
 """
 
 from dataclasses import dataclass
@@ -24,18 +23,13 @@ from numpy.typing import NDArray
 
 Integers = NDArray[np.integer]
 
-#: Ratio to the usual interval of a short one, as in a burst or after a late sample.
-SHORT_RATIO = 0.5
-
-#: Least number of windows in a record. None crosses a gap of more than this part of the record,
-#: and longer windows do not show a motion.
+SHORT_RATIO = 0.5  # to the usual interval of a short one, as in a burst
+#: Least number of windows in a record. None crosses a gap of more than this part of the record.
 MIN_WINDOWS = 50
 
 
 @dataclass(frozen=True)
 class StampGrid:
-    """Stamps on an even grid."""
-
     time: Array  # s, shape (n,)
     lost_after: Integers  # how many samples are lost after each but the last, shape (n - 1,)
     grid_index: Integers  # index on the grid, shape (n,); long gaps are cut to `max_gap`
@@ -46,11 +40,9 @@ class StampGrid:
 
     @property
     def burst_remarks(self) -> list[str]:
-        """Return a sentence on the deviation from the grid, if stamps come in bursts."""
-        if not (self.has_bursts and self.max_deviation):
-            return []
         return [f'The stamps come in bursts or with jitter, up to {self.max_deviation:.3g} s off '
-                f'an even interval of {1000 * self.interval:.5g} ms, which is used.']
+                f'an even interval of {1000 * self.interval:.5g} ms, which is used.'
+                ] if self.has_bursts and self.max_deviation else []
 
     @property
     def loss_remarks(self) -> list[str]:
@@ -74,16 +66,15 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     alike = 0.8 < interval / usual < 1.25
     if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > 0.9:
         raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
-                          f'{100 * interval:.4g} s: either most samples are lost, or they come in '
-                          'long bursts; give the sample rate with --rate, or record again')
+                          f'{100 * interval:.4g} s: most samples are lost, or come in long '
+                          'bursts; give the sample rate with --rate, or record again')
     whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
     usual = (float(steps[whole & (steps < 1.5 * usual)].mean())
              if alike and float(whole.mean()) > 0.9 else interval)
     bursts = float((steps < SHORT_RATIO * usual).mean()) > 0.02
 
     # The number of lost samples is that of the intervals by which the stamps remain late. Samples
-    # that were delayed at a host arrive in one burst of any size; the time to catch up begins
-    # after it.
+    # that were delayed arrive in one burst of any size; the time to catch up begins after it.
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
     # samples within which delayed stamps catch up, and the least loss beyond their jitter

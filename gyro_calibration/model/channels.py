@@ -11,8 +11,8 @@
 """
 Channels that need a history: time since power-on, lagged channels, the sign of heating.
 
-A stream sample by sample, and a log in blocks, have the same results but for rounding (1e-14
-rad/s). A lag starts at the value of its channel where it is first requested.
+A stream of samples and a log in blocks have the same results. A lag starts at the value of its
+channel where it is first requested.
 """
 
 from __future__ import annotations
@@ -43,11 +43,7 @@ class ChannelHistory:
     def update(self, time: Number, temperature: Number | None = None,
                specific_force: Number | None = None, supply: Number | None = None,
                heading: Number = 0.0) -> Channels:
-        """
-        Take the next sample (numbers) or samples (shape (n,), n > 0), and return its channels.
-
-        Stamps are in s, quantities in degC, m/s², V and rad, or None. Rate and output are 0.
-        """
+        """Take samples, numbers or (n,), in s, degC, m/s², V, rad; return their channels."""
         if self._block is None:
             self._start_time = float(_edge_value(time, 0))
         known = {'specific_force': specific_force}
@@ -130,7 +126,6 @@ def channels_from_log(log: Log) -> Channels:
 
 
 def clip(value: Number, low: float, high: float) -> Number:
-    """Return a number, or an array, within bounds."""
     # np.clip turns a number into a numpy scalar, which makes later computations 3 times slower
     return (np.clip(value, low, high) if isinstance(value, np.ndarray)
             else min(max(value, low), high))

@@ -8,13 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-Compensation: from the output of a gyro to the rate, the same for one sample and for a whole log.
-
-Where an effect is a function of the true rate, the model equation is solved by secant iteration
-with a fixed number of passes. No separate inverse formula exists that could differ from the
-simulation.
-"""
+"""Compensation: from the output of a gyro to the rate, the same for one sample and a whole log."""
 
 from dataclasses import dataclass
 import math
@@ -38,11 +32,11 @@ class CompensatedSamples:
     model_rate: Number  # after the model, before the self-calibration, rad/s
     rate: Number  # rad/s
     temperature: Number  # degC, limited to plausible temperatures
-    # outside the calibrated temperatures; up to `GyroModel.extrapolation_range` the correction is
-    # extrapolated, beyond that held
+    # outside the calibrated temperatures; beyond `GyroModel.extrapolation_range` the correction is
+    # held, up to it extrapolated
     temperature_clipped: Number
-    # the output is outside the calibrated rates, or no rate has it; up to `GyroModel.rate_limit`
-    # the correction is extrapolated, beyond that, or at a fold of the response, held
+    # outside the calibrated rates, or no rate has the output; beyond `GyroModel.rate_limit`, or at
+    # a fold of the response, the correction is held, up to it extrapolated
     beyond_range: Number
 
 
@@ -52,8 +46,7 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     Compensate by model (Ojeda et al., eq. 13), then self-calibration (Hong and Park, eq. 3).
 
     Output, rad/s, and temperature, degC, are numbers or have shape (n,); no temperature is the
-    reference temperature. A model that `needs_history` needs the environment: further channels,
-    from the history (`GyroModel.start_history`) that took the same temperatures.
+    reference temperature. A model that `needs_history` needs the environment of its history.
     """
     given = model.reference_temperature if temperature is None else temperature
     if not isinstance(output, np.ndarray) or environment is not None:
@@ -118,9 +111,8 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     Return the derivative of the rate by each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then the
-    `GyroModel.active_tolerances`, then (s, b) of the self-calibration. The derivative of the error
-    is divided by the slope of the output. Effects that compensation cannot undo have a derivative
-    of 0.
+    `GyroModel.active_tolerances`, then (s, b) of the self-calibration. Effects that compensation
+    cannot undo have a derivative of 0.
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None or model.active_tolerances:

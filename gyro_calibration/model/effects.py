@@ -11,10 +11,8 @@
 """
 Errors of a gyro: the formula of each effect between the true rate and the output.
 
-Simulation, calibration, diagnosis and compensation use the same formulas. Most effects add
-``sum(columns(channels, *shapes) * values)`` to the output. Others, such as a delay or rounding,
-change the signal itself; `not_compensated` states what compensation leaves of them. A new effect
-is one more record here.
+Most effects add ``sum(columns(channels, *shapes) * values)`` to the output. Others, such as a
+delay or rounding, change the signal itself. A new effect is one more record here.
 """
 
 from __future__ import annotations
@@ -41,9 +39,8 @@ class Channels:
     supply: Number | None = None  # V; None where it is not known
     heading: Number = 0.0  # rad
     # of earlier samples, by `model.channels`; without them the past is taken to be constant
-    # (channel, time constant) -> the channel through a first-order lag; channels are
-    # 'temperature', 'specific_force', and 'vibration', the squared deviation of the specific force
-    # from its own mean over 1 s
+    # (channel, time constant) -> the channel through a first-order lag: 'temperature',
+    # 'specific_force', or 'vibration', its squared deviation from its own mean over 1 s
     lagged: Callable[[str, float], Number] | None = None
     # (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell, else 0
     heating: Callable[[float, float], Number] | None = None
@@ -62,8 +59,6 @@ class Channels:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A coefficient or a nonlinear parameter."""
-
     name: str
     unit: str
     default: float | None = None  # a convention; without one it is fitted
@@ -73,8 +68,6 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect."""
-
     name: str  # as in the catalogue and in files
     cause: str  # one sentence for users
     inputs: frozenset[str] = frozenset()  # the channels that it uses
@@ -121,8 +114,7 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
     Return the lagged signal minus the signal, at one instant or at many (shape (n,)).
 
     ``time_constant * d(lagged)/dt = signal - lagged`` is solved exactly for a signal that is
-    linear between its samples. Interval, s, not negative, and change are those since the previous
-    sample.
+    linear between its samples. Interval, s, and change are those since the previous sample.
     """
     if not isinstance(interval, np.ndarray):
         x = interval / time_constant
@@ -157,9 +149,8 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     Return the error polynomial of Ojeda, Chung and Borenstein (2000), eq. 9 to 13.
 
     It is one of the output, so that compensation is one subtraction (eq. 13). Its powers are
-    centred and scaled, since the condition number of raw powers of deg/s and degC is about 1e11.
-    The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of output; the index of
-    eq. 10 as printed collides. The orders are p and q of the paper, not negative.
+    centred and scaled: the condition number of raw powers of deg/s and degC is about 1e11. The
+    coefficient ``t{j}w{i}`` belongs to power j of temperature and i of output.
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 
@@ -223,8 +214,7 @@ def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:
     """
     Return the effect of the matrix C of eq. 11 of Ojeda et al., and its values in SI.
 
-    The matrix has shape (q + 1, p + 1), for deg/s and degC, highest powers first:
-    ``error = [T² T 1] C [w³ w² w 1]'`` (eq. 12).
+    C has shape (q + 1, p + 1), highest powers first: ``error = [T² T 1] C [w³ w² w 1]'`` (eq. 12).
     """
     c = np.array(matrix, dtype=float)
     rows, columns = c.shape
@@ -484,12 +474,7 @@ USER_EFFECTS: dict[str, Effect] = {}
 
 
 def add_effects(effects: Iterable[Effect]) -> None:
-    """
-    Add effects of the user to the catalogue, for models and for the diagnosis of logs.
-
-    Raise `ValueError` for an item that is no `Effect`, a name that is taken, a nonlinear parameter
-    to be fitted without initial values, or columns that do not match the coefficients.
-    """
+    """Add effects of the user to the catalogue; `ValueError` for one that does not fit."""
     rate = np.linspace(-1.0, 1.0, 5)
     channels = Channels(rate, rate, 25.0 + rate, 1.0 + rate, rate, 5.0 + rate, rate,
                         lambda channel, seconds: rate, lambda seconds, threshold: rate)

@@ -246,8 +246,8 @@ class GyroModel:
     @cached_property
     def rate_domain(self) -> tuple[float, float]:
         """Return the rates between which the response is inverted, rad/s."""
-        # They begin at the valid rate nearest to zero, and end where the output no longer grows
-        # with the rate at some used temperature, or would not be plausible.
+        # from the valid rate nearest to zero to where the output no longer grows with the rate at
+        # some used temperature, or would not be plausible
         low, high = self.rate_range
         centre = min(max(0.0, low), high)
         dependent, ends = self._split_by_rate[1], list[float]()
@@ -307,8 +307,8 @@ class GyroModel:
         """
         Return the rate, rad/s, at the output and the surroundings of channels.
 
-        The second value tells whether no rate of the `rate_domain` has this output; the correction
-        at the end of the domain is held there.
+        The second value tells whether no rate of the `rate_domain` has this output; then the
+        correction at its end is used.
         """
         output, (independent, dependent) = channels.output, self._split_by_rate
         given = output - _sum_errors(independent, channels)

@@ -47,8 +47,7 @@ def read_model(path: str | Path) -> GyroModel:
     try:
         content = read_settings(path)
     except FileNotFoundError:
-        raise ModelNotFound(f'{path}: there is no such file; calibrate first, or name another '
-                            'model file') from None
+        raise ModelNotFound(f'{path}: there is no such file; calibrate, or name another') from None
     except (OSError, ValueError) as error:
         raise ModelError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
                          'restore the file or calibrate again') from error

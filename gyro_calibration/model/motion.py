@@ -30,9 +30,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
-#: Largest motion profile, bytes: twice the size of an hour at 100 Hz.
-_MAX_PROFILE_BYTES = 16_000_000
-
 
 class MotionError(InputError):
     """A file is not a motion profile; the message names file and column."""
@@ -64,11 +61,7 @@ class Motion:
         return self.heading[index] + since * (self.rate[index] + 0.5 * slope * since)
 
     def rate_at(self, time: Array) -> Array:
-        """
-        Return the rate, rad/s, at any times; before and after the motion it is 0.
-
-        That of measured headings is a central difference, linear between the given times.
-        """
+        """Return the rate, rad/s, at any times; before and after the motion it is 0."""
         if self.rate is None and not self.is_measured:
             index = np.clip(np.searchsorted(self.time, time, side='right') - 1, 0,
                             len(self.time) - 2)
@@ -132,7 +125,7 @@ ROBOT_MOTION = _turns_and_rests(10.0, (
 NAMED_MOTIONS = {
     'calibration': CALIBRATION_MOTION,
     'robot': ROBOT_MOTION,
-    'rest': motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+    'rest': constant_rate_motion([(60.0, 0.0)]),
 }
 
 
@@ -157,10 +150,11 @@ def read_motion(path: str | Path) -> Motion:
     Read a motion profile from a CSV file, or raise `MotionError`.
 
     It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s, which were commanded;
-    or the reference of a log, of which a heading was measured, without the rows where it was lost.
+    or the measured reference of a log, without the rows where it was lost.
     """
     try:
-        lines = io.StringIO(read_bytes(path, _MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
+        # twice the size of an hour at 100 Hz
+        lines = io.StringIO(read_bytes(path, 16_000_000).decode('utf-8-sig'), newline=None)
         rows = csv.DictReader(line for line in lines if line.strip() and not line.startswith('#'))
         rows.fieldnames = header = [name.strip() for name in rows.fieldnames or ()]
         found = sorted(name for name in _COLUMN_UNITS if name in header)
@@ -177,7 +171,7 @@ def read_motion(path: str | Path) -> Motion:
                 value = float(row[column] or '')
             except ValueError:
                 value = math.inf
-            # nan is a number where a reference may be lost
+            # a reference may be lost
             if not (abs(value) <= MAX_MAGNITUDE
                     or value != value and column.startswith('reference_')):
                 raise MotionError(
@@ -207,8 +201,7 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
     """
     Return the log of a simulated gyro, as `api.simulate`, with the true motion as reference.
 
-    Without a generator there is no noise; without a temperature, degC, of all samples or of each,
-    it is the reference temperature.
+    Without a generator there is no noise; a temperature, degC, is of all samples or of each.
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
     rate, heading = motion.rate_at(time), motion.heading_at(time)
@@ -226,10 +219,9 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
 def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
                          generator: np.random.Generator | None = None) -> Array:
     """
-    Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
+    Return the output, rad/s, shape (n,), at stamps, s, of channels with the true rate.
 
-    The channels have the true rate and surroundings at the stamps, s, (n,). The noise is that of
-    their median interval; without a generator there is none.
+    The noise is that of their median interval; without a generator there is none.
     """
     rate = model.distort('rate', channels.rate, time)
     output = model.output_from_channels(channels.with_rate(rate, rate))

@@ -93,8 +93,7 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     """
     Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
 
-    Flicker and random walk have no finite variance, so it holds for sums whose weights add up to
-    zero, such as the difference of two biases.
+    For sums whose weights add up to zero: flicker and random walk have no finite variance.
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
     angle = (noise.bias_instability ** 2 * FLICKER.angle_covariance(apart)

@@ -32,20 +32,18 @@ class Preset:
 
     @property
     def noise(self) -> Noise:
-        """Return the noise figures in SI."""
         return Noise(self.angle_random_walk * DEGREE / 60.0,
                      self.bias_instability * DEGREE / 3600.0)
 
     @property
     def model(self) -> GyroModel:
-        """Return a model with scale factor error, bias and noise."""
         return GyroModel((Term(SCALE_FACTOR_ERROR, (self.scale_factor_error,)),
                           Term(BIAS, (self.bias * DEGREE,))), noise=self.noise)
 
 
 XV3500 = Preset('XV3500', 'Epson XV-3500CB by Hong and Park 2008, sections 1, 2.1 and 4.2; their '
                 'bias is printed in deg/s, but only deg/min explains the drift',
-                2.5, 18.0, 0.0373, 0.75 / 60.0)
+                2.5, 18.0, 0.0373, 0.0125)
 RD2100 = Preset('RD2100', 'KVH E-Core RD2100, open-loop fibre-optic, by Ojeda et al. 2000, '
                 'Table I and section 5: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; '
                 'half of 2 % and of 0.2 deg/s, both over the range of temperatures',

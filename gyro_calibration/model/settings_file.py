@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-YAML files of settings: models, bias tables, limits.
-
-They are data only: nothing in them is run, and they cannot name other files. A schema states what
-each name may hold.
-"""
+"""YAML files of settings, as data only: nothing in them is run, and they name no other files."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -26,8 +21,6 @@ from gyro_calibration.files import (
 import numpy as np
 import yaml
 
-#: Largest file, bytes: twice the size of a model with the covariance of 150 values.
-_MAX_SETTINGS_BYTES = 1_000_000
 _FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
@@ -39,7 +32,8 @@ def read_settings(path: str | Path) -> Any:
     truncated 9.3e-06 could read as 9.3.
     """
     try:
-        text = read_bytes(path, _MAX_SETTINGS_BYTES).decode('utf-8-sig')
+        # twice the size of a model with the covariance of 150 values
+        text = read_bytes(path, 1_000_000).decode('utf-8-sig')
         content = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         problem, mark = error, None
@@ -65,8 +59,8 @@ def validate(key_path: str, value: Any, schema: Any) -> Any:
     """
     Return a value, at a place such as `noise.angle_random_walk`, as parsed by its schema.
 
-    A schema is a function of place and value; or a mapping of optional names to schemas; or None,
-    for a mapping of any names. Raise `InvalidValue` for others.
+    A schema is a function of place and value; a mapping of optional names to schemas; or None, for
+    a mapping of any names. Raise `InvalidValue` for others.
     """
     if callable(schema):
         return schema(key_path, value)

@@ -9,10 +9,9 @@
 # under the License.
 
 """
-Export of a gyro model to the formats of robot simulators.
+Export of a gyro model to robot simulators; each lists the parameters that it leaves out.
 
-Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configuration, MuJoCo from
-a `<gyro>` sensor. Each supports some of the parameters; the export lists those that are left out.
+Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from Python, MuJoCo from a `<gyro>`.
 """
 
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import GaussMarkov, Noise, NOISE_TERMS
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 
 
 def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
@@ -48,20 +47,16 @@ def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussM
     def log_errors(logarithms: Array) -> Array:
         return np.log((white + to_process(logarithms).allan_variance(octaves)) / wanted)
 
-    longest = math.log(100.0 * span)  # beyond it the process is a random walk over the span
-    begins = [np.array([math.log(walk + floor / math.sqrt(time)), math.log(time)])
-              for time in np.geomspace(span / 100.0, span, 5)]
-    found = min(
-        (minimize(lambda x: float(np.mean(log_errors(x) ** 2)), begin, method='Nelder-Mead',
-                  bounds=((None, None), (math.log(interval), longest)))
-         for begin in begins), key=lambda each: float(each.fun))
-    return to_process(found.x), float(np.expm1(0.5 * np.abs(log_errors(found.x)).max()))
+    # beyond 100 spans the process is a random walk
+    bounds = (-np.inf, math.log(interval)), (np.inf, math.log(100.0 * span))
+    found = min((least_squares(log_errors, [math.log(walk + floor / math.sqrt(time)),
+                                            math.log(time)], bounds=bounds)
+                 for time in np.geomspace(span / 100.0, span, 5)), key=lambda each: each.cost)
+    return to_process(found.x), float(np.expm1(0.5 * np.abs(found.fun).max()))
 
 
 @dataclass(frozen=True)
-class _SimulatorParameters:
-    """The parameters of a gyro that simulators support, in rad/s and s; 0 where there is none."""
-
+class _SimulatorParameters:  # in rad/s and s; 0 where there is none
     bias: float  # output at rest
     bias_deviation: float
     white_noise: float  # standard deviation of a sample

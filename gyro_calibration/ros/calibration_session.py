@@ -11,13 +11,10 @@
 """
 Calibration runs on a robot, without rclpy: data collection, drive, guards and fit.
 
-Inputs are samples, odometry and commands with the time of the steady clock; commands are sent
-through `send`. All guards of a drive use the steady clock, not ROS time. A run ends with
+All guards of a drive use the steady clock, not ROS time. A run ends with
 `CalibrationRun.end_reason` set ('' where its samples are complete); `CalibrationSession.conclude`
-then fits it.
-
-A foreign command is one of another node: own commands come back on `cmd_vel` in the order of
-sending, and every other command is foreign, also an additional zero.
+then fits it. Own commands come back on `cmd_vel` in the order of sending; every other command is
+foreign, of another node, also an additional zero.
 """
 
 from __future__ import annotations
@@ -51,8 +48,8 @@ import numpy as np
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
 FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
 MIN_ODOMETRY_DURATION = 5.0  # s; of a run by odometry, whose first and last second are not fitted
-#: Time without a sample after which a run without a drive ends, and longest wait for a node that
-#: receives the commands, s; discovery may take 3 s.
+#: Longest time without a sample, and without a node that receives the commands, s; discovery may
+#: take 3 s.
 SAMPLE_TIMEOUT = 5.0
 _STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
 #: Least change of the odometry heading that shows a turn, rad: beyond the slack of wheels at rest.
@@ -67,8 +64,6 @@ _NO_RECEIVER = ('no other node receives cmd_vel: start what moves the robot, rem
 
 @dataclass
 class CalibrationRun:
-    """A calibration in progress."""
-
     kind: str  # PROFILE, ODOMETRY, TURNS or REST
     duration: float  # of the compared motion, s; inf until `finish`
     last_received: float  # time of the last sample, or of the request, s of the steady clock
@@ -85,24 +80,19 @@ class CalibrationRun:
     odometry: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, time: float, output: float, rate: float, temperature: float | None) -> None:
-        """Add a sample; temperature in degC, or None if unknown."""
         self.times.append(time)
         self.outputs.append(output)
         self.rates.append(rate)
         self.temperatures += [] if temperature is None else [temperature]
 
-    def finish(self) -> str:
-        """End the motion now; return the remaining instruction for the user."""
-        self.duration = min(self.duration, self.elapsed)
-        return f'leave the robot at rest for {self.max_duration - self.elapsed:.1f} s more'
-
     @property
     def due_end_reason(self) -> str | None:
         """Return '' if the samples are complete, the reason of a time-out, or None."""
-        if math.isinf(self.duration) and self.elapsed > FINISH_TIMEOUT:
-            return (f'finish_calibration was not called within {FINISH_TIMEOUT:g} s: call it when '
-                    'the robot stands on the mark again')
-        return '' if self.elapsed >= self.duration + self.extra_duration else None
+        if self.elapsed < self.max_duration:
+            return None
+        return '' if math.isfinite(self.duration) else (
+            f'finish_calibration was not called within {FINISH_TIMEOUT:g} s: call it when the '
+            'robot stands on the mark again')
 
     @property
     def elapsed(self) -> float:
@@ -110,25 +100,22 @@ class CalibrationRun:
         return self.times[-1] - self.times[0] if self.times else 0.0
 
     @property
-    def extra_duration(self) -> float:
-        """Return the duration of samples after the motion, s."""
-        return {REST: 0.0, TURNS: 2.5}.get(
+    def max_duration(self) -> float:
+        """Return the longest duration of the run, s; after the motion the robot rests."""
+        if math.isinf(self.duration):
+            return FINISH_TIMEOUT
+        return self.duration + {REST: 0.0, TURNS: 2.5}.get(
             self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property
-    def max_duration(self) -> float:
-        """Return the longest duration of the run, s."""
-        return FINISH_TIMEOUT if math.isinf(self.duration) else self.duration + self.extra_duration
-
-    @property
     def status(self) -> str:
-        return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
-                if math.isinf(self.duration)
-                else f'{self.elapsed:.0f} of {self.max_duration:.0f} s')
+        return (f'{self.elapsed:.0f} of {self.max_duration:.0f} s' if math.isfinite(self.duration)
+                else f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call '
+                'finish_calibration')
 
 
 class Drive:
-    """The commands of a run that drives the robot, and the guards that end it."""
+    """The commands of a run that drives the robot, and its guards."""
 
     INTERVAL = 0.02  # time between commands, s
 
@@ -141,7 +128,6 @@ class Drive:
         self.command_lateness = self.sample_lateness = 0.0  # largest ones, s
 
     def add_sample(self, time: float) -> None:
-        """Update the lateness of samples relative to the recent least delay."""
         self.sample_lateness = max(self.sample_lateness, self._stamp_delay.add(time))
 
     def is_waiting(self, receivers: int) -> bool:
@@ -188,7 +174,7 @@ class Drive:
         return float(self._motion.rate_at(np.array(elapsed)))
 
     def describe_lateness(self, limits: RunLimits) -> str:
-        """Return a sentence on the lateness of commands and samples beyond the residual limit."""
+        """Return a sentence where commands or samples were late beyond the residual limit."""
         late = max(self.command_lateness, self.sample_lateness)
         if late * _max_rate(self._motion) <= limits.max_stretch_residual:
             return ''
@@ -202,7 +188,6 @@ def read_profile(file: str) -> Motion:
 
 
 def _max_rate(motion: Motion) -> float:
-    """Return the fastest rate of a motion, rad/s."""
     return float(np.abs(motion.rate_at(motion.time)).max())
 
 
@@ -229,14 +214,14 @@ class CalibrationSession:
     # Start
 
     def begin(self, kind: str, values: SimpleNamespace, obstacle: str = '') -> str:
-        """Begin a run by the parameters of the node; return '', or why it is refused."""
+        """Begin a run; return '', or why it is refused."""
         if self.run:
             return 'a calibration is in progress; wait for its end, or call cancel_calibration'
         if self._store.problem:
             return self._store.problem
         if kind in (ODOMETRY, TURNS) and values.calibration_drive:
-            return (f'calibration.drive drives the profile, which is no calibration by {kind}: '
-                    'set calibration.reference to profile, or calibration.drive to false')
+            return (f'calibration.drive drives the profile, not a calibration by {kind}: set '
+                    'calibration.reference to profile, or calibration.drive to false')
         motion, drives = None, kind == PROFILE and values.calibration_drive
         duration = {ODOMETRY: values.calibration_duration, REST: 15.0}.get(kind, math.inf)
         if kind == PROFILE:
@@ -248,9 +233,9 @@ class CalibrationSession:
             # less than any gyro's limit; one in deg/s that was taken for rad/s is faster
             fastest, limit = _max_rate(motion), _STOPPING_DURATION * MAX_ANGULAR_ACCELERATION
             if drives and fastest > limit:
-                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but a robot is '
-                        f'expected to stop in {_STOPPING_DURATION:g} s, as from '
-                        f'{limit / DEGREE:.0f} deg/s: correct calibration.profile_file')
+                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, faster than '
+                        f'{limit / DEGREE:.0f} deg/s, from which a robot stops in '
+                        f'{_STOPPING_DURATION:g} s: correct calibration.profile_file')
         if drives and obstacle:
             return obstacle
         now = self._clock.steady()
@@ -285,16 +270,15 @@ class CalibrationSession:
         self._command_if_due()
 
     def add_odometry(self, time: float, heading: float, rate: float) -> None:
-        """Add a heading, rad, and a rate, rad/s, of odometry."""
         if self.run:
             self.run.odometry.append((time, heading, rate))
         since = self._clock.steady() - self._stop_time
         alone = self._last_foreign_command < self._stop_time and not self._drive
         if (alone and _STOPPING_DURATION < since < 2.0 * _STOPPING_DURATION
                 and abs(rate) > 1.0 * DEGREE):
-            self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
-                            f'{since:.1f} s after it was commanded to stop: set the command '
-                            'time-out of its base, and check for other nodes that command it')
+            self.warning = (f'odom shows a turn at {rate / DEGREE:.0f} deg/s {since:.1f} s after '
+                            'the command to stop: set the command time-out of the base, and check '
+                            'for other nodes that command it')
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel; a foreign one ends a drive."""
@@ -304,12 +288,9 @@ class CalibrationSession:
                     self._pending_commands.popleft()
                 return
         self._last_foreign_command = self._clock.steady()
-        if self.run and self.run.kind == REST and velocity.is_moving:
-            self.end('another node sent a command to move on cmd_vel during the rest: stop that '
-                     'node and run again')
-        if self._drive:
-            self.end('another node sent a command on cmd_vel while the robot was driven, and '
-                     'controls the robot now: stop that node and run again')
+        if self._drive or self.run and self.run.kind == REST and velocity.is_moving:
+            self.end('another node sent a command on cmd_vel during the run, and controls the '
+                     'robot now: stop that node and run again')
         self._stop_repeat_end = -math.inf
 
     # Guards
@@ -317,11 +298,9 @@ class CalibrationSession:
     def poll(self, values: SimpleNamespace, receivers: int, is_ros_time_paused: bool = False,
              conflict: str = '') -> None:
         """
-        Send the next command of a drive, or end a run by its guards.
+        Send the next command of a drive, or end a run by its guards or a conflict, if not ''.
 
         To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
-        `receivers` is the number of other nodes that receive the commands, and `conflict` why the
-        samples cannot be used, or ''.
         """
         run, drive, now = self.run, self._drive, self._clock.steady()
         if now < self._stop_repeat_end and not drive:
@@ -338,8 +317,7 @@ class CalibrationSession:
                 usual = self._estimator.tracker.intervals.usual_interval
                 timeout = min(max(FAULT_DURATION, 4.0 * usual), run.limits.max_gap)
                 is_driven = True
-        # Decided at the second poll: after a pause of this process, queued samples are delivered
-        # after its timers.
+        # at the second poll: after a pause of this process, queued samples come after its timers
         silence = now - run.last_received
         before, self._is_silent = self._is_silent, silence > timeout
         if before and self._is_silent:
@@ -387,24 +365,23 @@ class CalibrationSession:
                     self._stop_repeat_end = self._stop_time + 1.0
 
     def finish(self) -> tuple[bool, str]:
-        """End the motion of a run by turns or by odometry."""
+        """End the motion now; return the remaining instruction for the user, or why not."""
         run = self.run
         if run is None or run.kind not in (ODOMETRY, TURNS):
             return False, 'no calibration by turns or by odometry is in progress'
         if not run.times:
-            return False, ('no sample has come since the calibration began: check the gyro and '
-                           'its driver')
+            return False, 'no sample has come so far: check the gyro and its driver'
         if run.kind == ODOMETRY and run.elapsed < MIN_ODOMETRY_DURATION:
             return False, (f'the run lasts {run.elapsed:.1f} s so far, and one by odometry '
                            f'{MIN_ODOMETRY_DURATION:g} s at least: turn both ways, and call again')
-        return True, run.finish()
+        run.duration = min(run.duration, run.elapsed)
+        return True, f'leave the robot at rest for {run.max_duration - run.elapsed:.1f} s more'
 
     def cancel(self) -> tuple[bool, str]:
         if self.run is None:
             return False, 'no calibration is in progress'
         if self.run.end_reason is not None:
-            return False, ('the calibration has just ended; its own answer states whether it is '
-                           'in use')
+            return False, 'the calibration has just ended; its answer states whether it is in use'
         self.end('cancelled')
         return True, 'cancelled; the previous calibration is in use'
 
@@ -445,16 +422,15 @@ class CalibrationSession:
 
 
 def _refuse_turn_at_rest(run: CalibrationRun) -> None:
-    """Refuse a rest in which odometry, if there is any, shows a turn."""
     if len(run.odometry) < 2:
         return
     at, headings, rates = np.array(run.odometry).T
     turned = max(float(np.mean(rates) * np.ptp(at)),
                  float(np.unwrap(headings)[-1] - headings[0]), key=abs)
     if abs(turned) > MIN_TURN_ANGLE:
-        raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
-                          f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap odom '
-                          'to an odometry of the wheels')
+        raise DataRefused(f'odom shows a turn by {turned / DEGREE:.1f} deg in {run.elapsed:.0f} s '
+                          'of rest: keep the robot still, or remap odom to an odometry of the '
+                          'wheels')
 
 
 def _find_motion(run: CalibrationRun) -> tuple[float, Motion]:
@@ -462,14 +438,12 @@ def _find_motion(run: CalibrationRun) -> tuple[float, Motion]:
     last = run.times[0] + run.duration
     rows = np.array([each for each in run.odometry if each[0] <= last])
     if len(rows) < 10:
-        raise DataRefused(
-            f'{len(rows)} messages came on odom with an orientation and a rate in '
-            f'{run.duration:.0f} s, but at least 10 are needed: check the topic, its '
-            'quaternions, which have the length 1, and its twist')
+        raise DataRefused(f'{len(rows)} messages with an orientation and a rate came on odom in '
+                          f'{run.duration:.0f} s, of 10 at least: check the topic, its '
+                          'quaternions of length 1, and its twist')
     at, headings, rates = rows.T
     if not (np.diff(at) > 0.0).all():
-        raise DataRefused('the messages on odom do not have increasing stamps: check that one '
-                          'node publishes them')
+        raise DataRefused('the stamps on odom do not increase: check that one node publishes it')
     if (covered := float(np.ptp(at))) < 0.8 * run.duration:
         raise DataRefused(f'{len(rows)} messages came on odom, but in {covered:.0f} s of '
                           f'{run.duration:.0f} s only: check that it does not stop')
@@ -488,8 +462,8 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     temperature = float(np.mean(run.temperatures)) if run.temperatures else None
     if run.kind == REST:
         if not output.any():
-            raise DataRefused('the gyro reports zero only: either it sets its output to zero at '
-                              'rest, and shows no bias, or it is dead; turn the robot to find out')
+            raise DataRefused('the gyro reports zero only: it is dead, or sets its output to zero '
+                              'at rest and shows no bias; turn the robot to find out')
         bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
         _refuse_turn_at_rest(run)
         return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date, temperature,

@@ -58,8 +58,6 @@ _UNMEASURED_AXES = (*5 * (UNMEASURED_VARIANCE, *6 * (0.0,)),)
 
 
 class _NodeClock:
-    """The clocks of a node; see `inputs.Clock`."""
-
     steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
 
     def __init__(self, node: Node):
@@ -314,7 +312,6 @@ class CompensationNode(Node):
         self._receivers = max(count - 1, 0)
 
     def _drive(self) -> None:
-        """Send the next command and check the guards of a drive."""
         self._count_receivers()
         self._pipeline.poll(self._receivers)
         self._answer_finished_run()
@@ -434,7 +431,6 @@ class CompensationReport:
             why = journal.event if 'refused_samples' in growing else 'is the driver running?'
             return ERROR, f'no samples on imu/data_raw for {silent:.0f} s: {why}'
 
-        # the warnings, the most important first
         estimator, store, monitor = pipeline.estimator, pipeline.store, pipeline.monitor
         low, high = estimator.model.valid_temperatures
         warnings = [text for name, text in {
@@ -442,8 +438,7 @@ class CompensationReport:
             'refused_samples': journal.event, 'refused_temperatures': journal.event,
             'lost_samples': 'samples are lost: check the cable, the baud rate and the load of the '
             'computer; the heading is integrated over the gaps, and its variance includes them',
-            'beyond_range': 'the rate is beyond the calibrated range; the correction is '
-            'extrapolated',
+            'beyond_range': 'the rate is beyond the calibrated range: extrapolated',
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
             f'{high:g} degC; the correction is extrapolated, and its variance increases',
         }.items() if name in growing]
@@ -451,11 +446,11 @@ class CompensationReport:
             pipeline.session.warning, pipeline.repeat_suspicion, *pipeline.faults.values(),
             pipeline.heading_loss))
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
-            warnings.append('no temperature comes; the model is used at its reference temperature '
-                            f'of {estimator.model.reference_temperature:g} degC')
+            warnings.append('no temperature comes; the reference of the model is used, '
+                            f'{estimator.model.reference_temperature:g} degC')
         elif estimator.temperature is not None and estimator.is_temperature_lost:
-            warnings.append(f'the temperature is missing; {estimator.temperature:.1f} degC, the '
-                            'last one, is held, and the standard deviation of the bias increases')
+            warnings.append(f'the temperature is missing; the last, {estimator.temperature:.1f} '
+                            'degC, is held, and the standard deviation of the bias increases')
         warnings += [f'the model needs the {channel.replace("_", " ")}, which no message '
                      'contains; that effect is left out'
                      for channel in ('supply', 'specific_force')

@@ -49,21 +49,16 @@ PARAMETERS = (
                   'that is auto.', 'bit/s', (0, MAX_BAUD)),
     NodeParameter('frame_id', 'gyro', 'Frame of the gyro, whose z is its input axis.'),
     NodeParameter('axis', 'z', 'Axis to read of a gyro with three.', choices=('x', 'y', 'z')),
-    NodeParameter('invert', 'default',
-                  'Whether the gyro counts clockwise turns positive; default is that of the '
-                  'protocol.',
-                  choices=tuple(TRISTATE)),
-    NodeParameter('increments', 'default',
-                  'Whether the gyro sends angles, not rates; default is that of the protocol.',
-                  choices=tuple(TRISTATE)),
+    NodeParameter('invert', 'default', 'Whether the gyro counts clockwise turns positive; default '
+                  'is that of the protocol.', choices=tuple(TRISTATE)),
+    NodeParameter('increments', 'default', 'Whether the gyro sends angles, not rates; default is '
+                  'that of the protocol.', choices=tuple(TRISTATE)),
     NodeParameter('sensitivity', 0.0, 'Rate of one count of the gyro; 0 is that of the protocol.',
                   'rad/s', (0.0, 100.0)),
-    NodeParameter('sample_rate', 0.0,
-                  'Samples a second that the gyro is set to; 0 is that of the protocol.', 'Hz',
-                  (0.0, 100000.0)),
-    NodeParameter('full_scale', 0.0,
-                  'Rate beyond which a sample is refused; 0 is that of the protocol.', 'rad/s',
-                  (0.0, 1000.0)),
+    NodeParameter('sample_rate', 0.0, 'Samples a second that the gyro is set to; 0 is that of the '
+                  'protocol.', 'Hz', (0.0, 100000.0)),
+    NodeParameter('full_scale', 0.0, 'Rate beyond which a sample is refused; 0 is that of the '
+                  'protocol.', 'rad/s', (0.0, 1000.0)),
     NodeParameter('columns', Settings().columns,
                   'Columns of the protocol csv, in the words of the log format.'),
     NodeParameter('samples_per_message', 1, 'The mean of this many samples is one message.', '',
@@ -75,9 +70,8 @@ class DriverNode(Node):
     """
     Publishes ``imu/data_raw``, ``imu/temperature`` and ``/diagnostics``; see `PARAMETERS`.
 
-    Stamps are those of the node's clock. With ``use_sim_time`` that is the simulated time, and the
-    system time before a simulation starts. A gyro on a port measures in real time: its rates are
-    wrong in a simulation that runs faster or slower.
+    Stamps are those of the node's clock, and the system time before a simulation starts. A gyro on
+    a port measures in real time, so its rates are wrong in a faster or slower simulation.
     """
 
     def __init__(self) -> None:

@@ -9,12 +9,11 @@
 # under the License.
 
 """
-Tests of the noise and the bias of a gyro at rest against its model.
+Tests of the noise and the bias of a gyro at rest against its model, and for repeats and pulses.
 
-Samples are collected in stretches of `REST_DURATION` s with a steady rate, as at rest. In each
-stretch the mean square of differences of neighbouring blocks is tested against the noise of the
-model, and the mean rate against zero. The levels of both tests follow from a stated rate of false
-alarms.
+Samples are collected in stretches of `REST_DURATION` s with a steady rate. In each the mean square
+of differences of blocks is tested against the noise of the model, and the mean rate against zero,
+at levels by a stated rate of false alarms.
 """
 
 from __future__ import annotations
@@ -36,22 +35,13 @@ import numpy as np
 from scipy.special import chdtr, chdtrc
 
 _PART_DURATION = 1.0  # s; of the parts of a stretch that are compared: a push shows in one
-#: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
-#: less noise in neighbouring blocks.
+#: Largest ratio of the noise of the model to the measured one, 1, as of a filtered output.
 _MAX_NOISE_REDUCTION = 3.0
 _MAX_DECELERATION = 20.0  # rad/s²; of a robot: six times the default of Nav2's controllers
-#: Height of a pulse, in medians of the steps before it, that no vibration has: 5 of 1.2 million
-#: samples of cars and turntables are higher.
-_MIN_PULSE_RATIO = 10.0
-#: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
-#: path may vibrate for some time.
-_DECIDING_STRETCHES = 3
 
 
 @dataclass(frozen=True)
 class _RestResult:
-    """The result of one stretch at rest."""
-
     noise_ratio: float  # standard deviation of the noise over that of the model
     is_noise_normal: bool  # within chance and tolerance
     bias: float  # mean rate, rad/s
@@ -64,23 +54,22 @@ class RepeatedOutputDetector:
     """
     Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
-    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the
-    noise is larger than the steps of the output, or if chance is excluded. Some gyros report
-    zero at rest: a repeated zero counts only after a deceleration that no robot has, 20
-    rad/s², unless wheels stand then, or if a whole stretch at rest had the noise of the model
-    before the first such zero. Two neighbouring codes, as of a dead gyro whose last bit
-    toggles, count if chance is excluded; zero as above. What counts does so until the value
-    changes.
+    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
+    larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
+    a repeated zero counts only after a deceleration that no robot has, unless wheels stand then,
+    or if a whole stretch at rest had the noise of the model before the first such zero. Two
+    neighbouring codes, as of a dead gyro whose last bit toggles, count if chance is excluded; zero
+    as above.
 
     A gyro with noise `is_suspected` while it repeats the value of its first sample, whose step is
-    not known, or zero against chance for the first time: it is dead, or shows that at rest. Later
-    such zeros mean that it `is_zeroed`: it has neither noise nor bias now. Where what is suspected
-    ends with an acceleration that no robot has, it was dead, unless wheels stood until then.
+    not known, or zero against chance for the first time. Later such zeros mean that it
+    `is_zeroed`: it has neither noise nor bias now. Where what is suspected ends with an
+    acceleration that no robot has, it was dead, unless wheels stood until then.
 
-    A value that was held for less time, but longer than usual and not by chance, leaves a possible
-    error of the integrated rate, `unseen_turn`, rad, with the sample that ends it; a full turn
-    where the first value shows later, by step and noise, to have been that of a dead gyro. Each
-    value is rounded to the steps of the output, by an error that lasts until the next one.
+    A value held for longer than usual, not by chance, leaves a possible error of the integrated
+    rate, `unseen_turn`, rad; a full turn where the first value shows later to have been that of a
+    dead gyro. Each value is rounded to the steps of the output, by an error that lasts until the
+    next one.
     """
 
     def __init__(self, noise: Noise):
@@ -93,7 +82,7 @@ class RepeatedOutputDetector:
         self._until = self.unseen_turn = 0.0  # last sample of this value, s
         # of the values before, rad², and standard deviation by this value so far, rad
         self._rounding_variance = self._rounded_turn = 0.0
-        # Smallest and largest value since a time, s, and the number of samples after the first.
+        # smallest and largest value since a time, s, and the number of samples after the first
         self._band = math.nan, math.nan, 0.0, 0
 
     def add(self, time: float, output: float, odometry_rate: float,
@@ -101,8 +90,8 @@ class RepeatedOutputDetector:
         """
         Add a sample, s and rad/s, and tell if it is repeated.
 
-        The rate by odometry, rad/s, is 0 without any; `stands` is whether wheels show standstill,
-        `rests` whether they or the statistics of the rate do.
+        The rate by odometry, rad/s, is 0 without any; wheels show that the robot `stands`, or the
+        statistics of the rate that it `rests`.
         """
         step = abs(output - self._value)
         if step:
@@ -161,8 +150,7 @@ class RepeatedOutputDetector:
             usual, held = self._holds.usual_interval, self._until - self._since
             # a chance of e^-20 is once in 50 days at 100 Hz
             if self._excludes_chance(self._step, held / usual, usual, 20.0):
-                # the mean square of a rate that goes on linearly, or changes at once, and a turn
-                # meanwhile
+                # the mean square of a rate that goes on linearly or changes at once, and a turn
                 self.unseen_turn = math.hypot(
                     math.hypot(step, self._last_step) * (held + usual) / math.sqrt(3.0),
                     0.25 * MAX_ANGULAR_ACCELERATION * (held + usual) ** 2)
@@ -190,23 +178,15 @@ class RepeatedOutputDetector:
         return self._rounding_variance + self._rounded_turn ** 2
 
     def reset_heading(self) -> None:
-        """Let the heading be exact now."""
         self._rounding_variance = self._rounded_turn = 0.0
 
     @property
     def has_changed(self) -> bool:
-        """Tell whether a second value came."""
         return self._changes > 1
 
     def _excludes_chance(self, width: float, count: float, interval: float,
                          level: float = 100.0) -> bool:
-        """
-        Tell whether a live gyro cannot have `count` samples within a width, rad/s.
-
-        The noise of a sample, of an interval in s, may be lower than that of the model. The
-        probability must be below e^-level: e^-100, since it is e^-25 for a gyro that sends each
-        sample four times.
-        """
+        """Tell whether chance is below e^-level for samples of noise within a width, rad/s."""
         if not (sample := self._noise.angle_random_walk / math.sqrt(interval)):
             return False
         stays = math.erf(_MAX_NOISE_REDUCTION * width / (2.0 * math.sqrt(2.0) * sample))
@@ -218,7 +198,7 @@ class PulseDetector:
     Detector of samples that deviate from those before and after as no rate of a robot does.
 
     A pulse begins with a step of more than 20 rad/s² and ten times the median one of the last 2 s,
-    and ends with such a step back, at most 0.25 s later: a fast turntable swings in 0.5 s.
+    and ends with such a step back, at most 0.25 s later.
     """
 
     def __init__(self) -> None:
@@ -238,7 +218,8 @@ class PulseDetector:
         if self._steps and not 0.0 <= time - self._median_time < 0.05 * RECENT_DURATION:
             self._median_time = time
             self._median_step = float(np.median([size for _, size in self._steps]))
-        is_jump = abs(step) > _MAX_DECELERATION * interval + _MIN_PULSE_RATIO * self._median_step
+        # 5 of 1.2 million samples of cars and turntables are higher than ten medians
+        is_jump = abs(step) > _MAX_DECELERATION * interval + 10.0 * self._median_step
         found = 0.0, 0
         if self._pulse and not 0.0 <= time - self._pulse[1] <= FAULT_DURATION:
             self._pulse = None
@@ -257,21 +238,16 @@ class PulseDetector:
 
 
 class HealthMonitor:
-    """
-    Monitor of noise and bias at rest on a robot.
-
-    The alarms are a sentence each, or ''; `examined_count` is the number of stretches at rest, and
-    `has_noise_at_rest` tells whether one had the noise and the bias of the model.
-    """
+    """Monitor of noise and bias at rest on a robot; its alarms are a sentence each, or ''."""
 
     def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0,
                  largest_bias: float = math.inf):
         """
-        Start without samples; `noise` is that of the model.
+        Take the noise of the model, the largest rate of false alarms, 1/h, and rates in rad/s.
 
-        The largest rate of false alarms at rest is in 1/h. Means below the standstill rate, rad/s,
-        are rest; one above may be a steady turn, and counts only if it stays in several stretches,
-        and, unless a rest is known otherwise, is below the largest bias, rad/s.
+        Means below the standstill rate are rest; one above may be a steady turn, and counts only
+        if it stays in several stretches, and, unless a rest is known otherwise, is below the
+        largest bias.
         """
         self._noise, self.standstill_rate = noise, standstill_rate
         self._largest_bias = largest_bias
@@ -279,7 +255,8 @@ class HealthMonitor:
         self._level = 0.25 * false_alarm_rate * REST_DURATION / 3600.0
         self.is_enabled = noise.angle_random_walk > 0.0 and self._level > 0.0
         self._samples: list[tuple[float, float, float]] = []
-        self._rests: list[_RestResult] = []
+        # in a row, which decide in a rest that was not announced: a robot may vibrate
+        self._rests = deque[_RestResult](maxlen=3)
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
         self.last_rest: _RestResult | None = None
@@ -290,7 +267,6 @@ class HealthMonitor:
         self._samples = []
 
     def reset_biases(self) -> None:
-        """Discard past biases after a new calibration."""
         self.restart()
         self._rests.clear()
         self.bias_alarm = ''
@@ -304,11 +280,7 @@ class HealthMonitor:
 
     def examine_stretch(self, bias_variance: float, age: float, is_announced: bool,
                         is_resting: bool = False) -> _RestResult | None:
-        """
-        Test the complete stretch as `examine_stretch` does, and start the next one.
-
-        A rest is announced by a run, or shown by wheels or tracker; else the robot may turn.
-        """
+        """Test the complete stretch, and start the next; a run announces a rest."""
         # the last sample is alone in its part, and may be the first of a turn
         time, output, rate = np.array(self._samples[:-1]).T
         self.restart()
@@ -323,19 +295,18 @@ class HealthMonitor:
         self.has_noise_at_rest = (
             self.has_noise_at_rest or rest.is_noise_normal and rest.is_bias_normal
             and 1.0 / _MAX_NOISE_REDUCTION < rest.noise_ratio < _MAX_NOISE_REDUCTION)
-        self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
-        last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
+        self._rests.append(rest)
+        last, several = self._rests, len(self._rests) == self._rests.maxlen
         # the mean was the same in the last stretches, unlike in turns
         biases = [each.bias for each in last]
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
         if rest.is_noise_normal:
             self.noise_alarm = ''
         elif is_announced or several and not any(each.is_noise_normal for each in last):
-            remedy = ('record a log at rest, and run allan or diagnose on it'
-                      if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = '' if is_announced or rest.noise_ratio < 1.0 else ', or the robot vibrates'
+            remedy = (': check that the gyro responds to turns' if rest.noise_ratio < 1.0 else
+                      ', unless the robot vibrates: record a log at rest, and run allan on it')
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
-                                f'model{shaken}: {remedy}')
+                                f'model{remedy}')
         if rest.is_bias_normal:
             self.bias_alarm = ''
         elif (is_announced or abs(rest.bias) < self.standstill_rate
@@ -353,15 +324,12 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
                     step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0
                     ) -> _RestResult | None:
     """
-    Test a stretch of samples against noise and bias of a model.
-
-    A coarsely quantized output does not show the noise: the tests allow for the error by rounding.
+    Test a stretch of samples against noise and bias of a model; None where it tells nothing.
 
     Time, output and rate, after model and self-calibration, are in s and rad/s, of shape (n,); the
     level is the probability of each of the four false alarms, the step that of the quantization,
     rad/s, inf where the output never changed. The variance of the bias, (rad/s)², is that of its
-    calibration of an age in s, nan where it is not known. Return None where the rate is not
-    steady, samples are too few, or values are too large.
+    calibration of an age in s, nan where it is not known.
     """
     if max(np.abs(output).max(), np.abs(rate).max()) > MAX_MAGNITUDE:
         return None  # the squares may overflow

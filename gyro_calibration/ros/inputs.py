@@ -8,12 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""
-What a node takes from outside, without rclpy: parameters, clocks, motion of the wheels.
-
-Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
-ROS time, which may be paused. The motion is that of odometry and commands of the last second.
-"""
+"""What a node takes from outside, without rclpy: parameters, clocks, motion of the wheels."""
 
 from __future__ import annotations
 
@@ -112,22 +107,21 @@ class StampDelay:
     """
     Delay of stamps behind the clock of a node, and tests whether both advance equally.
 
-    `unknown_turn` is the largest error of a heading by the stamps so far, rad. Transport and a
-    busy computer delay samples, but the least delay in the longest duration follows the stamps.
-    Its changes, less the mean one so far since the clock of a gyro may drift, are time that the
-    heading has missed or counted twice, at the rate of that moment.
+    Transport and a busy computer delay samples, but the least delay in the longest duration
+    follows the stamps. Its changes, less the mean one since the clock of a gyro may drift, are
+    time that the heading has missed or counted twice, with an error of up to `unknown_turn`, rad.
     """
 
     def __init__(self, clock: Clock, window: float, *tolerances: tuple[float, float]):
         """
-        Start without samples.
+        Compare with the delays of a window, s, by tolerances, the shortest duration first.
 
-        The test compares with the delays of a window, s. A tolerance is a duration, s, the
-        shortest one first, in which some samples are not late, and a change of their delay, s.
+        A tolerance is a duration, s, in which some samples are not late, and a change of their
+        delay, s.
         """
         self._clock, self._window, self._tolerances = clock, window, tolerances
-        # Time of arrival and delay, s, and heading, rad, of samples with less delay than any after
-        # them; those of the least delay when the first duration was over, and at present.
+        # time of arrival and delay, s, and heading, rad, of samples with less delay than any after
+        # them; those of the least delay when the first duration was over, and at present
         self._min_delays = deque[tuple[float, float, float]]()
         self._begin: tuple[float, float, float] | None = None
         self._least = -math.inf, math.nan, math.nan
@@ -147,7 +141,6 @@ class StampDelay:
         return now - time - self.min_delay
 
     def _use_least(self) -> None:
-        """Compare the least delay with that before."""
         (then, delay, heading), self._least = self._least, self._min_delays[0]
         now, late, turned = self._least
         self._first_time = min(self._first_time, now)
@@ -193,29 +186,25 @@ class StampDelay:
                 # the clocks of gyros are up to 3 % off
                 if abs(late - early) > factor * tolerance + 0.05 * elapsed:
                     return ('this computer was busy, or the clock of the driver is wrong: the '
-                            'stamps on imu/data_raw advanced by '
-                            f'{elapsed - late + early:.2f} s in {elapsed:.2f} s; reduce the load, '
-                            'or check that clock and use_sim_time')
+                            f'stamps on imu/data_raw advanced by {elapsed - late + early:.2f} s '
+                            f'in {elapsed:.2f} s; check load, clock and use_sim_time')
         if self._min_delays and not (
                 self._earlier and now - self._earlier[-1][0] < self._tolerances[-1][0]):
             self._earlier.append((now, least))
         return ''
 
 
-_STEADY_STAMPS = 24  # late ones at equal intervals, which have a clock of their own
-
-
 class ArrivalOrder:
     """
     Order of the stamps of one publisher, of which some may come late: after a later one.
 
-    Three late ones in a row are those of a clock that was set back. Late ones at equal intervals,
-    up to a factor of two, while others come in between are of a second gyro.
+    Three late ones in a row are of a clock that was set back. Late ones at equal intervals, up to
+    a factor of two, while others come in between are of a second gyro.
     """
 
     def __init__(self) -> None:
         self.has_two_clocks, self._last, self._late_in_a_row = False, -1, 0
-        self._late = deque[int](maxlen=_STEADY_STAMPS)  # stamps, ns
+        self._late = deque[int](maxlen=24)  # stamps, ns
 
     def is_late(self, stamp: int) -> bool:
         """Add a stamp, ns, and tell whether it is late; not if its clock was set back."""
@@ -227,25 +216,22 @@ class ArrivalOrder:
             return False
         self._late.append(stamp)
         apart = np.diff(self._late)
-        self.has_two_clocks = bool(len(self._late) == _STEADY_STAMPS
+        self.has_two_clocks = bool(len(self._late) == self._late.maxlen
                                    and 0 < apart.max() < 2 * apart.min())
         return True
 
 
 class RosTime:
-    """Whether ROS time advances."""
 
     def __init__(self) -> None:
-        # time since its last advance, s of the steady clock; 0 where it is not simulated, inf
-        # before a simulation starts
+        # since its last advance, s; 0 where it is not simulated, inf before a simulation starts
         self.paused_duration = 0.0
         self._last: float | None = -1.0
         self._last_change = self._last_poll = 0.0
 
     def poll(self, clock: Clock) -> None:
         """Compare with the last poll; to be called by one timer."""
-        # Only the time up to that poll counts: after a pause of this process, queued messages of
-        # /clock are delivered after its timers.
+        # only up to that poll: after a pause of this process, /clock comes after its timers
         now, time = clock.steady(), clock.simulated()
         if time != self._last:
             self._last, self._last_change, self._last_poll = time, now, now
@@ -261,9 +247,6 @@ MAX_VELOCITY_AGE = 1.0  # largest age of a velocity that is used, s; slower odom
 #: Longest motion after the last command to move, s: the default time-out of ros2_control's
 #: diff_drive_controller.
 COASTING_DURATION = 0.5
-#: Largest speeds of wheels at standstill, m/s and rad/s: what turns slower adds to the bias at
-#: rest, 0.011 deg/s at most.
-_STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 #: Least rate of a turn by odometry, rad/s: 2.9 deg/s, beyond the bias of a gyro.
 MIN_ODOMETRY_TURN_RATE = 0.05
 #: Angular acceleration between two samples, rad/s²: the default of Nav2's controllers.
@@ -280,9 +263,9 @@ class Velocity:
 
     @property
     def is_moving(self) -> bool:
-        """Tell whether it exceeds the speeds at standstill."""
-        return (any(abs(part) > _STANDSTILL_SPEED for part in self.linear)
-                or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
+        # what turns slower adds 0.011 deg/s at most to the bias at rest
+        return (any(abs(part) > 0.001 for part in self.linear)
+                or any(abs(part) > 0.0002 for part in self.angular))
 
 
 class TurnComparison:
@@ -290,14 +273,13 @@ class TurnComparison:
     Comparison of the turns by the gyro with those by odometry or commands, a radian at a time.
 
     Turns contradict each other where two in a row have opposite signs by odometry, or a ratio
-    beyond the geometric mean of 1 and that of deg/s to rad/s. A smaller ratio may be a slip of the
-    wheels; a robot may be turned by others than the commands, or scale them. So against commands
-    the rate by the gyro counts as well: that of a robot is about 1 rad/s, and of as wide a
-    distribution as the ratio. Then the product of both must exceed 57.3 rad/s.
+    beyond the geometric mean of 1 and that of deg/s to rad/s. As a robot may be turned by others
+    than the commands, or scale them, the ratio by commands times the rate by the gyro, usually
+    about 1 rad/s, must exceed 57.3 rad/s.
 
     The sensitivity of the gyro is wrong where it turns further than odometry from one standstill
-    to the next, twice in a row and by more than the largest scale factor error that a calibration
-    accepts: wheels that slip turn further than the gyro.
+    to the next, twice in a row and by more than the largest scale factor error of a calibration:
+    wheels that slip turn further than the gyro.
     """
 
     def __init__(self) -> None:
@@ -313,11 +295,7 @@ class TurnComparison:
 
     @property
     def turn_at_rest(self) -> tuple[float, float, float]:
-        """
-        Return duration, s, and turn by the gyro, rad, while odometry shows standstill.
-
-        The least rate in a second of it, rad/s, follows: a push is over, a bias is not.
-        """
+        """Return duration, s, turn, rad, and least rate in a second, at standstill."""
         # two seconds pass before a robot stands, and one until a late odometry shows its turn
         if len(self._at_rest) < 4:
             return 0.0, 0.0, 0.0
@@ -360,7 +338,6 @@ class TurnComparison:
             self._by_wheels = self._by_gyro = self._path = self._duration = 0.0
 
     def _check(self, name: str, fault: str) -> None:
-        """Take what a turn shows of a fault, or ''."""
         before, self._last_faults[name] = self._last_faults[name], fault
         self.faults[name] = fault and before and f'the gyro turns by {fault}'
 
@@ -379,12 +356,11 @@ class AlternateTurns:
     """
     Comparison of the turns by every other sample, and by those between, half a radian at a time.
 
-    Both turns are equal, of samples of a single gyro. They contradict each other where they differ
-    by more than the largest scale factor error that a calibration accepts, in the same proportion
-    in turns of a row whose sense changes twice: samples of another gyro, with another axis or
-    without a function, have the same topic and frame. A vibration near half the sample rate has
-    the opposite proportion in the other sense. Turns of less than 0.025 rad/s do not count, as the
-    biases of the two may differ.
+    Both are equal, of samples of a single gyro. They contradict each other, as with another gyro
+    on the topic, where they differ by more than the largest scale factor error of a calibration,
+    in the same proportion in turns of a row whose sense changes twice: a vibration near half the
+    sample rate has the opposite proportion in the other sense. Turns of less than 0.025 rad/s do
+    not count, as the biases of the two may differ.
     """
 
     def __init__(self) -> None:

@@ -11,15 +11,11 @@
 """
 Processing of the compensation node, without rclpy: samples, wheels, time and conflicts.
 
-Inputs are samples, temperatures, odometry and commands with their stamps; outputs are corrected
-rates and headings. Stamps are nanoseconds since 1970 or of a simulation; guards and time-outs use
-the steady clock.
+Stamps are nanoseconds since 1970 or of a simulation; guards and time-outs use the steady clock.
 
 Two publishers are detected by their stamps: a sample of a second one divides an interval so that
 one part is at most half of it. Two such intervals while the graph lists several publishers are the
-proof. The graph alone is not, since it lists a killed driver for up to 20 s. Of one publisher a
-stamp that jumps back is that of a late sample, of a second gyro, or of a clock that was set; see
-`ArrivalOrder`.
+proof. The graph alone is not, since it lists a killed driver for up to 20 s.
 """
 
 from __future__ import annotations
@@ -73,8 +69,7 @@ PARAMETERS = (
     NodeParameter('assumed.bias', Assumptions.bias,
                   'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
     NodeParameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
-                  'Standard deviation of the scale factor error without a calibration.', '1',
-                  (0.0, 1.0)),
+                  'Standard deviation of the scale factor error, likewise.', '1', (0.0, 1.0)),
     NodeParameter('assumed.bias_temperature_coefficient', Assumptions.bias_temperature_coefficient,
                   'Standard deviation of the change of the bias with temperature; 0 for a gyro '
                   'that compensates it.', 'rad/s/K', (0.0, 0.1)),
@@ -102,8 +97,6 @@ _INTERLEAVING_WINDOW = 1.0  # s; two changes of the frame in it show several pub
 
 
 class CorrectedSample(NamedTuple):
-    """A corrected sample."""
-
     stamp: int  # ns
     heading: float  # rad
     heading_variance: float  # rad²; as not measured where the noise of the gyro is unknown
@@ -117,8 +110,6 @@ COUNT_NAMES = ('samples', 'refused_samples', 'refused_temperatures', 'lost_sampl
 
 @dataclass
 class _Journal:
-    """Events and counts so far."""
-
     last_received: float  # time of the last sample, s of the steady clock
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNT_NAMES, 0))
     event: str = ''  # the last one
@@ -151,8 +142,7 @@ class Pipeline:
             TrackerSettings(0.1 if method == 'rest' else 0.0, Threshold(
                 self._standstill_rate, angle_random_walk=noise.angle_random_walk),
                 values.maximum_gap), clock.date())
-        # false alarms: 0.001 per hour of rest
-        # three deviations of the bias of an uncalibrated gyro
+        # false alarms per hour of rest, and three deviations of the bias of an uncalibrated gyro
         self.monitor = HealthMonitor(noise, 0.001, self._standstill_rate,
                                      3.0 * values.assumed_bias)
         self.wheels, self.journal = Wheels(), _Journal(clock.steady())
@@ -173,7 +163,7 @@ class Pipeline:
         self.publisher_conflict, self._interleaved_count = '', 0
         self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
-        # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
+        # begin of samples with a repeated stamp, s, and the largest rate among them, rad/s
         self._frozen_stamp: tuple[float, float] | None = None
         # that the gyro is dead, or may be so
         self.repeat_fault = self.repeat_suspicion = ''
@@ -183,13 +173,13 @@ class Pipeline:
         self.stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
         self._odometry_lateness = -math.inf, 0.0  # when it came, and its lateness, s
-        # Odometry heading when its rate became zero, rad, and times of the last odometry and of a
-        # contradiction, s.
+        # odometry heading when its rate became zero, rad, and times of the last odometry and of a
+        # contradiction, s
         self._heading_at_rest = self._odometry_time = math.nan
         self._contradiction_time, self._is_motion_shown = -math.inf, False
         self._turns, self._alternate_turns = TurnComparison(), AlternateTurns()
-        # Time until which gyro and odometry agreed at standstill, s, whether it stands, and the
-        # possible error of the heading and the turn by the gyro since then, rad.
+        # time until which gyro and odometry agreed at standstill, s, whether it stands, and the
+        # possible error of the heading and the turn by the gyro since then, rad
         self._agreed_time, self._stood, self._false_turn = math.inf, False, (0.0, 0.0)
         self._recent_rates, self._known_beginnings = deque[tuple[float, float]](), 0
 
@@ -312,8 +302,7 @@ class Pipeline:
         if not self._noise_is_known or self.heading_variance < math.tau ** 2:
             return ''
         event = self.journal.event or 'the errors of scale factor and bias have added up'
-        return (f'the heading is unknown (the last event: {event}): call reset_heading where it '
-                'is to be zero')
+        return f'the heading is unknown ({event}): call reset_heading where it is to be zero'
 
     @property
     def _is_odometry_contradictory(self) -> bool:
@@ -334,9 +323,9 @@ class Pipeline:
                 'topic: give each gyro a topic of its own'),
             **self._turns.faults,
             'stamp': (turned > MIN_TURN_ANGLE) * (
-                f'the heading may be off by {turned / DEGREE:.1f} deg, since the stamps on '
-                'imu/data_raw advanced faster or slower for a time than before: check that the '
-                'driver stamps by a clock and loses no samples, then reset the heading'),
+                f'the heading may be off by {turned / DEGREE:.1f} deg, since the pace of the '
+                'stamps on imu/data_raw has changed: check that the driver stamps by a clock and '
+                'loses no samples, then reset the heading'),
             'odometry_clock': (abs(late) > MAX_VELOCITY_AGE >= self._clock.steady() - came) * (
                 f'odom is stamped {abs(late):.1f} s {"behind" if late > 0.0 else "ahead of"} '
                 'imu/data_raw: stamp both by one clock, or synchronize those of their computers'),
@@ -361,8 +350,7 @@ class Pipeline:
         Return a sample corrected, or None where it cannot be used.
 
         The stamp is in ns, the output in rad/s, and the specific force along the input axis in
-        m/s², which counts as missing where it is not plausible; `receivers` is the number of other
-        nodes that receive cmd_vel.
+        m/s²; `receivers` is the number of other nodes that receive cmd_vel.
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
@@ -376,8 +364,8 @@ class Pipeline:
         if self.publisher_conflict:
             self._order = ArrivalOrder()
         elif self._order.is_late(stamp) and frame == self._frame:
-            journal.event = ('a sample came after the next one and is not used: the connection to '
-                             'the driver changes their order')
+            journal.event = ('a sample came after the next one and is not used: the connection '
+                             'to the driver changes their order')
             if self._order.has_two_clocks:
                 self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
             return None
@@ -429,7 +417,7 @@ class Pipeline:
         if time == self._last_time:
             self._frozen_stamp = first, max(fastest, abs(output))
             self.journal.event = (f'several samples have the stamp {text}, and only the first is '
-                                  'used: check that the driver stamps each when the gyro measures')
+                                  'used: let the driver stamp each when the gyro measures')
             return True
         self._frozen_stamp = None
         if lasts > FAULT_DURATION:
@@ -450,9 +438,9 @@ class Pipeline:
                     'imu/data_raw'))
         if not self.publisher_conflict:
             return
-        # Samples that follow too soon, or go back, are not of the same publisher. A restarted
-        # driver that sends twice as fast as before is refused while the middleware lists the
-        # killed one. Delayed samples also follow too soon, until they have caught up.
+        # Samples that follow too soon, or go back, are not of the same publisher; nor, while the
+        # middleware lists a killed driver, of one that sends twice as fast. Delayed samples also
+        # follow too soon, until they have caught up.
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
         interval, behind = stamp - self._last_stamp, self._backlog
         self._backlog = 0.0 if silence > FAULT_DURATION else min(
@@ -470,11 +458,7 @@ class Pipeline:
 
     def _integrate(self, time: float, interval: float, silence: float, output: float,
                    force: float | None, now: float) -> bool:
-        """
-        Compensate and integrate a sample, and tell whether it was used.
-
-        Interval and silence are from the sample before, by stamps and by arrivals, s.
-        """
+        """Use a sample, an interval by stamps and a silence, s, after the last; tell if it was."""
         estimator, journal, refused = self.estimator, self.journal, self.estimator.refused_count
         counts, lost = journal.counts, estimator.tracker.intervals.lost_samples
         wheels = self.values.wheels
@@ -625,7 +609,7 @@ class Pipeline:
         """Update bias table and files; to be called once per second, and at the end."""
         if self._clock.simulated() is None:
             self._update_host_clock()
-        # Two faults in a row: delayed samples come in a burst, and are late until then.
+        # two faults in a row: delayed samples come in a burst, and are late until then
         before = self._suspected_clock_fault
         self._suspected_clock_fault = self.stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
@@ -634,8 +618,7 @@ class Pipeline:
         if added > 0.01 * tracker.variance:  # else the deviation changes by less than 0.5 %
             tracker.add_unknown_turn(math.sqrt(added))
             self._stamp_turn = unknown
-        faults = self.faults
-        if any(faults[name] for name in ('clock', 'frame', 'turn', 'alternation')):
+        if any(map(self.faults.get, ('clock', 'frame', 'turn', 'alternation'))):
             tracker.add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):

@@ -61,11 +61,9 @@ class RecorderNode(Node):
 
     @property
     def missing_topics(self) -> list[str]:
-        """Return the requested topics without a publisher so far."""
         return [topic for topic in self._roles if topic not in self._taken]
 
     def poll(self) -> None:
-        """Subscribe to new topics in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
             if topic not in self._roles or not (
                     publishers := self.get_publishers_info_by_topic(topic)):
@@ -93,9 +91,8 @@ class RecorderNode(Node):
                             else DurabilityPolicy.VOLATILE)))
 
     def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> Subscription:
-        # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
-            self.message_count += 1
+            self.message_count += 1  # the steady clock does not jump
             received = self._clock_offset + round(read_steady_clock() * NSEC_PER_SEC)
             self._on_message(self._roles[topic], Message(topic, kind, received, bytes(data)))
         # of a type that `topic_type_fault` has accepted: other nodes choose no module
@@ -114,9 +111,8 @@ def take_messages(roles: Mapping[str, str], on_message: Callable[[str, Message],
     """
     Receive the messages of topics, each with a role of `topic_type_fault`, until an event is set.
 
-    `on_message` is called with the role and each message, and `tick` at least every 50 ms with the
-    node. Raise `LogError` where a topic name is not valid, a topic has another type than its role
-    wants, or ROS 2 cannot be started, as with an invalid ROS_DOMAIN_ID.
+    `tick` is called at least every 50 ms. Raise `LogError` where a topic has an invalid name or
+    another type than its role wants, or ROS 2 cannot be started.
     """
     context = rclpy.Context()
     domain = os.environ.get('ROS_DOMAIN_ID', '')

@@ -9,14 +9,10 @@
 # under the License.
 
 """
-Common functions of nodes: parameters, QoS of topics, diagnostics, start and shutdown.
+Start and end of nodes, and what all of them declare and publish.
 
-A node is a subclass of `rclpy.node.Node` that declares its table of parameters in its constructor
-and joins its threads in `destroy_node`. Its ``main`` is ``return run_node(TheNode)``.
-
-Signals set an event, the loop of `spin_once` ends, threads are joined, and then the node is
-destroyed. The handlers of rclpy invalidate the context while a callback still publishes, which
-ends some runs in a traceback.
+Signals set an event, the loop of `spin_once` ends, `destroy_node` joins threads. The handlers of
+rclpy invalidate the context while a callback still publishes, which ends some runs in a traceback.
 """
 
 from __future__ import annotations
@@ -46,8 +42,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-#: Of subscriptions to samples: best effort, compatible with every publisher (REP-2003). The depth
-#: covers callbacks that are busy for 5 s at 1 kHz.
+#: Of subscriptions to samples: compatible with every publisher (REP-2003), for 5 s at 1 kHz.
 SENSOR_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT,
                         durability=DurabilityPolicy.VOLATILE)
 #: Of published samples: reliable, compatible with every subscriber (REP-2003).
@@ -56,8 +51,7 @@ PUBLISHED_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE,
 #: Of a state: the last message is kept for late subscribers.
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
-#: Longest time of the shutdown of a node, s; then it is killed.
-SHUTDOWN_TIMEOUT = 10.0
+SHUTDOWN_TIMEOUT = 10.0  # s; then a node is killed
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values by name
@@ -65,8 +59,7 @@ Report = tuple[bytes, str, Mapping[str, object]]  # level, sentence and values b
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
     """Return a publisher whose quality of service parameters may override."""
-    # By default rclpy checks each topic for incompatible QoS at every wake-up, which costs 2 % of
-    # a core per topic at 1 kHz. Here every QoS is compatible.
+    # every QoS here is compatible; to check it at each wake-up costs 2 % of a core at 1 kHz
     return node.create_publisher(
         kind, topic, qos, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
@@ -85,10 +78,9 @@ def declare_parameters(
         node: Node, table: Sequence[NodeParameter],
         on_change: Callable[[SimpleNamespace], None] | None = None) -> SimpleNamespace:
     """
-    Declare the parameters of a table and return their values as one record.
+    Declare a table of parameters, and return their values as one record.
 
-    `on_change` is called with the record of all values after a change. `ValueError` says in a
-    sentence that an override has the wrong type or is out of range.
+    `on_change` is called with the new record after a change. `ValueError` names a wrong override.
     """
     known = {each.name: each for each in table}
 
@@ -136,8 +128,7 @@ def declare_parameters(
 
 def call_every(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Create a timer with a period, s, of the steady clock."""
-    # Timers of the node's clock, the default of rclpy, stop for an hour when that clock is set
-    # back by an hour, and while a simulation is paused.
+    # timers of the node's clock stop when it is set back, and while a simulation is paused
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
@@ -174,10 +165,10 @@ class Diagnostics:
 
 def run_node(node_class: Callable[[], Node]) -> int:
     """
-    Start a node, spin it until SIGINT, SIGTERM or SIGHUP, and return the exit code of the process.
+    Spin a node until SIGINT, SIGTERM or SIGHUP; return the exit code of the process.
 
-    It is 0 after a signal, and 2 where an argument or a parameter was refused, with a sentence on
-    standard error.
+    It is 0 after a signal, and 2, with a sentence on standard error, where the node refused a
+    value.
     """
     stop = threading.Event()
     handle_end_signals(lambda *_: stop.set())
@@ -185,8 +176,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
         try:
             rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
             node = node_class()
-        # rclpy raises RuntimeError where an argument cannot be parsed, and ParameterException
-        # where a parameter of its own is not possible
+        # rclpy raises RuntimeError for an argument, ParameterException for a parameter of its own
         except (ValueError, OSError, RuntimeError, ParameterException) as error:
             print(f'{node_class.__name__}: {error}', file=sys.stderr)
             return 2
@@ -209,16 +199,14 @@ def spin(node: Node, stop: threading.Event) -> None:
     """Serve the callbacks of a node until an event is set, then close it."""
     serving: Executor
     try:
-        # This executor takes half of the processor time. Before rclpy 7.1.11 (Jazzy) it has no
-        # ``async`` callbacks and no message information; the nodes use neither.
+        # it takes half of the processor time; before rclpy 7.1.11 it has no ``async`` callbacks
         from rclpy.experimental import EventsExecutor
         serving = EventsExecutor()
     except ImportError:  # Humble
         serving = SingleThreadedExecutor()
     serving.add_node(node)
     try:
-        # The timers of a node end the wait of SingleThreadedExecutor, for which a time-out would
-        # be one more timer at each message; EventsExecutor returns only with a time-out.
+        # the timers of a node end the wait of SingleThreadedExecutor, not that of EventsExecutor
         timeout = None if isinstance(serving, SingleThreadedExecutor) else 0.2
         while not stop.is_set():
             serving.spin_once(timeout_sec=timeout)
@@ -226,8 +214,7 @@ def spin(node: Node, stop: threading.Event) -> None:
         pass  # rclpy was shut down elsewhere
     finally:
         serving.shutdown()
-        # Fast DDS 2.14 can deadlock, with the GIL held, when two nodes end at the same time, as
-        # after Ctrl-C.
+        # Fast DDS 2.14 can deadlock, with the GIL held, when two nodes end at the same time
         faulthandler.dump_traceback_later(SHUTDOWN_TIMEOUT, exit=True)
         node.destroy_node()
         faulthandler.cancel_dump_traceback_later()

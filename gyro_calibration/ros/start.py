@@ -36,7 +36,6 @@ def start_compensation() -> int:
 
 
 def _start(name: str) -> int:
-    """Import the module of a node, and return the exit code of its `main`."""
     handle_end_signals(lambda *_: os._exit(0))  # nothing runs yet that had to be closed
     node: Any = import_module(f'gyro_calibration.ros.{name}')
     code: int = node.main()

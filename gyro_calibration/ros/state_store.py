@@ -11,8 +11,8 @@
 """
 The state of a robot in files: the gyro model, the last self-calibration, biases at rest.
 
-The calibration file is a complete model file with the effects that were in use at the calibration.
-If they differ from the model in use, the self-calibration is not used.
+The calibration file is a model file with the effects that were in use at the calibration. If they
+differ from the model in use, the self-calibration is not used.
 """
 
 from __future__ import annotations
@@ -36,18 +36,12 @@ class StateStore:
     """
     The files of one gyro: its model, empty if it cannot be read, and its table of biases at rest.
 
-    `problem` says why the rates are uncalibrated, `calibration_hint` and `table_hint` a fault of
-    the calibration file and of the table, `shared_hint` that another process has written to a
-    file, each in a sentence or ''. `table_written_time` is in s since 1970, None before the first.
+    `problem` says why the rates are uncalibrated; each hint names a fault of a file, or is ''.
     """
 
     def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior,
                  max_bias: float = RunLimits.max_bias):
-        """
-        Read the files, and use those without a fault.
-
-        A model with a bias beyond the largest one, rad/s, is a fault.
-        """
+        """Read the files; a model with a bias beyond the largest one, rad/s, is a fault."""
         self._max_bias = max_bias
         self._calibration_file, self._bias_file = calibration_file, bias_file
         self.problem = self.calibration_hint = ''
@@ -67,23 +61,20 @@ class StateStore:
             found = _existing_version(file)
             if found is not None and found != seen:
                 self.shared_hint = to_printable(
-                    f'{file} was written by another process, and the next writer replaces it: '
-                    'give each node a calibration_file of its own, or restart this one to use '
-                    'that file')
+                    f'{file} was written by another process: give each node a calibration_file '
+                    'of its own, or restart this one to use that file')
 
     def _load_model(self, model_file: str) -> GyroModel:
         model = GyroModel()
-        if model_file:
-            try:
+        try:
+            if model_file:
                 read = read_model(os.path.expanduser(model_file))
-                try:
-                    refuse_implausible_model(read, self._max_bias)
-                except InvalidValue as error:
-                    raise ModelError(f'{model_file}: {error}') from None
+                refuse_implausible_model(read, self._max_bias)
                 model = read
-            except ModelError as error:
-                self.problem = f'uncalibrated: {error}'
-                return model
+        except (ModelError, InvalidValue) as error:
+            named = '' if isinstance(error, ModelError) else f'{model_file}: '
+            self.problem = f'uncalibrated: {named}{error}'
+            return model
         try:
             stored = read_model(self._calibration_file)
         except ModelNotFound:
@@ -98,9 +89,8 @@ class StateStore:
         elif not have_same_effects(stored, model):
             fault = 'it belongs to another model'
         elif theirs != ours:
-            of = (f'the gyro with the serial number {theirs}' if theirs
-                  else 'a gyro without a serial number')
-            fault = f'it belongs to {of}, and the model to {ours or "one without"}'
+            fault = (f'it belongs to the gyro with the serial number {theirs or "(none)"}, and '
+                     f'the model to {ours or "(none)"}')
         if fault:
             self.calibration_hint = to_printable(
                 f'the self-calibration in {self._calibration_file} is not used: {fault}; '
@@ -136,18 +126,13 @@ class StateStore:
             self._file_versions[self._bias_file] = written
         except OSError as error:
             self.table.mark_write(now, is_written=False)
-            self.table_hint = to_printable('the bias table cannot be written '
+            self.table_hint = to_printable(f'the bias table cannot be written '
                                            f'({describe_error(error)}): '
                                            f'{remedy(error, self._bias_file)}')
 
 
 def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
-    """
-    Raise `InvalidValue` for a model by which no gyro of a robot can be compensated.
-
-    Bias, rad/s, and scale factor error are limited as those of a run are. By its noise a heading
-    must not be unknown within a second, as one of any direction, with a deviation of pi / sqrt(3).
-    """
+    """Raise `InvalidValue` for a bias, scale factor or noise that no gyro of a robot has."""
     limits = {'scale_factor_error': (RunLimits.max_scale_factor_error, 'a fraction, not in %'),
               'bias': (max_bias, 'in rad/s; calibration.maximum_bias allows another one')}
     for term in model.terms:
@@ -158,13 +143,11 @@ def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
                                f'at most {limit:.4g} of either sign, {remedy}')
     for name, value in vars(model.noise).items():
         if not math.sqrt(Noise(**{name: value}).heading_variance(1.0)) < math.pi / math.sqrt(3.0):
-            raise InvalidValue(f'noise.{name}', value,
-                               'SI units, rad and s: with this noise the heading is unknown '
-                               'within 1 s')
+            raise InvalidValue(f'noise.{name}', value, 'SI units, rad and s: with this noise the '
+                               'heading is unknown within 1 s')
 
 
 def _existing_version(file: Path) -> tuple[int, int] | None:
-    """Return the version of a file; None where there is none."""
     try:
         return file_version(file)
     except OSError:

@@ -149,7 +149,7 @@ def test_the_verb_prints_a_summary(run, limits, tmp_path):
 WRONG = {
     'unknown': ({'maximum_speed': 3}, 'maximum_speed'),
     'no acceleration': ({'maximum_acceleration_dps2': 0},
-                        'maximum_acceleration_dps2 is 0; wanted a number from 0.01'),
+                        'maximum_acceleration_dps2 is 0; wanted a finite number of at least 0.01'),
     'a text': ({'maximum_rate_dps': 'fast'}, "maximum_rate_dps is 'fast'"),
     'not a number': ({'maximum_rate_dps': math.nan}, 'maximum_rate_dps is nan'),
     'yes': ({'rest_s': True}, 'rest_s is True'),

@@ -87,8 +87,8 @@ WRONG = {
     'emulate --protocol fizoptika --model model.yaml': 'sensitivity is not set',
     'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
     'reproduce newton': 'hong_park',
-    'self-calibrate log.csv --turns 3 --profile p.csv': 'were both given',
-    'self-calibrate log.csv --marking 2': 'omit it', 'export --to unity model.yaml': 'unity',
+    'self-calibrate log.csv --turns 3 --profile p.csv': 'give one of them',
+    'self-calibrate log.csv --marking 2': 'both or none', 'export --to unity model.yaml': 'unity',
     'export --to sdf model.yaml --span 0.001': 'is shorter than two samples',
     'export --to sdf model.yaml --sample-rate 0': 'is out of range',
     'simulate --model model.yaml --motion waltz --out x.csv': 'waltz: there is no such motion',
@@ -97,7 +97,7 @@ WRONG = {
        for option, said in {
            '--sample-rate 1e-300': '', '--sample-rate 1e300': '', '--sample-rate 1e9': '',
            '--temperature nan': '', '--temperature 1e9': '',
-           '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
+           '--sample-rate 0.001': 'fewer than two samples'}.items()}}
 
 
 @pytest.mark.parametrize('words, said', WRONG.items(), ids=WRONG)
@@ -351,8 +351,8 @@ def polynomial(tmp_path):
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    monkeypatch.setattr('gyro_calibration.cli.compensate.BLOCK_ROWS', 300)
-    monkeypatch.setattr('gyro_calibration.logs.log.BLOCK_ROWS', 300)
+    monkeypatch.setattr('gyro_calibration.cli.compensate.CACHE_BLOCK_SAMPLES', 300)
+    monkeypatch.setattr('gyro_calibration.logs.log.CACHE_BLOCK_SAMPLES', 300)
 
 
 WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--invert'],

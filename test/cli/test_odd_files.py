@@ -290,9 +290,9 @@ VIEW = ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELE
 
 
 @pytest.mark.parametrize('messages, more, words', [
-    (PLAIN + ' AS (CAST(hex(zeroblob(100000 + id)) AS BLOB)))', '', 'tables of stored columns'),
-    (PLAIN + ' AS (CAST(hex(zeroblob(10)) AS BLOB)) STORED)', '', 'tables of stored columns'),
-    (VIEW, '', 'not a ROS 2 recording'),
+    (PLAIN + ' AS (CAST(hex(zeroblob(100000 + id)) AS BLOB)))', '', 'no ROS 2 recording'),
+    (PLAIN + ' AS (CAST(hex(zeroblob(10)) AS BLOB)) STORED)', '', 'no ROS 2 recording'),
+    (VIEW, '', 'no ROS 2 recording'),
     (VIEW, "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE name = "
      "'messages'", 'cannot be read'),
 ], ids=['generated', 'stored', 'view', 'view called a table'])

@@ -275,18 +275,18 @@ def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
 
 
 @pytest.mark.parametrize(('words', 'sentence'), [
-    (['--out', 'a.txt', '--port', '/dev/x'], 'give a name that ends in .csv, .csv.gz or .mcap'),
+    (['--out', 'a.txt', '--port', '/dev/x'], 'give a name that ends in .csv, .csv.gz, .mcap'),
     (['--out', 'a.csv', '--port', '/dev/x', '--topic', 'imu'],
      '--port and topics were both given'),
     (['--out', 'a.csv', '--port', '/dev/x', '--protocol', 'morse'], 'morse'),
     (['--out', 'a.csv', '--port', '/dev/x', '--baud', '-5'],
      '--baud is -5, but must be from 0 to 4000000'),
     (['--out', 'a.csv', '--port', '/dev/x', '--baud', '9' * 30], 'but must be from 0 to 4000000'),
-    (['--out', 'a.csv', '--protocol', 'csv'], 'without --port'),
-    (['--out', 'a.csv', '--sample-rate', '100'], 'without --port'),
-    (['--out', 'a.csv', '--increments', 'never'], 'without --port'),
+    (['--out', 'a.csv', '--protocol', 'csv'], 'need --port'),
+    (['--out', 'a.csv', '--sample-rate', '100'], 'need --port'),
+    (['--out', 'a.csv', '--increments', 'never'], 'need --port'),
     (['--out', 'a.csv', '--topic', 'imu', '--reference-topic', '/imu'],
-     'one topic was named twice'),
+     'a topic was named twice'),
     (['--out', 'a.csv', '--reference-topic', 'a', '--reference-topic', 'b'],
      'record several topics into .mcap'),
 ])

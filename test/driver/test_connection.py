@@ -69,7 +69,7 @@ def test_auto_asks_for_what_the_protocol_needs():
     world.gyro('csv', settings=Settings(columns=('gyro_counts',), sensitivity=0.001))
     problem = Reading(world, settings=counts).problems[0]
     assert problem.startswith(
-        'csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
+        'csv comes on /dev/gyro, but sensitivity, the rad/s of one count')
 
 
 def test_a_gyro_is_found_again_under_another_name(tmp_path):

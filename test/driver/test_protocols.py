@@ -199,7 +199,7 @@ def test_every_protocol_has_an_assumed_noise_and_a_full_scale_at_which_it_satura
     ('csv', {'columns': ('time_s',)}, 'exactly one'),
     ('csv', {'columns': ('gyro_dps', 'gyro_counts')}, 'exactly one'),
     ('csv', {'columns': ('gyro_dps', 'time_s', 'time_s')}, 'only once'),
-    ('csv', {'columns': ('gyro_counts',)}, 'sensitivity is not set'),
+    ('csv', {'columns': ('gyro_counts',)}, 'gyro_counts: give both'),
     ('csv', {'sensitivity': 0.1}, 'sensitivity'),
     ('fizoptika', {'sensitivity': None}, 'sensitivity is not set.*rad/s of one count'),
     *((name, {'increments': True}, 'sends rates') for name in ALL if name != 'kvh_1750')])

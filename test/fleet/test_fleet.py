@@ -134,11 +134,11 @@ def test_notes_and_names_say_what_a_table_does_not(tmp_path):
 def test_a_worker_that_is_killed_ends_the_run_and_one_without_memory_does_not():
     with process_executor(2, 1e9) as executor:
         numbers = [*range(KILLS), *range(KILLS + 1, 10)]
-        found = dict(run_tasks(task, numbers, 2, executor))
+        found = dict(run_tasks(task, numbers, executor))
     assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
     assert found == {number: number for number in {*numbers} - {TAKES_ALL_MEMORY}}
     with process_executor(2) as executor, pytest.raises(BrokenExecutor):
-        list(run_tasks(task, [KILLS], 2, executor))
+        list(run_tasks(task, [KILLS], executor))
 
 
 def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):

@@ -110,7 +110,7 @@ ONE, OTHER = 'effects: {}\n', 'effects: {bias: {bias: 0.1}}\n'
     (ONE + SEVEN, ONE + SEVEN + STORED, ''),
     (ONE + SEVEN, ONE + EIGHT + STORED, 'and the model to 7; calibrate again'),
     (ONE + SEVEN, ONE + STORED, 'and the model to 7; calibrate again'),
-    (ONE, ONE + EIGHT + STORED, 'and the model to one without; calibrate again'),
+    (ONE, ONE + EIGHT + STORED, 'and the model to (none); calibrate again'),
     (OTHER, ONE + STORED, 'belongs to another model'),
     ('', ONE, 'the file has none'), (ONE + STORED, ONE, 'the file has none'),
     ('', '\n', 'the file'),

@@ -41,8 +41,6 @@ AUTO = 'auto'  # name that stands for recognition by listening
 #: Bits per second, in order of the attempts: first the defaults of gyros, then others.
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 
-_MIN_FRAMES = 3  # least number of frames; fewer may be chance
-
 
 def find_protocol(name: str) -> Protocol:
     """Return a protocol by its name; ValueError names the known ones where there is none."""
@@ -56,8 +54,7 @@ def recognize_protocol(data: bytes, settings: Settings) -> Protocol | None:
     """
     Return the format that explains the last 8192 bytes; None if ambiguous, or too few bytes.
 
-    The settings may be incomplete for the recognized format. `csv` is recognized by the number of
-    their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
+    The settings may be incomplete for it; `csv` is recognized by the number of their columns.
     """
     data, scores = data[-8192:], []
     for protocol in PROTOCOLS.values():  # the share of the bytes in frames, and these frames
@@ -71,7 +68,7 @@ def recognize_protocol(data: bytes, settings: Settings) -> Protocol | None:
             explained = sum(map(len, good)) / (received - begun)
         scores.append((explained, good, protocol))
     (share, frames, best), (next_share, *_) = sorted(scores, key=lambda each: -each[0])[:2]
-    # a line may damage half of the bytes; of equal frames, as zeros may pass a weak check, 5 %
-    least = 0.5 if len(set(frames)) >= _MIN_FRAMES else 0.95
-    return best if (len(frames) >= _MIN_FRAMES and share >= least
-                    and next_share < 0.8 * share) else None
+    # Fewer than three frames may be chance. A line may damage half of the bytes; of equal frames,
+    # as zeros may pass a weak check, 5 %.
+    least = 0.5 if len(set(frames)) > 2 else 0.95
+    return best if len(frames) > 2 and share >= least and next_share < 0.8 * share else None

@@ -38,13 +38,9 @@ _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
 
 
 def _check(settings: Settings) -> None:
-    counts = 'gyro_counts' in settings.columns
-    if counts and settings.sensitivity is None:
-        raise ValueError('columns hold gyro_counts, but sensitivity is not set: set it to the '
-                         'rad/s of one count')
-    if not counts and settings.sensitivity is not None:
-        raise ValueError('sensitivity is set, but columns hold no gyro_counts: name the column '
-                         'gyro_counts, or leave sensitivity out')
+    if ('gyro_counts' in settings.columns) != (settings.sensitivity is not None):
+        raise ValueError('sensitivity, the rad/s of one count, belongs to a column gyro_counts: '
+                         'give both or none')
 
 
 def _parse(line: bytes, settings: Settings) -> Reading | None:

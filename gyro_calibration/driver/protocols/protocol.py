@@ -12,8 +12,8 @@
 Common parts of wire formats: records, decoder from bytes to samples, and splitters of a stream.
 
 A format is a `Protocol`: a splitter that finds frames in a stream of bytes, a parser from a frame
-to a `Reading`, and a writer. A reading is in the unit of the device; sign, sensitivity and full
-scale are applied here for all formats, as are the counts of discarded, refused and lost data.
+to a `Reading` in the unit of the device, and a writer. Sign, sensitivity and full scale are
+applied here for all formats.
 """
 
 from __future__ import annotations
@@ -35,11 +35,8 @@ GYRO_COLUMNS = {name: factor for name, (quantity, factor) in COLUMNS.items()
                 if quantity in ('output', 'counts')}
 #: Further columns of the log format.
 OPTIONAL_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
-#: Standard deviation of a sample of a gyro whose data sheet is not known, rad/s.
-ASSUMED_NOISE = math.radians(0.5)
-#: Standard deviation of a specific force, m/s²: 0.01 g, beyond the noise of any such unit.
-ASSUMED_FORCE_NOISE = 0.1
-
+ASSUMED_NOISE = math.radians(0.5)  # of a sample of an unknown gyro, rad/s
+ASSUMED_FORCE_NOISE = 0.1  # m/s²; beyond the noise of any such unit
 #: Words for a setting that is None by default; not yes and no, which YAML reads as booleans.
 TRISTATE = {'default': None, 'always': True, 'never': False}
 
@@ -52,12 +49,9 @@ class Sample:
     temperature: float | None = None  # degC
     time: float | None = None  # s, by the clock of the device
     sequence: int | None = None  # count of the device, modulo `Protocol.modulus`
-    #: Estimated samples lost directly before this one: damaged, marked as invalid by the device,
-    #: or refused. A sequence or the elapsed time has priority.
-    missing: int = 0
+    missing: int = 0  # estimated samples lost directly before: damaged, invalid or refused
     specific_force: float | None = None  # m/s², along the input axis
-    #: Further values, by names with units: ``supply_v``, ``source_current_a``.
-    health: Mapping[str, float] = field(default_factory=dict)
+    health: Mapping[str, float] = field(default_factory=dict)  # by names with units: ``supply_v``
 
 
 @dataclass
@@ -146,8 +140,6 @@ class Splitter:
 
 @dataclass(frozen=True)
 class Protocol:
-    """A wire format."""
-
     name: str  # of the parameter ``protocol``
     text: str | None  # what documents state: devices, layout of a frame, sources, unverified
     baud: int  # with 8 data bits, no parity and 1 stop bit
@@ -156,11 +148,10 @@ class Protocol:
     #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    #: Makes the parser of one connection: a frame to a reading, or None if it is not valid; it
-    #: may use earlier frames.
+    #: Makes the parser of one connection: a frame to a reading, or None if it is not valid.
     parser: Callable[[Settings], Callable[[bytes], Reading | None]]
     #: Makes the writer of one device: a value in its unit and the further values of a sample,
-    #: whose sequence counts from 0 and never wraps, to bytes; it may use earlier samples.
+    #: whose sequence counts from 0 and never wraps, to bytes.
     writer: Callable[[Settings], Callable[[float, Sample], bytes]]
     invert: bool = False  # whether the device counts clockwise turns positive
     full_scale: float = math.radians(2000.0)  # rad/s
@@ -181,7 +172,7 @@ class Protocol:
                              'increments out')
         if settings.sensitivity is None and self.sensitivity is None:
             raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the '
-                             'rad/s of one count, which its data sheet gives')
+                             'rad/s of one count')
         self.check(settings)
 
     def decoder(self, settings: Settings | None = None, counts: Counts | None = None) -> Decoder:
@@ -249,7 +240,6 @@ class Decoder:
 
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
-    What is refused and discarded is added to the counts.
     """
 
     def __init__(self, protocol: Protocol, settings: Settings, counts: Counts):
@@ -307,8 +297,8 @@ class LineSplitter(Splitter):
     """
     Splits bytes into complete, nonempty lines without their ends.
 
-    A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
-    first line is discarded, unless it begins with bytes with which only complete lines begin.
+    The first line, which may be the rest of one, is discarded unless it begins as complete ones
+    do.
     """
 
     def __init__(self, line_starts: tuple[bytes, ...] = ()):
@@ -337,11 +327,10 @@ class LineSplitter(Splitter):
 
 class FrameSplitter(Splitter):
     """
-    Splits bytes into frames that match a pattern and pass their check, from any byte on.
+    Splits bytes into frames that match a pattern (``.`` is any byte) and pass their check.
 
-    In the pattern, a regular expression, ``.`` is any byte; the length is in bytes. If other bytes
-    often pass the check, which is then weak, a frame after other bytes counts only if another one
-    follows directly.
+    If other bytes often pass the check, which is then weak, a frame after other bytes counts only
+    if another one follows directly.
     """
 
     def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool],
