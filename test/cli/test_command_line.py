@@ -214,9 +214,9 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
     """A gyro that agrees with its model: the effect of its specific force is no bias."""
     (tmp_path / 'model.yaml').write_text(
         'effects: {acceleration_sensitivity: {acceleration_sensitivity: 0.001}}')
-    rate = (np.concatenate([np.zeros(500), np.full(2000, TURN / 20.0), np.zeros(500)])
-            + np.sin(np.arange(3000)) * 1e-9)
-    write_log(tmp_path / 'log.csv', Log(output=rate + 0.00981, time=np.arange(3000) / 100.0,
+    rate = np.concatenate([np.zeros(500), np.full(2000, TURN / 20.0), np.zeros(500)])
+    output = rate + 0.00981 + 1e-6 * np.random.default_rng(0).standard_normal(3000)
+    write_log(tmp_path / 'log.csv', Log(output=output, time=np.arange(3000) / 100.0,
                                         specific_force=np.full(3000, 9.81), reference_rate=rate))
     code, text, error = run('self-calibrate', tmp_path / 'log.csv',
                             '--model', tmp_path / 'model.yaml', '--json', *words)
