@@ -26,8 +26,8 @@ from gyro_calibration.calibration.heading_regression import (
     find_reference_delay, robust_least_squares)
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.calibration.reference_noise import (
-    COURSE_NOISE_RATIO, heading_difference, keep_own_instants, MAX_GYRO_LAG, MAX_ROUNDING_RATIO,
-    MAX_ROUNDING_STEP)
+    COURSE_NOISE_RATIO, heading_difference, heading_white_noise, keep_own_instants, MAX_GYRO_LAG,
+    MAX_ROUNDING_RATIO, MAX_ROUNDING_STEP)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.spans import CauseTerm, design_matrix, lay_out_spans, Spans
 from gyro_calibration.heading.integration import integrate
@@ -68,11 +68,8 @@ def find_reference_kind(log: Log, spans: Spans | None = None) -> tuple[str, str]
     if 0.0 < step < MAX_ROUNDING_STEP:
         # The last digit of a file is a power of ten of a rad or a deg, or less than the noise of
         # the heading, which is also in its difference to that of the gyro, without the motion.
-        assert log.time is not None and log.output is not None
-        powers, known = np.log10([step, step / DEGREE]), np.isfinite(heading)
-        own = integrate(log.time, bridge_gaps(log.output))
-        if np.abs(powers - np.rint(powers)).min() < 1e-4 or step < min(
-                white_noise_deviation(each[known]) for each in (heading, heading - own)):
+        powers = np.log10([step, step / DEGREE])
+        if np.abs(powers - np.rint(powers)).min() < 1e-4 or step < heading_white_noise(log):
             step = 0.0
     if step:
         return ('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')

@@ -390,6 +390,19 @@ def _rate_noise_variances(log: Log, is_commanded: bool = False) -> tuple[float, 
     return variance, gyro
 
 
+def heading_white_noise(log: Log) -> float:
+    """
+    Return the standard deviation of the white noise of a reference heading, rad.
+
+    It is in the heading, and in its difference to that of the gyro, without the motion.
+    """
+    assert log.time is not None and log.output is not None and log.reference_heading is not None
+    known = np.isfinite(log.reference_heading)
+    own = integrate(log.time, bridge_gaps(log.output))
+    return min(white_noise_deviation(each[known])
+               for each in (log.reference_heading, log.reference_heading - own))
+
+
 def heading_noise_share(log: Log) -> float:
     """
     Return the ratio of the rate noise of a reference heading to that of the gyro; 0 if none shows.

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import OUTLIER_THRESHOLD, require_output
+from gyro_calibration.calibration.reference_noise import heading_white_noise
 from gyro_calibration.diagnosis.causes import sized_finding
 from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.diagnosis.gates import (
@@ -346,6 +347,8 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     heading = log.reference_heading if log.reference_rate is None else None
     step = (0.0 if heading is None or np.count_nonzero(np.isfinite(heading)) < 3
             else encoder_step(heading))
+    if step and step < heading_white_noise(log):  # the last digit of a file
+        step = 0.0
     return _check_samples(DataQuality((*units, *lost), (*notes, *remarks), has_output,
                                       heading_step=step), comparison, model, log.time)
 
