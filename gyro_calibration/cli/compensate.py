@@ -125,7 +125,7 @@ def _describe_heading(log: Log, found: CompensatedLog, model: GyroModel,
     yield f'Heading at the end: {heading / DEGREE:.2f}{spread} deg.'
     if is_known and not data['noise_is_known']:
         yield ('The model has no noise figures: noise and wander of the bias are not in the '
-               'standard deviation; record a rest, and run allan to add them.')
+               'standard deviation; record a rest, and run allan to add them to the model.')
     if log.reference_heading is None:
         return
     error = headings - log.reference_heading
