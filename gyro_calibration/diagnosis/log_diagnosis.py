@@ -252,7 +252,10 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
               if model is None else any(term.effect is QUANTIZATION for term in model.terms))
     simulated = Noise() if model is None else model.noise
-    noise = fit_noise_parameters(found, rounds)
+    # a response without a name would be in noise and scale factor error
+    responses = [each for each in selection.unnamed if each.cause == RESPONSE]
+    noise = fit_noise_parameters(
+        fit_causes(search.problem, [*selection.named, *responses]), rounds)
     time_is_up = on_progress(None, 'cross-validation')
     changed = [] if model is None else list(_model_value_findings(found, model, noise))
     within = [(known, members) for known, members in zip(found.causes, selection.alternatives)
@@ -272,8 +275,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     if model is not None and not searched.hidden:
         findings += find_changed_figures(found, model, rounds).values()
     # without causes that the model has already and that cannot be merged with those
-    inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
-                     if out else found, lasting_only=True)
+    inside = replace(fit_causes(search.problem, [
+        *(each for each in found.causes if each not in out), *responses])
+                     if out or responses else found, lasting_only=True)
     plain = fit_causes(search.problem, [])
     deviation = _mean_bias_deviation(inside, noise)
     best = replace(add_causes(GyroModel(), plain, deviation), noise=noise)

@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 
+from chance import seeds
 from diagnosed import log_of
 from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.extended_model import (
@@ -31,6 +32,7 @@ from gyro_calibration.model.noise import Noise
 from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 
 NOISE = Noise(1.5e-4)
 LINEAR = (Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)))
@@ -319,3 +321,19 @@ def test_what_a_cause_adds_like_a_bias_or_a_scale_factor_error_is_not_its_share(
     own = {**parts, 'quadratic_nonlinearity': 1e-3 * np.sin(0.01 * time[1:]),
            'bias': 0.0 * rate, 'scale_factor_error': 0.0 * rate}
     assert heading_error_shares([(own, time)])['quadratic_nonlinearity'] > 0.5
+
+
+@pytest.mark.parametrize('order, corner', [(2, 4.0), (3, 6.0)])
+@pytest.mark.parametrize('seed', seeds(2))
+def test_a_filter_that_has_no_name_is_not_in_the_scale_factor_error(seed, order, corner):
+    generator, smooth = np.random.default_rng(seed), np.hanning(41) / np.hanning(41).sum()
+    rate = np.convolve(np.repeat(generator.uniform(-1.0, 1.0, 120), 100), smooth, 'same')
+    output = 1.004 * lfilter(*butter(order, corner / 50.0), rate)
+    found = diagnose([Log(time=0.01 * np.arange(12000), reference_rate=rate,
+                          output=output + 2e-4 * generator.standard_normal(12000))],
+                     np.random.default_rng(0))
+    assert [each.along for each in found.unexplained] == ['rate_change']
+    (size, deviation), = ((each[2:]) for each in found.model.estimates()
+                          if each[0] == 'scale_factor_error')
+    assert abs(size - 0.004) < 4.0 * deviation < 3e-4
+    assert found.noise.angle_random_walk < 1e-4
