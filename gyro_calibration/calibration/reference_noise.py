@@ -478,10 +478,7 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
             off = abs(jump - unseen)
         if abs(unseen) <= least or off >= abs(jump):
             continue
-        starts = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1] - span, 500))
-        ends = np.minimum(np.searchsorted(log.time, log.time[starts] + span), len(log) - 1)
-        changes = difference[ends] - difference[starts] - bias * span
-        changes = changes[np.isfinite(changes)]
+        changes = _changes_over(span, log.time, difference) - bias * span
         if len(changes) and abs(unseen) > least + 2.0 * bound * robust_deviation(changes):
             kept[rows[1:]] = np.nan
             lost.append((float(log.time[first]), float(log.time[last]), abs(unseen)))
@@ -493,3 +490,11 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
         f'The reference stays the same from {begin:.4g} s to {end:.4g} s, where the gyro turns by '
         f'{angle / DEGREE:.3g} deg more, as if it were lost; it is not used there, nor where the '
         'same happens for a shorter time.']
+
+
+def _changes_over(span: float, time: Array, values: Array) -> Array:
+    """Return the known changes of values over a span, s, from up to 500 samples of a log."""
+    starts = np.searchsorted(time, np.linspace(time[0], time[-1] - span, 500))
+    ends = np.minimum(np.searchsorted(time, time[starts] + span), len(time) - 1)
+    changes = values[ends] - values[starts]
+    return np.asarray(changes[np.isfinite(changes)])

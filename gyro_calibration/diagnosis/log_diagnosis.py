@@ -236,12 +236,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     replays = [replay(log, clean.usable, generator, clean.heading_step, clean.output_step, model)
                for log, clean in zip(logs, quality)]
     searched = _search_logs(logs, replays, on_progress, is_command)
-    search = searched.search
-    selection = confirm_causes(search, searched.causes)
-    delays = [each.shapes[0] for each in selection.named if each.cause == 'time_offset']
-    if delays and 'bandwidth' not in {each.cause for each in selection.named}:
-        search = replace(search, problem=build_problem(
-            [each.with_possible_lag(delays[0]) for each in search.problem.replays]))
+    selection = confirm_causes(searched.search, searched.causes)
+    search = _with_possible_lag(searched.search, selection.named)
     if searched.followed is not None and selection.unnamed and len(logs) == 1:
         return _diagnose_by_spans(logs[0], searched, replays[0], references[0], model,
                                   on_progress)
@@ -302,6 +298,15 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                       *searched.remarks, *[TIME_LIMIT_REMARK] * bool(time_is_up)),
                      heading_shares=of_heading,
                      reference=references[0] if len(logs) == 1 else None)
+
+
+def _with_possible_lag(search: Search, named: Sequence[Candidate]) -> Search:
+    """Return a search whose logs may have a lag beside a delay, if that is named without one."""
+    delays = [each.shapes[0] for each in named if each.cause == 'time_offset']
+    if not delays or 'bandwidth' in {each.cause for each in named}:
+        return search
+    return replace(search, problem=build_problem(
+        [each.with_possible_lag(delays[0]) for each in search.problem.replays]))
 
 
 def _diagnose_by_spans(log: Log, searched: _Searched, given: Replay, reference: Reference,

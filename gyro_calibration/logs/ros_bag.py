@@ -44,7 +44,7 @@ from gyro_calibration.logs.columns import excerpt
 from gyro_calibration.logs.log import ExpansionBudget, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
-MAX_RECORD_BYTES = 250_000_000
+MAX_RECORD_BYTES = 1 << 28
 _READ_BYTES = 1_000_000
 
 _MAGIC = b'\x89MCAP0\r\n'

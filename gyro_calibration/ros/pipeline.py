@@ -69,7 +69,8 @@ PARAMETERS = (
     NodeParameter('assumed.bias', Assumptions.bias,
                   'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
     NodeParameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
-                  'Standard deviation of the scale factor error, likewise.', '1', (0.0, 1.0)),
+                  'Standard deviation of the scale factor error without a calibration.', '1',
+                  (0.0, 1.0)),
     NodeParameter('assumed.bias_temperature_coefficient', Assumptions.bias_temperature_coefficient,
                   'Standard deviation of the change of the bias with temperature; 0 for a gyro '
                   'that compensates it.', 'rad/s/K', (0.0, 0.1)),
