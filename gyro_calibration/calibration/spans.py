@@ -238,7 +238,8 @@ class Spans:
     def prior_deviations(self, causes: Sequence[CauseTerm]) -> Array:
         """Return the prior standard deviations of the values, infinite of most causes."""
         own = {MISALIGNMENT_TERM.cause: MISALIGNMENT_DEVIATION,
-               OWN_BIAS: self.treatment.prior[1], OWN_DELAY: self.treatment.prior[2]}
+               OWN_BIAS: self.treatment.prior[1], OWN_DELAY: self.treatment.prior[2],
+               'dead_zone': 1.0}  # its amplitude, although no rate may be within it
         return np.concatenate([self.treatment.prior, *(
             np.full(each.value_count, own.get(each.cause, math.inf))
             for each in self.all_causes(causes))])
@@ -400,8 +401,15 @@ class Spans:
             rate = np.asarray(self.channels.rate)
             return (self.span_integrals(rate)
                     - self.span_changes(time * self.smooth_rate))[:, None]
-        columns = CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)
-        return np.column_stack([-self.span_integrals(np.asarray(each)) for each in columns])
+        return np.column_stack([-self.span_integrals(np.asarray(each))
+                                for each in self._effect_columns(cause)])
+
+    def _effect_columns(self, cause: CauseTerm) -> Sequence[Array]:
+        """Return the columns of an effect of the gyro in samples, each of shape (m,)."""
+        channels = self.channels
+        if cause.cause == 'dead_zone':  # noise would pass its limit
+            channels = channels.with_rate(self.smooth_rate, self.output)
+        return CATALOGUE[cause.cause].columns(channels, *cause.shapes)
 
     def step_columns(self, times: Array) -> Array:
         """Return the columns of steps of the bias, each between two samples, shape (n + r, k)."""
@@ -443,7 +451,7 @@ class Spans:
             elif (cause.cause in CATALOGUE.keys() - {'bandwidth'}
                     and 'rate' in CATALOGUE[cause.cause].inputs):
                 errors = errors + sum(size * column for size, column in zip(
-                    own, CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)))
+                    own, self._effect_columns(cause)))
         rate: Array = self.is_in_motion * (self.output - errors) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]), clock_rate=clock_rate)
         turned = integrate_with_curvature(self.stamps, rate)

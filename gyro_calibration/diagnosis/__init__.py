@@ -19,7 +19,7 @@ limits), `replay` (of a log, and the spectrum of its noise), `candidates` (colum
 of what has no name), `regression` (of logs on causes, under every noise), `scans` (for tones,
 steps and slips), `search` (for causes, and their confirmation), `words` (numbers and findings for
 people), `residuals` (their noise and curves), `extended_model` (and its gain on what was held
-out), `noisy_reference` (a log as spans, where the reference limits what is known),
-`reference_lag` (of a motion that follows its reference), `table_diagnosis` (of a rate table),
-`log_diagnosis` (of logs, in order), `report` (the page).
+out), `span_search` (the search over spans), `noisy_reference` (a log as spans, where the reference
+limits what is known), `reference_lag` (of a motion that follows its reference), `table_diagnosis`
+(of a rate table), `log_diagnosis` (of logs, in order), `report` (the page).
 """

@@ -14,35 +14,27 @@ The diagnosis of logs whose reference has errors of its own, such as a course ov
 Causes are searched for as beside an exact reference, but over spans, under the noise of gyro and
 reference that is found with a column of each cause, and under any wander of the bias.
 
-The score of a cause is also summed over stretches. Its variance is that by the noise or that by
-the scatter of the stretches, whichever is larger, and its distribution is Fisher's, with the
-effective number of stretches less that of the columns as the degrees of freedom. The evidence is
-at most that of this test.
-
 Several logs are joined, each with a bias of its own; a cause has the same values in all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import product
+from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.calibration.heading_regression import (
-    fit_spans, MIN_STRETCHES, SpanFit, whiten_regression, WhitenedRegression)
+    fit_spans, MIN_STRETCHES, SpanFit, whiten_regression)
 from gyro_calibration.calibration.joined_logs import join_logs
 from gyro_calibration.calibration.likelihood import MISALIGNMENT_REMEDY, oblique_angle
-from gyro_calibration.calibration.noise_grid import GridFit
 from gyro_calibration.calibration.reference_noise import MAX_GYRO_LAG, OwnInstants
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.calibration.spans import (
-    BASE_VALUES, CauseTerm, design_matrix, HEADING_TREATMENT, lay_out_spans, MISALIGNMENT_TERM,
-    OWN_BIAS, OWN_DELAY, Spans)
+    BASE_VALUES, CauseTerm, design_matrix, lay_out_spans, MISALIGNMENT_TERM,
+    OWN_BIAS, OWN_DELAY)
 from gyro_calibration.diagnosis.candidates import (
-    Candidate, indices_by_cause, lasting_shapes, MIN_CHANNEL_RANGE, observed_range)
+    MIN_CHANNEL_RANGE, observed_range)
 from gyro_calibration.diagnosis.causes import (
     Cause, CAUSES, sized_finding, untestable_causes, value_finding)
 from gyro_calibration.diagnosis.data_quality import inspect_record, strongest_findings
@@ -51,21 +43,17 @@ from gyro_calibration.diagnosis.extended_model import (
     MAX_WINDOW_SHARE, previous_origins, window_changes)
 from gyro_calibration.diagnosis.findings import (
     Curve, detectable_sigmas, Diagnosis, Estimate, Finding, Gain, MIN_PROBABILITY, OnProgress,
-    prediction_sigmas, Reference, SEARCH_ALARM_RATE, TIME_LIMIT_REMARK, VALUE_ALARM_RATE)
-from gyro_calibration.diagnosis.regression import (
-    column_evidence, columns_of, fit_causes, group_columns, RegressionFit)
-from gyro_calibration.diagnosis.scans import best_steps, Scored
-from gyro_calibration.diagnosis.search import (
-    confirm_causes, explain_selection, Search, search_causes, SelectedCause)
+    Reference, SEARCH_ALARM_RATE, TIME_LIMIT_REMARK, VALUE_ALARM_RATE)
+from gyro_calibration.diagnosis.search import SelectedCause
+from gyro_calibration.diagnosis.span_search import (
+    follows_the_rate, OF_FIXED_SIZE, propose_terms, select_causes, suspect_terms, term_of)
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
-from scipy.stats import f as fisher
 
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
@@ -121,7 +109,7 @@ def diagnose_by_noisy_reference(logs: Sequence[Log], reference: Reference,
         # causes that do not improve the prediction are not added to the model
         model_fit, gain = plain, _cross_validated_gain(plain, plain)
         if not plain.spans.treatment.is_fine:
-            found = _suspect(found, lasting)
+            found = suspect_terms(found, lasting)
             extended = fit_spans(plain.spans, events) if events else plain
     on_progress(None, 'findings')
     of_logs, of_record = _heading_contributions(extended), strongest_findings(records)
@@ -183,7 +171,7 @@ def _withdraw_differing_causes(fit: SpanFit, found: list[SelectedCause],
                                each_alone: Sequence[SpanFit]
                                ) -> tuple[SpanFit, list[SelectedCause]]:
     """Return the fit without causes whose values differ between logs beyond chance."""
-    established = [_term_of(each.cause) for each in found if each.is_established]
+    established = [term_of(each.cause) for each in found if each.is_established]
     lasting = [each for each in established if not each.is_single_event]
     if not lasting:
         return fit, found
@@ -199,13 +187,7 @@ def _withdraw_differing_causes(fit: SpanFit, found: list[SelectedCause],
     if not differing:
         return fit, found
     return (fit_spans(fit.spans, [each for each in established if each not in differing]),
-            _suspect(found, differing))
-
-
-def _suspect(found: Sequence[SelectedCause], terms: Collection[CauseTerm]) -> list[SelectedCause]:
-    """Return causes, of which some are no longer established."""
-    return [replace(each, is_established=each.is_established
-                    and _term_of(each.cause) not in terms) for each in found]
+            suspect_terms(found, differing))
 
 
 def _own_biases(fit: SpanFit) -> Array:
@@ -337,14 +319,15 @@ def _cause_findings(found: Sequence[SelectedCause], extended: SpanFit) -> Iterat
 
 def _cause_finding(found: SelectedCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
-    term, spans = _term_of(found.cause), extended.spans
+    term, spans = term_of(found.cause), extended.spans
     fit = (extended if found.is_established
            else fit_spans(spans, [*extended.causes, term]))
-    places, shapes = fit.value_slice(term), found.fit.shapes(found.place)
+    places, shapes = fit.value_slice(term), found.shapes
     values, covariance = fit.values[places], fit.normal_covariance[places, places]
     if term.cause == SINE_RESPONSE.name:
         size, slope = _shape_of_sine(term, float(values[0]))
         shapes['k'] = Estimate.from_half_width(size, slope * fit.half_width(places.start), 's')
+    if term.cause in OF_FIXED_SIZE:
         values, covariance = values[1:], covariance[1:, 1:]
     end, temperature, joined = float(spans.time[-1]), spans.log.temperature, spans.joined
     observed = observed_range([np.asarray(spans.channels.rate)],
@@ -404,6 +387,8 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, logs: Sequence[Log],
                 # the shape instead of the amplitude
                 shape, slopes[places] = _shape_of_sine(cause, values[0])
                 shapes, values, of_term = (shape,), [1.0], [places.start, -1]
+            elif cause.cause in OF_FIXED_SIZE:
+                values, of_term = [1.0], [-1, -1]
             terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
             indices += of_term
     outputs = [log.output for log in logs if log.output is not None]
@@ -499,7 +484,7 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
 def _untestable_causes(plain: SpanFit) -> dict[str, str]:
     """Return the reason for each cause that was not searched for."""
     def reason(cause: Cause) -> str:
-        if plain.lacks_turns and _follows_the_rate(cause.name):
+        if plain.lacks_turns and follows_the_rate(cause.name):
             return ('fewer than three stretches turn, which do not distinguish it from a scale '
                     'factor error')
         return {'axis_misalignment': 'the reference is planar',
@@ -507,7 +492,7 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
                 'reference_once_per_rev': 'a course over ground has no shaft'}.get(
                     cause.name, 'the errors of the reference hide it over short spans')
 
-    seen = {each.cause for each in (*_propose_terms(plain), *plain.causes)}
+    seen = {each.cause for each in (*propose_terms(plain), *plain.causes)}
     return untestable_causes(seen | _ALWAYS_TESTED, [
         channel for channel in MIN_CHANNEL_RANGE if getattr(plain.spans.log, channel) is None],
         reason)
@@ -546,255 +531,3 @@ def _rate_curve_and_trace(fit: SpanFit, of_logs: Sequence[tuple[dict[str, Array]
     return (Curve('rate', 'rad/s', at, given, left, deviation, np.zeros(len(order))),
             Curve('time', 's', (time + 0.5 * steps)[of_first], before[of_first], after[of_first],
                   simulated=(measured - before)[of_first]))
-
-
-# the log as spans
-
-#: Sizes of each part of the wander of the bias, and times of a step, that are tried.
-_SIZES, _STEP_TIMES = 8, 400
-
-
-@dataclass(frozen=True, eq=False)
-class SpanProblem:
-    """A log as spans, as a `RegressionProblem`, under each size of a wander of the bias."""
-
-    spans: Spans  # with the rate as corrected so far
-    noise: GridFit  # of gyro and reference, which whitens
-    data: WhitenedRegression  # with the prior of the values; its last w rows are of the wander
-    base: Array  # rows of what is always fitted, and last of the observations
-    wander: Array  # columns of the wandering bias, whitened, shape (w, m)
-    deviations: Array  # of the wander, under each noise, shape (g, w)
-    cosine_count: int  # number of the columns that are cosines
-
-    @classmethod
-    def of(cls, fit: SpanFit, noise_fit: SpanFit) -> SpanProblem:
-        """Return the problem of a log under the noise of a fit, with wanders of all sizes."""
-        waves, parts = fit.spans.bias_wander()
-        axes = [np.geomspace(*part.size_range, 1 if len({*part.size_range}) == 1 else _SIZES)
-                for part in parts]
-        variances = np.array([*product(*axes)]) ** 2 @ np.array([each.variance for each in parts])
-        data, count = whiten_regression(fit, (), noise_fit), waves.shape[1]
-        rows = np.column_stack([data.design, data.observed])[:-count].T
-        return cls(fit.spans, noise_fit.fit, data, np.delete(rows, slice(-count - 1, -1), axis=0),
-                   rows[-count - 1:-1], np.sqrt(variances),
-                   int(np.count_nonzero(parts[0].variance)))
-
-    def whiten(self, columns: Array) -> Array:
-        """Return columns, shape (n + r, k), in units of the noise, shape (k, m)."""
-        white = self.noise.whiten(columns).T
-        return np.pad(white, ((0, 0), (0, self.wander.shape[1] - white.shape[1])))
-
-    @cached_property
-    def _scaled(self) -> Array:
-        """Return identity and products of the wander in its deviations, shape (g, w, w)."""
-        gram = self.wander @ self.wander.T
-        return np.eye(len(gram)) + self.deviations[:, :, None] * gram * self.deviations[:, None]
-
-    @cached_property
-    def _reduction(self) -> Array:
-        """Return the matrices by which the wander reduces products, shape (g, w, w)."""
-        return np.asarray(self.deviations[:, :, None] * np.linalg.inv(self._scaled)
-                          * self.deviations[:, None])
-
-    # as of `RegressionProblem`
-
-    @cached_property
-    def log_determinants(self) -> Array:
-        return np.linalg.slogdet(self._scaled)[1]
-
-    @property
-    def durations(self) -> list[float]:
-        return [float(np.ptp(self.spans.time))]
-
-    def distorted(self, causes: Sequence[Candidate]) -> tuple[Spans, ...]:
-        return (self.spans,)
-
-    def base_rows(self, logs: tuple[Spans, ...]) -> Array:
-        return self.base
-
-    def rows(self, candidate: Candidate, logs: tuple[Spans, ...]) -> Array:
-        return self.whiten(columns_of(replace(candidate, values=()), self.spans).T)
-
-    def products(self, one: Array, other: Array) -> Array:
-        of_one, of_other = (each @ self.wander.T for each in (one, other))
-        return one @ np.swapaxes(other, -1, -2) - np.einsum(
-            '...rw,gwv,...sv->g...rs', of_one, self._reduction, of_other, optimize=True)
-
-    def with_noises(self, kept: list[int]) -> SpanProblem:
-        return replace(self, deviations=self.deviations[kept])
-
-    def _with_wander(self, rows: Array, noise: int) -> tuple[Array, Array]:
-        """Return rows, shape (k, m), and the wander with its prior under a noise, (w, m + w)."""
-        prior = np.diag(1.0 / self.deviations[noise])
-        return np.pad(rows, ((0, 0), (0, len(prior)))), np.hstack([self.wander, prior])
-
-    def held_out_gains(self, full: RegressionFit, rest: RegressionFit,
-                       known: Candidate) -> Array | None:
-        # all values are fitted without each fifth of the log, or every fifth stretch, where slow
-        # causes are also predicted by the wander of neighbouring ones; errors of a course are
-        # correlated, so that distant stretches must be predicted
-        if known.log_index is not None:
-            return None
-        stretch, count = self.data.clusters[0], self.data.stretch_count
-        gains = []
-        for fold in [stretch * 5 // count, stretch % 5][:1 + self.spans.treatment.is_fine]:
-            losses = []
-            for fit in (rest, full):
-                rows, wander = self._with_wander(fit.rows, full.best_noise)
-                design, observed = np.vstack([rows[:-1], wander]).T, rows[-1]
-                left: Array = np.zeros(len(observed))
-                for held in (np.equal(fold, part) & (stretch < count) for part in range(5)):
-                    values = np.linalg.lstsq(design[~held], observed[~held], rcond=None)[0]
-                    left[held] = observed[held] - design[held] @ values
-                losses.append(0.5 * np.bincount(stretch, left ** 2)[:count])
-            gains.append(losses[0] - losses[1])
-        return max(gains, key=prediction_sigmas)
-
-    def robust_evidence(self, rest: RegressionFit, candidate: Candidate) -> tuple[float, float]:
-        # the noise without a slow cause has its wander
-        best, count = fit_causes(self, [*rest.causes, candidate]).best_noise, len(self.wander)
-        rows, wander = self._with_wander(np.vstack([
-            rest.columns, self.rows(candidate, rest.distorted), rest.rows[-1]]), best)
-        given, sought = np.split(rows, [len(rest.columns)])
-        base, _ = np.linalg.qr(np.vstack([given, wander]).T)
-        left = sought.T - base @ (base.T @ sought.T)
-        # along the motion they are similar to errors of an encoder that repeat with its position
-        along = CAUSES[candidate.cause].along in ('rate', 'heading')
-        chance, ratio = _cluster_robust_chance(
-            left[:, :-1], left[:, -1], self.data.clusters[:None if along else 1],
-            slice(-count, self.cosine_count - count or None))
-        return 0.5 * float(chi2.isf(max(chance, 1e-300), 1)) - candidate.penalty, ratio
-
-
-def span_candidate(name: str, *shapes: float) -> Candidate:
-    """Return a cause for the search, whose columns are those of spans."""
-    def columns(spans: Spans, *sizes: float) -> Sequence[Array]:
-        found: Array = (spans.step_columns(np.array(sizes)) if name == 'bias_step'
-                        else spans.cause_columns(CauseTerm(name, sizes)))
-        return [*found.T]
-
-    return Candidate(name, shapes, columns,
-                     amplitude=1.0 if name == SINE_RESPONSE.name else None)
-
-
-def find_span_steps(fit: RegressionFit) -> list[Scored]:
-    """Return the clearest step of the bias of a log as spans."""
-    problem = fit.problem
-    times = problem.spans.time[2:-2]
-    times = times[::math.ceil(len(times) / _STEP_TIMES)]
-    evidence = column_evidence(fit, group_columns(
-        problem, problem.whiten(problem.spans.step_columns(times)),
-        np.arange(len(times))[:, None].tolist()))
-    return best_steps([(times, evidence)], span_candidate)
-
-
-def _cluster_robust_chance(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
-                           cosines: slice) -> tuple[float, float]:
-    """
-    Return the largest p-value of columns by any of the clusterings, and the ratio of variances.
-
-    It is the variance by the scatter of the clusters over that by the noise, at least 1. Evidence
-    against a wander of the bias counts as that of all its cosines, since all of them show its
-    size, although a slow cause is in few of them. Fewer clusters than `MIN_STRETCHES` show none.
-    """
-    size = np.linalg.norm(x, axis=0) + 1e-300
-    axes, lengths, _ = np.linalg.svd(x / size, full_matrices=False)
-    axes = axes[:, lengths > 1e-6]  # columns that depend on each other count once
-    count, found = axes.shape[1], []
-    if not count:
-        return 1.0, 1.0
-    # by the residual with the candidate: scores that contain the effect would overestimate scatter
-    along = axes.T @ residual
-    off = residual - axes @ along
-    for cluster in clusters:
-        scores = np.array([np.bincount(cluster, part * off) for part in axes.T])
-        shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
-        shares[cosines] = shares[cosines].mean()
-        effective = float(shares.sum() ** 2 / (shares ** 2).sum())
-        scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
-        ratio = max(float(np.linalg.eigvalsh(scatter).max()), 1.0)
-        found.append((1.0 if effective < MIN_STRETCHES else float(fisher.sf(
-            along @ along / ratio / count, count, max(effective - count, 1.0))), ratio))
-    return max(found)
-
-
-# the search
-
-def _propose_terms(fit: SpanFit) -> list[CauseTerm]:
-    """
-    Return the causes that headings over spans can show, for the channels that the log has.
-
-    Where too few stretches turn, none that follows the rate can be told from the scale factor
-    error.
-    """
-    log, fine, time = fit.spans.log, fit.spans.treatment.is_fine, fit.spans.time
-    has = {name for name, least in MIN_CHANNEL_RANGE.items()
-           if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
-    terms = [CauseTerm(*each) for each in lasting_shapes(
-        has, float(time[-1] - time[0]), np.asarray(fit.spans.channels.temperature))]
-    fastest = float(np.abs(fit.spans.channels.rate).max())
-    terms += [*[CauseTerm('clock_rate')] * (fit.spans.joined is None),
-              *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
-    return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
-            and not (fit.lacks_turns and _follows_the_rate(each.cause))]
-
-
-def _follows_the_rate(cause: str) -> bool:
-    """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
-    effect = CATALOGUE.get(cause)
-    return (cause == 'clock_rate' or effect is not None
-            and 'rate' in effect.inputs)
-
-
-def _term_of(cause: Candidate) -> CauseTerm:
-    return CauseTerm(cause.cause, cause.shapes)
-
-
-def select_causes(fit: SpanFit, false_alarm_rate: float,
-                  on_progress: OnProgress) -> tuple[SpanFit, list[SelectedCause]]:
-    """Search for causes, and fit again with those that are established."""
-    terms = _propose_terms(fit)
-    candidates = tuple(span_candidate(each.cause, *each.shapes) for each in terms)
-    # noise given one column of each cause, so that it does not absorb their contributions
-    rich = [*{each.cause: each for each in terms if each.cause != SINE_RESPONSE.name}.values()]
-    # of a log with fewer spans than columns, the noise is that without them
-    noise_fit = (fit_spans(fit.spans, rich)
-                 if design_matrix(fit.spans, rich).shape[1] < len(fit.spans.time) - 1 else fit)
-    search = Search(SpanProblem.of(fit, noise_fit), candidates,
-                    false_alarm_rate / (1 + len(indices_by_cause(candidates))),
-                    {'bias_step': find_span_steps}, on_progress=on_progress)
-    causes = search_causes(search)
-    found = [*explain_selection(search, confirm_causes(search, causes))]
-    while established := [_term_of(each.cause) for each in found if each.is_established]:
-        extended = fit_spans(fit.spans, established)
-        worst = max(established,
-                    key=lambda each: _implausibility(extended, each, false_alarm_rate))
-        if _implausibility(extended, worst, false_alarm_rate) < 1.0:
-            return extended, found
-        found = _suspect(found, [worst])
-    return fit, found
-
-
-def _implausibility(fit: SpanFit, cause: CauseTerm, false_alarm_rate: float) -> float:
-    """
-    Return the ratio of an effect to the largest plausible one; inf if it may be 0.
-
-    It may be if it is not significant under the noise that is fitted with it, by which the search
-    does not test: a single value at the level of the search.
-    """
-    places = fit.value_slice(cause)
-    values = fit.values[places]
-    if cause.cause == 'reference_once_per_rev':
-        # from 1 on, the reference would turn back
-        return float(np.hypot(*values))
-    if len(values) == 1 and fit.p_value(places.start) >= false_alarm_rate:
-        return math.inf
-    if (CAUSES[cause.cause].along not in ('rate', 'heading')
-            or cause.cause not in CATALOGUE):
-        return 0.0
-    columns = CATALOGUE[cause.cause].columns(fit.spans.channels, *cause.shapes)
-    added = np.abs(np.tensordot(values, np.array(columns), 1)).max()
-    # of two standard deviations of the prior of a scale factor error, as a share of the rate;
-    # larger ones result from several similar columns that nearly cancel each other
-    return float(added / np.abs(fit.spans.channels.rate).max()) / (
-        2.0 * HEADING_TREATMENT.prior[0])

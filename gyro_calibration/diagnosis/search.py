@@ -18,7 +18,7 @@ that are held out, and if the interval of its size excludes 0.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import combinations
 import math
@@ -470,11 +470,19 @@ class SelectedCause:
     is_established: bool  # whether it is confirmed
     # what it and its alternatives lack in log-likelihood, the best first
     deficits: Mapping[str, float]
+    sizes: Mapping[str, Estimate] = field(default_factory=dict)  # shapes that were refined
+
+    @property
+    def shapes(self) -> dict[str, Estimate]:
+        """Return the fitted shapes, by their names."""
+        return {**self.fit.shapes(self.place), **self.sizes}
 
     @property
     def cause(self) -> Candidate:
         """Return the cause with its shapes."""
-        return self.fit.causes[self.place]
+        known = self.fit.causes[self.place]
+        return replace(known, shapes=tuple(each.estimate for each in self.sizes.values())
+                       or known.shapes)
 
     def finding(self, values: Array, covariance: Array, shapes: Mapping[str, Estimate],
                 observed: Mapping[str, float], sigmas: float, end: float,

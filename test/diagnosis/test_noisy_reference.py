@@ -14,7 +14,7 @@ from dataclasses import replace
 import math
 
 from chance import evidence, seeds
-from diagnosed import established, judge_findings, log_of
+from diagnosed import established, estimates, judge_findings, log_of
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.heading_regression import fit_spans
 from gyro_calibration.calibration.reference_kind import find_drift
@@ -22,8 +22,8 @@ from gyro_calibration.calibration.reference_noise import heading_noise_share
 from gyro_calibration.calibration.spans import lay_out_spans
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.log_diagnosis import diagnose
-from gyro_calibration.diagnosis.noisy_reference import _cluster_robust_chance, select_causes
 from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.span_search import _cluster_robust_chance, select_causes
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -91,6 +91,31 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
     assert {'given', 'plain', 'extended'} <= set(told['gain'])
     assert ('course over ground' in ' '.join(terminal_lines(found))
             and 'course over ground' in render_report(found))
+
+
+@pytest.mark.parametrize('dead_zone', [0.0, 0.5])
+@pytest.mark.parametrize('seed', seeds(6))
+def test_a_dead_zone_is_found_beside_an_encoder_that_errs_more_than_the_gyro(dead_zone, seed):
+    generator = np.random.default_rng(seed)
+    turns = generator.choice([-9.0, -3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0, 9.0], 90)
+    rate = np.convolve(np.repeat(turns * DEGREE, 200), np.hanning(41) / 20.0, 'same')
+    time = np.arange(len(rate)) / 40.0
+    heading = cumulative_trapezoid(rate, time, initial=0.0)
+    output = ((1.0 + SCALE) * np.where(np.abs(rate) < dead_zone * DEGREE, 0.0, rate) + BIAS_TRUE
+              + 0.01 * DEGREE * generator.standard_normal(len(time)))
+    heading = 0.05 * DEGREE * np.round(heading / DEGREE / 0.05)
+    found = diagnosed(Log(time=time, output=output, reference_heading=heading), kind='encoder')
+    named = established(found)
+    assert {*named} - {'time_offset'} == ({'dead_zone'} if dead_zone else set())
+    if dead_zone:
+        size = named['dead_zone'].parameters['dead_zone']
+        low, high = size.interval
+        assert low < dead_zone * DEGREE < high
+        assert size.estimate == pytest.approx(dead_zone * DEGREE, rel=0.3)
+        assert value(found.model, 'dead_zone') == 1.0
+    for name, true in (('scale_factor_error', SCALE), ('bias', BIAS_TRUE)):
+        known, deviation = estimates(found)[name]
+        assert abs(known - true) < 4.0 * deviation
 
 
 @pytest.mark.parametrize('hertz, frequencies, late, lag, noise, step', (
