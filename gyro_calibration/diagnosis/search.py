@@ -470,7 +470,7 @@ class SelectedCause:
     is_established: bool  # whether it is confirmed
     # what it and its alternatives lack in log-likelihood, the best first
     deficits: Mapping[str, float]
-    sizes: Mapping[str, Estimate] = field(default_factory=dict)  # shapes that were refined
+    sizes: Mapping[str, Estimate] = field(default_factory=dict)  # all shapes, if refined
 
     @property
     def shapes(self) -> dict[str, Estimate]:

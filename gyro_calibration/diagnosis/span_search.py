@@ -47,7 +47,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
-
 #: Sizes of each part of the wander of the bias, times of a step, and dead zones that are tried.
 _SIZES, _STEP_TIMES, _DEAD_ZONES = 8, 400, 14
 #: Most rounds in which the rate in a dead zone and its size are found, and sizes tried in each.
@@ -368,12 +367,17 @@ def _refine_dead_zone(fit: SpanFit,
         fit = fit_spans(fit.spans, [*others, CauseTerm(_DEAD_ZONE, (size,))])
     excess = losses - losses[best]
     likely = tried[excess.sum(axis=1) <= 2.0 * np.linalg.norm(excess, axis=1)]
-    rates = np.abs(np.diff(fit.spans.point_means(np.asarray(fit.spans.channels.heading)))
-                   / np.diff(fit.spans.time))
-    change = np.maximum(np.abs(np.diff(rates)), np.finfo(float).tiny)[np.diff(rates < size)]
-    # each pass shows the limit to within a change, a slow one best
-    half = NORMAL_QUANTILE_975 * math.sqrt(max(len(change), 1) / 12.0) / float(
-        np.sum(1.0 / change, initial=1.0 / size))
+    half = _limit_half_width(fit.spans, size)
     known = Estimate(size, (max(float(likely[0]) - half, 0.0), float(likely[-1]) + half), 'rad/s')
     return fit, [replace(each, sizes={_DEAD_ZONE: known}) if each.cause.cause == _DEAD_ZONE
                  else each for each in found]
+
+
+def _limit_half_width(spans: Spans, limit: float) -> float:
+    """Return the half-width, rad/s, of the interval of 95 % of a limit that the rate passes."""
+    rates = np.abs(np.diff(spans.point_means(np.asarray(spans.channels.heading)))
+                   / np.diff(spans.time))
+    change = np.maximum(np.abs(np.diff(rates)), np.finfo(float).tiny)[np.diff(rates < limit)]
+    # each pass shows it to within the change from span to span, a slow pass best
+    return NORMAL_QUANTILE_975 * math.sqrt(max(len(change), 1) / 12.0) / float(
+        np.sum(1.0 / change, initial=1.0 / limit))
