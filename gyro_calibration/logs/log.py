@@ -194,7 +194,7 @@ def _iter_lines(text: io.TextIOWrapper, budget: ExpansionBudget | None) -> Itera
     for line in iter(partial(text.readline, _MAX_LINE_LENGTH + 1), ''):
         if budget:
             budget.spend(len(line))
-        if len(line) < 3 and not line.strip('\r\n') and len(empty) < CACHE_BLOCK_SAMPLES:
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _MAX_LINE_LENGTH:
             empty.append(line)
             continue
         if len(line) > _MAX_LINE_LENGTH:
