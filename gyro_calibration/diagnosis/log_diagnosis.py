@@ -363,14 +363,15 @@ def _drop_unknown_ends(plain: RegressionFit) -> Sequence[Replay]:
     late, likelihood = max((refine_shape(plain, effect_candidate(name, first)) for name, first in (
         *(('time_offset', each) for each in delays), ('bandwidth', 0.1))),
         key=lambda each: each[1])
-    size = late.shapes[0]
     if p_value(late.cause, likelihood - plain.log_likelihood) > FALSE_ALARM_RATE:
         return replays
-    # a lag that begins with the log has decayed to less than 1 % after five time constants
-    first, last = max(size, 0.0) * (5.0 if late.cause == 'bandwidth' else 1.0), max(-size, 0.0)
-    times = [each.channels.time for each in replays]
-    return [drop_samples(each, (time < time[0] + first) | (time > time[-1] - last))
-            for each, time in zip(replays, times)]
+    # a lag, of which a delay may be a part, has decayed to less than 1 % after five time constants
+    reach = 5.0 * abs(late.shapes[0])
+    parts = []
+    for each in replays:
+        time, within = each.channels.time, min(reach, 0.1 * each.duration)
+        parts.append(drop_samples(each, (time < time[0] + within) | (time > time[-1] - within)))
+    return parts
 
 
 def _search_replays(replays: Sequence[Replay], on_progress: OnProgress,

@@ -36,7 +36,8 @@ from scipy.special import logsumexp
 MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
 #: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
 _SLIP_DURATIONS, _MAX_SLIPS = (0.0, 0.1, 0.4), 20
-#: Least time between two slips, and between a slip and a gap where the heading is rounded, s.
+#: Least time between two slips, between a slip and an end of the log, and between a slip and a gap
+#: where the heading is rounded, s.
 _SLIP_INTERVAL = 1.0
 
 #: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
@@ -133,6 +134,9 @@ def find_slips(fit: RegressionFit) -> list[Scored]:
         each = fit.problem.replays[run]
         acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
+        # next to the ends, a response to what was before passes for a slip
+        ends = math.ceil(_SLIP_INTERVAL / each.point_interval)
+        moments = moments[(moments >= ends) & (moments < each.point_count - ends)]
         if acceleration.max() > 0.0 and len(moments):
             tried = [_fit_slips(each, run, left[run], factors[run], moments,
                                 max(width, 0.5 * each.point_interval))

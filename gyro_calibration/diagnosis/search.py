@@ -50,6 +50,8 @@ from scipy.stats import chi2
 _UNNAMED_PENALTY = 4.0
 #: Largest numbers of candidates that are refined in each step, and of causes.
 _MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
+#: Largest number of Gauss-Newton steps.
+_MAX_REFINEMENTS = 12
 
 Causes = tuple[Candidate, ...]
 
@@ -278,8 +280,22 @@ def _select_forward(search: Search) -> Causes:
         more = _with_several(search, named) if one_more is None else (*named, one_more)
         if not more:
             break
-        named = _eliminate_backward(search, refine_jointly(search, more))
+        named = _eliminate_backward(search, refine_jointly(search, _divide_delay(search, more)))
     return named
+
+
+def _divide_delay(search: Search, causes: Causes) -> Causes:
+    """Return causes; if the last joins a delay or a lag, with the likeliest shares of both."""
+    pair = {each.cause: each for each in causes if each.cause in ('time_offset', 'bandwidth')}
+    if len(pair) < 2 or causes[-1].cause not in pair:
+        return causes
+    delay, lag = pair['time_offset'], pair['bandwidth']
+    others = tuple(each for each in causes if each.cause not in pair)
+    whole = (delay if lag is causes[-1] else lag).shapes[0]
+    first = [each.shapes[0] for each in search.candidates if each.cause == 'bandwidth']
+    tried = [(*others, with_shape(delay, 0, whole - share), with_shape(lag, 0, share))
+             for share in (lag.shapes[0], *np.geomspace(min(first), max(first), 13).tolist())]
+    return max(tried, key=lambda some: fit_causes(search.problem, some).log_likelihood)
 
 
 def _with_several(search: Search, causes: Causes) -> Causes:
@@ -346,17 +362,24 @@ def _without(causes: Sequence[Candidate], place: int) -> Causes:
 
 def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
     """Refine all shapes and values together by Gauss-Newton steps."""
-    current = list(causes)
-    for _ in range(3 if causes else 0):
+    current, moved = list(causes), math.inf
+    for _ in range(_MAX_REFINEMENTS if causes else 0):
+        if moved < 0.1:  # standard deviations
+            break
         fit = fit_causes(search.problem, current)
-        own = dict(zip(fit.column_owners, fit.estimates[0].tolist()))
+        own = dict(zip(fit.column_owners, zip(
+            fit.estimates[0].tolist(), np.sqrt(np.diag(fit.estimates[1])).tolist())))
+        # without values, the derivatives by shapes are not in the fit
+        moved = 0.0 if all(each.values for each in current) else math.inf
         for place, candidate in enumerate(fit.causes):
-            values = tuple(own.get((place, number), 0.0)
+            values = tuple(own.get((place, number), (0.0,))[0]
                            for number in range(fit.column_counts[place]))
             for shape in fitted_shape_indices(candidate):
-                most = 0.3 * abs(candidate.shapes[shape])
-                change = np.clip(own.get((place, -1 - shape), 0.0), -most, most)
-                candidate = with_shape(candidate, shape, candidate.shapes[shape] + float(change))
+                change, deviation = own.get((place, -1 - shape), (0.0, 1.0))
+                moved = max(moved, abs(change) / deviation)
+                most = 0.3 * abs(candidate.shapes[shape]) + 3.0 * deviation
+                candidate = with_shape(candidate, shape, candidate.shapes[shape]
+                                       + float(np.clip(change, -most, most)))
             current[place] = replace(candidate, values=values or (candidate.amplitude or 0.0,))
     return tuple(current)
 

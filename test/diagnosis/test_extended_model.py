@@ -337,3 +337,19 @@ def test_a_filter_that_has_no_name_is_not_in_the_scale_factor_error(seed, order,
                           if each[0] == 'scale_factor_error')
     assert abs(size - 0.004) < 4.0 * deviation < 3e-4
     assert found.noise.angle_random_walk < 1e-4
+
+
+@pytest.mark.parametrize('lag, delay', [(0.012, -0.03), (0.06, 0.05)])
+@pytest.mark.parametrize('seed', seeds(1))
+def test_a_lag_and_a_delay_together_have_both_values(seed, lag, delay):
+    generator, smooth = np.random.default_rng(seed), np.hanning(300) / np.hanning(300).sum()
+    rate = np.convolve(np.repeat(generator.uniform(-1.0, 1.0, 120), 1000), smooth, 'same')
+    kept = np.exp(-0.001 / lag)
+    late = np.roll(lfilter([1.0 - kept], [1.0, -kept], rate), round(1000.0 * delay))
+    used = slice(1000, -1000, 10)
+    log = Log(time=0.001 * np.arange(120000)[used], reference_rate=rate[used],
+              output=late[used] + 3e-4 * generator.standard_normal(len(rate[used])))
+    found = diagnose([log], np.random.default_rng(0))
+    sizes = {each.effect: each.parameters[each.effect].estimate for each in found.findings}
+    # the filter, in steps of 1 ms, is 0.5 ms early
+    assert sizes == pytest.approx({'bandwidth': lag, 'time_offset': delay - 0.0005}, abs=4e-4)
