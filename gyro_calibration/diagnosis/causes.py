@@ -289,7 +289,8 @@ def add_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
 
     def remedy(effect: str) -> str:
         origin = CAUSES[effect].origin
-        return ('' if origin == 'gyro' and effect not in inside
+        return ('find its cause; the extended model does not contain it'
+                if origin == 'gyro' and effect not in inside
                 else _REMEDIES.get(effect, _REMEDIES[origin]))
 
     return [replace(each, share_of_heading_error=shares.get(each.effect),

@@ -18,13 +18,12 @@ import zlib
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
 from gyro_calibration.diagnosis.causes import (
-    cause_parameters, CAUSES, next_experiment,
-    value_finding)
-from gyro_calibration.diagnosis.findings import (
-    MIN_PREDICTION_SIGMAS, prediction_sigmas)
+    add_remedies, cause_parameters, CAUSES, next_experiment, sized_finding, value_finding)
+from gyro_calibration.diagnosis.findings import MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import QUANTITIES
 from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
+from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden import hide
 from gyro_calibration_bench.hidden.conditions import hide_look_alike, LOOK_ALIKES
 import numpy as np
@@ -160,3 +159,10 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(text, message, tm
         (tmp_path / 'own.py').write_text(text)
     code, _, error = run('allan', 'log.csv', '--catalogue', tmp_path / 'own.py')
     assert code == 2 and message in error and error.count('\n') == 1
+
+
+def test_a_cause_that_the_model_does_not_contain_has_a_remedy_too():
+    found = sized_finding('dead_zone', 0.01, 0.001, 1e-9)
+    inside = GyroModel((Term(CATALOGUE['dead_zone'], (0.01,)),))
+    remedies = {add_remedies([found], {}, model)[0].remedy for model in (inside, GyroModel())}
+    assert len(remedies) == 2 and all(remedies)
