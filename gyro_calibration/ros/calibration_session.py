@@ -236,7 +236,7 @@ class CalibrationSession:
                 return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, faster than '
                         f'{limit / DEGREE:.0f} deg/s, from which a robot stops in '
                         f'{_STOPPING_DURATION:g} s: correct calibration.profile_file')
-        if drives and obstacle:
+        if obstacle:
             return obstacle
         now = self._clock.steady()
         if drives and now - self._last_foreign_command < 1.0:

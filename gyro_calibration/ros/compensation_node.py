@@ -35,7 +35,7 @@ from gyro_calibration.logs.cdr import (
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import MotionError
 from gyro_calibration.ros.calibration_session import (
-    Drive, read_profile, REST, ROS_TIME_PAUSED)
+    Drive, PROFILE, read_profile, REST, ROS_TIME_PAUSED)
 from gyro_calibration.ros.inputs import Clock, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
@@ -247,8 +247,9 @@ class CompensationNode(Node):
 
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
         """Begin a run, which `_answer_finished_run` answers, or refuse with the reason."""
-        session, values, obstacle = self._pipeline.session, self._pipeline.values, ''
-        if values.calibration_drive:
+        session, values = self._pipeline.session, self._pipeline.values
+        obstacle = self._pipeline.gyro_conflict
+        if kind == PROFILE and values.calibration_drive:
             obstacle = self._offer_velocity() or self._pipeline.find_obstacle()
         if refusal := session.begin(kind, values, obstacle):
             return self._refuse(response, refusal)

@@ -573,14 +573,19 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._trusted_heading = tracker.heading, tracker.variance
 
+    @property
+    def gyro_conflict(self) -> str:
+        """Return why the samples may be those of another gyro, or of several; else ''."""
+        faults = self.faults
+        return self.conflict or faults['frame'] or faults['alternation']
+
     def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
         if self.ros_time.paused_duration > FAULT_DURATION:
             return ROS_TIME_PAUSED
-        faults = self.faults
-        if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
-                or faults['clock'] or faults['frame'] or faults['alternation']):
+        if (fault := self.gyro_conflict or self.publisher_conflict or self.repeat_fault
+                or self.faults['clock']):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
@@ -600,7 +605,8 @@ class Pipeline:
         """Check that time and samples advance; to be called several times per second."""
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
-        conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
+        conflict = self.gyro_conflict or (
+            self.publisher_conflict if self.session.is_driving else '')
         if self._clock.steady() - self.journal.last_received > RunLimits.max_gap:
             conflict = conflict or self.journal.refusal
         self.session.poll(self.values, receivers,

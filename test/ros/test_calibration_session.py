@@ -571,6 +571,21 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     assert not success and words in message, message
 
 
+@pytest.mark.parametrize('kind, drives', [(PROFILE, True), (PROFILE, False), (REST, True)])
+def test_samples_of_another_frame_end_a_calibration_and_none_begins_with_them(
+        tmp_path, kind, drives):
+    """What they show would be stored as the calibration of the first gyro."""
+    rig = rested(tmp_path, calibration_drive=drives)
+    assert not rig.begin(kind)
+    rig.go(3.0)
+    rig.sample = lambda stamp, output, heading: rig.pipeline.add_sample(
+        stamp, output, receivers=1, frame='other')
+    success, message = rig.end(1.0)
+    assert not success and "have the frame 'other'" in message, message
+    assert "have the frame 'other'" in rig.begin(kind)
+    assert not rig.calibration_file.exists()
+
+
 def test_turns_that_are_not_finished_are_given_up():
     run = CalibrationRun(TURNS, math.inf, 0.0)
     for time in (0.0, FINISH_TIMEOUT, FINISH_TIMEOUT + 1.0):
