@@ -39,7 +39,7 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION, MIN_TURN_ANGLE, REST,
+    CalibrationSession, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION, MIN_TURN_ANGLE, PROFILE, REST,
     ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
@@ -150,7 +150,8 @@ class Pipeline:
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
         self.conflict = ''  # why samples cannot be used
-        self.output_conflict = ''  # which other nodes publish on the topics of the results
+        # that several nodes publish on another topic, by its role: `ODOMETRY` of calibrations
+        self.topic_conflicts: dict[str, str] = {}
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -573,18 +574,18 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._trusted_heading = tracker.heading, tracker.variance
 
-    @property
-    def gyro_conflict(self) -> str:
-        """Return why the samples may be those of another gyro, or of several; else ''."""
+    def find_conflict(self, kind: str) -> str:
+        """Return why a calibration of a kind may mix gyros or odometries; else ''."""
         faults = self.faults
-        return self.conflict or faults['frame'] or faults['alternation']
+        return (self.conflict or faults['frame'] or faults['alternation']
+                or self.topic_conflicts.get(kind, ''))
 
     def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
         if self.ros_time.paused_duration > FAULT_DURATION:
             return ROS_TIME_PAUSED
-        if (fault := self.gyro_conflict or self.publisher_conflict or self.repeat_fault
+        if (fault := self.find_conflict(PROFILE) or self.publisher_conflict or self.repeat_fault
                 or self.faults['clock']):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
@@ -605,7 +606,7 @@ class Pipeline:
         """Check that time and samples advance; to be called several times per second."""
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
-        conflict = self.gyro_conflict or (
+        conflict = self.find_conflict(self.session.run.kind if self.session.run else '') or (
             self.publisher_conflict if self.session.is_driving else '')
         if self._clock.steady() - self.journal.last_received > RunLimits.max_gap:
             conflict = conflict or self.journal.refusal

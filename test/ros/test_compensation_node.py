@@ -38,9 +38,10 @@ try:
     from diagnostic_msgs.msg import DiagnosticArray
     from gyro_calibration.ros.compensation_node import CompensationNode
     from gyro_calibration.ros.runner import SENSOR_QOS
+    from nav_msgs.msg import Odometry
     from rclpy.qos import ReliabilityPolicy
     from robot_faults import Fault, FAULTS, Stage
-    from sensor_msgs.msg import Imu
+    from sensor_msgs.msg import Imu, Temperature
     from std_srvs.srv import Trigger
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
@@ -108,15 +109,20 @@ def test_what_is_published(hold, tmp_path):
     assert imus[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
 
 
-def test_another_node_on_the_topics_of_the_results_is_a_warning(hold):
-    held = hold()
-    held.node.create_publisher(Imu, 'imu/data', 10)
+@pytest.mark.parametrize('topic', ['/imu/data', '/imu/temperature', '/odom'])
+def test_another_node_on_a_topic_is_a_warning_and_no_calibration_mixes_odometries(hold, topic):
+    held = hold(calibration__reference='odometry')
+    kind = {'/imu/data': Imu, '/imu/temperature': Temperature, '/odom': Odometry}[topic]
+    for _ in range(1 + (topic != '/imu/data')):  # where the node itself publishes
+        held.node.create_publisher(kind, topic, 10)
     held.tick(5)
     held.send('/imu/data_raw', sample(0, 0.0))
     held.tick(5)
     status, = held.sent['/diagnostics'][-1].status
-    assert status.level == status.WARN
-    assert 'several nodes publish on /imu/data (/compensation_node, ' in status.message
+    words = f'several nodes publish on {topic} (/compensation_node, '
+    assert status.level == status.WARN and words in status.message
+    answer = held.call('/compensation_node/calibrate', Trigger)
+    assert (words in getattr(answer, 'message', '')) == (topic == '/odom')
 
 
 def test_an_orientation_that_is_none_has_no_heading_and_raises_nothing():
