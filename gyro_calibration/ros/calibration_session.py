@@ -412,7 +412,7 @@ class CalibrationSession:
                 f'{calibration}, from {len(run.times)} samples', remark, trouble]))
         except DataRefused as error:
             cause = drive.describe_lateness(run.limits) if drive and not run.end_reason else ''
-            return False, f'{cause} (the run shows: {error})' if cause else str(error)
+            return False, f'{error}; besides, {cause}' if cause else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:

@@ -315,10 +315,19 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     rig.hold_up_samples(lambda: rig.clock.now % 0.8 < 0.3)
     rig.pipeline.poll = lambda count: rig.clock.now % 0.8 < 0.3 or poll(count)
     success, message = rig.calibrate()
-    assert not success and 'this computer was busy: commands were up to 0.' in message
-    assert '(the run shows: ' in message
+    assert not success and '; besides, this computer was busy: commands were up to 0.' in message
     commands, samples = rig.session.max_lateness
     assert 0.1 < commands < 0.7 and 0.1 < samples < 0.7
+
+
+def test_a_refusal_names_first_what_no_load_explains(tmp_path):
+    """Samples that are 30 ms late are usual, and turn no gyro the other way."""
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.robot.distort = lambda output: -output
+    rig.hold_up_samples(lambda: rig.clock.now % 0.8 < 0.04)
+    success, message = rig.calibrate()
+    assert not success and message.startswith('the gyro turns the other way'), message
+    assert 'this computer was busy' in message
 
 
 def test_samples_that_are_held_up_do_not_hold_up_the_motion(tmp_path):
