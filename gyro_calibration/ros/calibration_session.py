@@ -405,6 +405,11 @@ class CalibrationSession:
                 calibration = replace(
                     calibration, scale_factor_error=last.scale_factor_error,
                     covariance=((known[0][0], 0.0), (0.0, calibration.covariance[1][1])))
+                rest = self._monitor.last_rest
+                if rest and self._monitor.bias_alarm:
+                    remark = (f'by the bias until now the rate was {rest.bias / DEGREE:.2f} deg/s,'
+                              f' {rest.sigmas:.0f} sigma from rest: if the robot turned evenly, '
+                              'let it stand and run again')
             trouble = self._store.store_calibration(calibration)
             estimator.use_calibration(self._store.model, now.timestamp())
             self._monitor.reset_biases()

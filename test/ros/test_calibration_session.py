@@ -580,6 +580,18 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     assert not success and words in message, message
 
 
+@pytest.mark.parametrize('turn, words', [(0.03, 'the rate was 1.78 deg/s'), (0.0, '')])
+def test_calibrate_bias_says_by_how_much_the_bias_has_changed(tmp_path, turn, words):
+    """Only the robot's owner knows whether it has turned evenly, without odom."""
+    rig = Rig(tmp_path, robot=Robot(bias=0.01))
+    rig.odometry = lambda stamp, reading: None
+    assert rig.calibrate(REST)[0]
+    rig.turn(turn, 3.0)
+    success, message = rig.calibrate(REST)
+    assert success and ('if the robot turned evenly' in message) == bool(words)
+    assert words in message, message
+
+
 @pytest.mark.parametrize('kind, drives', [(PROFILE, True), (PROFILE, False), (REST, True)])
 def test_samples_of_another_frame_end_a_calibration_and_none_begins_with_them(
         tmp_path, kind, drives):
