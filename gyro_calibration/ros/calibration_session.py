@@ -340,7 +340,7 @@ class CalibrationSession:
     def interrupt(self, reason: str) -> None:
         """End a run in which the integration was restarted."""
         if self.run and self.run.times:
-            self.end(f'{reason}: check the cable of the gyro and run again')
+            self.end(f'{reason}: check gyro, driver and clock, and run again')
 
     def _command_if_due(self) -> None:
         """Send the next command if it is due, at samples and polls: simulations may be fast."""

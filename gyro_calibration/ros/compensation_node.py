@@ -83,7 +83,7 @@ class CompensationNode(Node):
         self._velocity_type = TwistStamped if values.cmd_vel_stamped else Twist
         name = self.get_fully_qualified_name().strip('/').replace('/', '_')
         file = values.calibration_file or os.path.join(
-            os.environ.get('ROS_HOME', '~/.ros'), 'gyro_calibration', f'{name}.yaml')
+            os.environ.get('ROS_HOME') or '~/.ros', 'gyro_calibration', f'{name}.yaml')
         self._pipeline = Pipeline(values, Path(os.path.expanduser(file)), clock,
                                   self._publish_command)
         if problem := self._pipeline.store.problem:

@@ -238,7 +238,8 @@ class Pipeline:
         if odd or estimator.refused_temperature_count > refused:
             counts['refused_temperatures'] += 1
             self.journal.event = (f'a temperature of {value:g} degC is implausible'
-                                  f'{f" after {known:g} degC" if odd else ""} and not used')
+                                  f'{f" after {known:g} degC" if odd else ""} and not used: '
+                                  'check the sensor, and that its driver sends degC')
 
     def add_odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Add a heading, rad, and a velocity by the odometry."""
@@ -360,7 +361,7 @@ class Pipeline:
         if not max(0, -self._stamp_offset) <= stamp < end - max(0, self._stamp_offset):
             counts['refused_samples'] += 1
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
-                             'time; the sample is not used')
+                             'time, and the sample is not used: check the clock of the driver')
             return None
         silence = now - self._last_arrival
         if self.publisher_conflict:
@@ -474,7 +475,8 @@ class Pipeline:
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
             journal.event = journal.refusal = (
-                'a sample without a rate (nan, or -1 in its covariance) is not used'
+                'a sample without a rate (nan, or -1 in its covariance) is not used: check the '
+                'gyro and its driver'
                 if math.isnan(output) else
                 f'a rate of {output:g} rad/s is beyond the range of this gyro, and not used: '
                 'check that the driver sends rad/s, and the range of the model')

@@ -30,6 +30,7 @@ import time
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.logs.cdr import quaternion_heading, UNMEASURED_VARIANCE
+from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
@@ -129,6 +130,14 @@ def test_an_orientation_that_is_none_has_no_heading_and_raises_nothing():
     assert quaternion_heading(0.0, 0.0, math.sin(0.3), math.cos(0.3)) == pytest.approx(0.6)
     for value in (0.0, 1e200, -1.7e308, math.inf, math.nan):
         assert math.isnan(quaternion_heading(value, value, value, value))
+
+
+def test_an_empty_ros_home_is_none_as_for_ros_itself(hold_node, monkeypatch, tmp_path):
+    monkeypatch.setenv('ROS_HOME', '')
+    monkeypatch.setenv('HOME', str(tmp_path))
+    store = hold_node(CompensationNode).node._pipeline.store
+    store.store_calibration(SelfCalibration(0.01, 0.02))
+    assert (tmp_path / '.ros' / 'gyro_calibration' / 'compensation_node.yaml').is_file()
 
 
 def test_names_types_and_qualities_are_those_of_the_documents(hold):
