@@ -330,13 +330,17 @@ class CompensationNode(Node):
         assert self._velocity is not None  # `_offer_velocity` comes before a run
         self._velocity.publish(message)
 
+    def stop_robot(self, reason: str) -> None:
+        """End a run by a reason, answer it, and wait until the robot has the command to stop."""
+        self._pipeline.session.end(reason)
+        self._answer_finished_run()
+        if self._velocity:
+            self._velocity.wait_for_all_acked(Duration(seconds=1.0))
+
     def destroy_node(self) -> None:
         """Stop the robot, store the bias table, answer a run, and destroy the node."""
         if hasattr(self, '_pipeline'):  # not where a parameter was refused
-            self._pipeline.session.end('this node was ended: start it, and run again')
-            self._answer_finished_run()
-            if self._velocity:
-                self._velocity.wait_for_all_acked(Duration(seconds=1.0))
+            self.stop_robot('this node was ended: start it, and run again')
             self._pipeline.run_periodic_tasks(is_final=True)
         super().destroy_node()
 

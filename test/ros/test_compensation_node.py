@@ -212,12 +212,17 @@ def killed_softly(stage):
     assert stage.process.wait(30.0) == 0
 
 
+def pause(stage):
+    stage.process.send_signal(signal.SIGTSTP)
+
+
 @pytest.mark.parametrize('name, words', [
     ('clock_absent', 'ROS time stands still'), ('clock_paused', 'ROS time stands still'),
-    ('ended', 'this node was ended')])
+    ('ended', 'this node was ended'), ('paused', 'this node was stopped by Ctrl-Z')])
 def test_a_fault_ends_a_drive_with_a_zero_and_an_answer(ros_domain, tmp_path, name, words):
     """Where a busy machine ended the drive before the fault did, it is tried again."""
-    fault = replace({**FAULTS, 'ended': Fault('', killed_softly)}[name], seconds=3.0)
+    faults = {**FAULTS, 'ended': Fault('', killed_softly), 'paused': Fault('', pause)}
+    fault = replace(faults[name], seconds=3.0)
     for _ in range(5):
         with ExitStack() as closing:
             stage = Stage(tmp_path, closing)
@@ -229,7 +234,7 @@ def test_a_fault_ends_a_drive_with_a_zero_and_an_answer(ros_domain, tmp_path, na
     assert 'Traceback' not in printed and not row.still
     driven = any(rate for _, rate in stage.robot.commands)
     assert row.zero < 2.0 if driven else name == 'clock_absent'
-    assert name == 'ended' or (row.level == 'ERROR' and words in row.message)
+    assert name in ('ended', 'paused') or (row.level == 'ERROR' and words in row.message)
 
 
 # The graph under faults: any order of starting, killed and stalled nodes
