@@ -36,7 +36,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import MotionError
 from gyro_calibration.ros.calibration_session import (
     Drive, ODOMETRY, PROFILE, read_profile, REST, ROS_TIME_PAUSED)
-from gyro_calibration.ros.inputs import Clock, Velocity
+from gyro_calibration.ros.inputs import Clock, ODOMETRY as ODOM, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
     call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK, publish_on, Report,
@@ -465,6 +465,10 @@ class CompensationReport:
                      for channel in ('supply', 'specific_force')
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
+        if (pipeline.values.wheels in ('odom', 'both')
+                and pipeline.wheels.is_moving(now, (ODOM,)) is None):
+            warnings.append('nothing that can be used comes on odom, which wheels was set to: '
+                            'remap odom to the odometry of the wheels, or set wheels to another')
         warnings += [
             *pipeline.topic_conflicts.values(), store.calibration_hint, store.shared_hint,
             monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,

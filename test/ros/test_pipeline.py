@@ -742,6 +742,18 @@ def test_the_diagnostics_name_what_is_wrong_within_two_seconds(
     assert (found, words in message) == (level, True), message
 
 
+@pytest.mark.parametrize('wheels, warns', [
+    ('odom', True), ('both', True), ('none', False), ('cmd_vel', False)])
+def test_wheels_by_an_odometry_that_does_not_come_are_a_warning(
+        tmp_path, reported, wheels, warns):
+    rig = rested(tmp_path, wheels=wheels)
+    assert reported(rig)[0] == OK
+    rig.odometry = lambda stamp, reading: None
+    rig.go(3.0)
+    level, message, _ = reported(rig)
+    assert (level == WARN and 'remap odom to the odometry' in message) == warns, message
+
+
 def test_lost_samples_hide_no_worse_warning_and_are_reported_with_it(tmp_path, reported):
     rig, count = rested(tmp_path), itertools.count()
     sample = rig.sample
