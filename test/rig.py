@@ -251,7 +251,7 @@ class Rig:
 
     def begin(self, kind=PROFILE):
         drive = self.pipeline.values.calibration_drive and kind == PROFILE
-        obstacle = self.pipeline.find_obstacle() if drive else ''
+        obstacle = self.pipeline.find_obstacle() if drive else self.pipeline.find_conflict(kind)
         return self.session.begin(kind, self.pipeline.values, obstacle)
 
     @property

@@ -400,6 +400,7 @@ class _TopicSession:
         self._messages, self._samples, self._damaged, self._is_waiting = 0, 0, 0, True
         self._received: dict[str, str] = {}  # role -> topic
         self._previous, self._intervals, self._clock_steps = (0, 0), Intervals(), 0
+        self._conflicts: dict[str, str] = {}  # topics with several publishers, as of the node
         self._given, self._stop, self._start_time = given, stop, time.monotonic()
         self.recorder = McapRecorder(given.out if self._is_mcap else f'{given.out}.mcap',
                                      lambda: _recording_notes(topics=', '.join(self._roles)))
@@ -411,6 +412,7 @@ class _TopicSession:
     def record(self, on_chunk: Callable[[], None]) -> None:
         def tick(node: Any) -> None:
             on_chunk()
+            self._conflicts = node.conflicts
             if self._is_waiting and time.monotonic() - self._start_time > 5.0:
                 self._is_waiting = False
                 if missing := node.missing_topics:
@@ -461,8 +463,9 @@ class _TopicSession:
             except (InputError, OSError) as error:
                 raise DataRefused(f'{error}; what was recorded is in {recording}') from None
             os.unlink(recording)
-        remarks = ([f'{self._damaged} messages of the gyro could not be read.']
-                   if self._damaged else [])
+        remarks = [*self._conflicts.values()]
+        if self._damaged:
+            remarks.append(f'{self._damaged} messages of the gyro could not be read.')
         if self._clock_steps:
             remarks.append(f'The clock of the stamps was set {self._clock_steps} times.')
         return {'messages': self._messages}, remarks

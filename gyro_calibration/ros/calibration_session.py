@@ -236,7 +236,7 @@ class CalibrationSession:
                 return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, faster than '
                         f'{limit / DEGREE:.0f} deg/s, from which a robot stops in '
                         f'{_STOPPING_DURATION:g} s: correct calibration.profile_file')
-        if drives and obstacle:
+        if obstacle:
             return obstacle
         now = self._clock.steady()
         if drives and now - self._last_foreign_command < 1.0:
@@ -340,7 +340,7 @@ class CalibrationSession:
     def interrupt(self, reason: str) -> None:
         """End a run in which the integration was restarted."""
         if self.run and self.run.times:
-            self.end(f'{reason}: check the cable of the gyro and run again')
+            self.end(f'{reason}: check gyro, driver and clock, and run again')
 
     def _command_if_due(self) -> None:
         """Send the next command if it is due, at samples and polls: simulations may be fast."""
@@ -405,6 +405,11 @@ class CalibrationSession:
                 calibration = replace(
                     calibration, scale_factor_error=last.scale_factor_error,
                     covariance=((known[0][0], 0.0), (0.0, calibration.covariance[1][1])))
+                rest = self._monitor.last_rest
+                if rest and self._monitor.bias_alarm:
+                    remark = (f'by the bias until now the rate was {rest.bias / DEGREE:.2f} deg/s,'
+                              f' {rest.sigmas:.0f} sigma from rest: if the robot turned evenly, '
+                              'let it stand and run again')
             trouble = self._store.store_calibration(calibration)
             estimator.use_calibration(self._store.model, now.timestamp())
             self._monitor.reset_biases()
@@ -412,7 +417,7 @@ class CalibrationSession:
                 f'{calibration}, from {len(run.times)} samples', remark, trouble]))
         except DataRefused as error:
             cause = drive.describe_lateness(run.limits) if drive and not run.end_reason else ''
-            return False, f'{cause} (the run shows: {error})' if cause else str(error)
+            return False, f'{error}; besides, {cause}' if cause else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:

@@ -35,8 +35,8 @@ from gyro_calibration.logs.cdr import (
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import MotionError
 from gyro_calibration.ros.calibration_session import (
-    Drive, read_profile, REST, ROS_TIME_PAUSED)
-from gyro_calibration.ros.inputs import Clock, Velocity
+    Drive, ODOMETRY, PROFILE, read_profile, REST, ROS_TIME_PAUSED)
+from gyro_calibration.ros.inputs import Clock, ODOMETRY as ODOM, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
     call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK, publish_on, Report,
@@ -83,7 +83,7 @@ class CompensationNode(Node):
         self._velocity_type = TwistStamped if values.cmd_vel_stamped else Twist
         name = self.get_fully_qualified_name().strip('/').replace('/', '_')
         file = values.calibration_file or os.path.join(
-            os.environ.get('ROS_HOME', '~/.ros'), 'gyro_calibration', f'{name}.yaml')
+            os.environ.get('ROS_HOME') or '~/.ros', 'gyro_calibration', f'{name}.yaml')
         self._pipeline = Pipeline(values, Path(os.path.expanduser(file)), clock,
                                   self._publish_command)
         if problem := self._pipeline.store.problem:
@@ -101,11 +101,15 @@ class CompensationNode(Node):
         self._yaw_rate = publish_on(self, TwistWithCovarianceStamped, 'yaw_rate')
         self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
         self._has_subscribers = {self._heading: False, self._yaw_rate: False}
-        subscribe_to(self, Temperature, 'imu/temperature',
-                     lambda message: self._pipeline.add_temperature(
-                         _stamp_ns(message.header), message.temperature))
+        temperatures = subscribe_to(self, Temperature, 'imu/temperature',
+                                    lambda message: self._pipeline.add_temperature(
+                                        _stamp_ns(message.header), message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
-        subscribe_to(self, Odometry, 'odom', self._on_odometry)
+        odometry = subscribe_to(self, Odometry, 'odom', self._on_odometry)
+        self._other_topics = {
+            ODOMETRY: odometry.topic_name, 'temperature': temperatures.topic_name,
+            'imu': self._imu.topic_name, 'heading': self._heading.topic_name,
+            'yaw_rate': self._yaw_rate.topic_name}
         subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
         if values.calibration_drive:
             self._offer_velocity()  # calibrate reports a failure
@@ -217,11 +221,11 @@ class CompensationNode(Node):
 
     def _poll_graph(self) -> None:
         self._pipeline.update_publishers(self._publishers_on(self._samples.topic_name))
-        outputs = (each.topic_name for each in (self._imu, self._heading, self._yaw_rate))
-        self._pipeline.output_conflict = next((
-            f'several nodes publish on {each} ({", ".join(sorted(self._publishers_on(each)))}), '
-            'and a receiver cannot distinguish them: end or remap the other'
-            for each in outputs if self.count_publishers(each) > 1), '')
+        self._pipeline.topic_conflicts = {
+            role: f'several nodes publish on {topic} '
+            f'({", ".join(sorted(self._publishers_on(topic)))}), and a receiver cannot '
+            'distinguish them: end or remap the other'
+            for role, topic in self._other_topics.items() if self.count_publishers(topic) > 1}
         self._has_subscribers = {each: each.get_subscription_count() > 0
                                  for each in self._has_subscribers}
         self._count_receivers()
@@ -247,8 +251,9 @@ class CompensationNode(Node):
 
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
         """Begin a run, which `_answer_finished_run` answers, or refuse with the reason."""
-        session, values, obstacle = self._pipeline.session, self._pipeline.values, ''
-        if values.calibration_drive:
+        session, values = self._pipeline.session, self._pipeline.values
+        obstacle = self._pipeline.find_conflict(kind)
+        if kind == PROFILE and values.calibration_drive:
             obstacle = self._offer_velocity() or self._pipeline.find_obstacle()
         if refusal := session.begin(kind, values, obstacle):
             return self._refuse(response, refusal)
@@ -325,13 +330,17 @@ class CompensationNode(Node):
         assert self._velocity is not None  # `_offer_velocity` comes before a run
         self._velocity.publish(message)
 
+    def stop_robot(self, reason: str) -> None:
+        """End a run by a reason, answer it, and wait until the robot has the command to stop."""
+        self._pipeline.session.end(reason)
+        self._answer_finished_run()
+        if self._velocity:
+            self._velocity.wait_for_all_acked(Duration(seconds=1.0))
+
     def destroy_node(self) -> None:
         """Stop the robot, store the bias table, answer a run, and destroy the node."""
         if hasattr(self, '_pipeline'):  # not where a parameter was refused
-            self._pipeline.session.end('this node was ended: start it, and run again')
-            self._answer_finished_run()
-            if self._velocity:
-                self._velocity.wait_for_all_acked(Duration(seconds=1.0))
+            self.stop_robot('this node was ended: start it, and run again')
             self._pipeline.run_periodic_tasks(is_final=True)
         super().destroy_node()
 
@@ -348,7 +357,7 @@ class CompensationReport:
 
     def make(self) -> Report:
         """Return level, message and values; only counts that increase give warnings."""
-        level, message = self._evaluate()
+        level, (message, *others) = self._evaluate()
         pipeline, journal, now = self._pipeline, self._pipeline.journal, self._clock.steady()
         estimator, monitor, store = pipeline.estimator, pipeline.monitor, pipeline.store
         tracker, temperature, model = estimator.tracker, estimator.temperature, estimator.model
@@ -371,7 +380,7 @@ class CompensationReport:
             'temperature_range_degc': (f'{low:g} to {high:g}'
                                        if model.uses_channel('temperature') else ''),
             'command_lateness_s': f'{commands:.3f}', 'sample_lateness_s': f'{samples:.3f}',
-            'last_event': journal.event}
+            'last_event': journal.event, 'other_warnings': ' | '.join(others)}
 
         bias, deviation = tracker.bias
         slowest, age = tracker.slowest_detectable_rate / DEGREE, pipeline.wheels.age(now)
@@ -409,8 +418,8 @@ class CompensationReport:
             'bias_table_written_min': '' if written is None else f'{(date - written) / 60.0:.1f}',
             'bias_table': store.table_hint}
 
-    def _evaluate(self) -> tuple[bytes, str]:
-        """Return level and message: the first error, else the first warning."""
+    def _evaluate(self) -> tuple[bytes, list[str]]:
+        """Return level and sentences: the first error, else the warnings, the worst one first."""
         pipeline, journal = self._pipeline, self._pipeline.journal
         tolerated = {'lost_samples': 3}  # per report
         growing = {name for name, count in journal.counts.items()
@@ -422,29 +431,29 @@ class CompensationReport:
                      or pipeline.wheels.is_moving(now) else '')
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.publisher_conflict
                      or pipeline.repeat_fault or suspicion):
-            return ERROR, error
+            return ERROR, [error]
         if pipeline.ros_time.paused_duration > 1.0:
-            return ERROR, ROS_TIME_PAUSED
+            return ERROR, [ROS_TIME_PAUSED]
         if silent > 1.0 and 'repeated_stamps' in growing or silent <= 1.0 and 'rebuilt' in growing:
-            return ERROR, journal.event
+            return ERROR, [journal.event]
         if silent > 1.0:
             why = journal.event if 'refused_samples' in growing else 'is the driver running?'
-            return ERROR, f'no samples on imu/data_raw for {silent:.0f} s: {why}'
+            return ERROR, [f'no samples on imu/data_raw for {silent:.0f} s: {why}']
 
         estimator, store, monitor = pipeline.estimator, pipeline.store, pipeline.monitor
         low, high = estimator.model.valid_temperatures
-        warnings = [text for name, text in {
-            'restarts': journal.event, 'repeated_stamps': journal.event,
-            'refused_samples': journal.event, 'refused_temperatures': journal.event,
+        warnings = [pipeline.session.warning, pipeline.repeat_suspicion,
+                    *pipeline.faults.values()]
+        if growing & {'restarts', 'repeated_stamps', 'refused_samples', 'refused_temperatures'}:
+            warnings.append(journal.event)
+        warnings.append(pipeline.heading_loss)
+        warnings += [text for name, text in {
             'lost_samples': 'samples are lost: check the cable, the baud rate and the load of the '
             'computer; the heading is integrated over the gaps, and its variance includes them',
             'beyond_range': 'the rate is beyond the calibrated range: extrapolated',
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
             f'{high:g} degC; the correction is extrapolated, and its variance increases',
         }.items() if name in growing]
-        warnings += filter(None, (
-            pipeline.session.warning, pipeline.repeat_suspicion, *pipeline.faults.values(),
-            pipeline.heading_loss))
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
             warnings.append('no temperature comes; the reference of the model is used, '
                             f'{estimator.model.reference_temperature:g} degC')
@@ -456,15 +465,19 @@ class CompensationReport:
                      for channel in ('supply', 'specific_force')
                      if estimator.current_model.uses_channel(channel)
                      and channel not in journal.channels]
-        warnings += filter(None, (
-            pipeline.output_conflict, store.calibration_hint, store.shared_hint,
+        if (pipeline.values.wheels in ('odom', 'both')
+                and pipeline.wheels.is_moving(now, (ODOM,)) is None):
+            warnings.append('nothing that can be used comes on odom, which wheels was set to: '
+                            'remap odom to the odometry of the wheels, or set wheels to another')
+        warnings += [
+            *pipeline.topic_conflicts.values(), store.calibration_hint, store.shared_hint,
             monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,
-            estimator.bias_message, store.table_hint))
-        if warnings:
-            return WARN, warnings[0]
+            estimator.bias_message, store.table_hint]
+        if any(warnings):
+            return WARN, list(filter(None, warnings))
         tracked = estimator.tracker.slowest_detectable_rate > 0.0
-        return OK, 'the heading is published' + (
-            '' if tracked else '; the bias is not estimated at rest')
+        return OK, ['the heading is published' + (
+            '' if tracked else '; the bias is not estimated at rest')]
 
 
 def _stamp_ns(header: Any) -> int:

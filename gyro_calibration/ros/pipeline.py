@@ -39,7 +39,7 @@ from gyro_calibration.heading.tracker import TrackerSettings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import (
-    CalibrationSession, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION, MIN_TURN_ANGLE, REST,
+    CalibrationSession, FINISH_TIMEOUT, MIN_ODOMETRY_DURATION, MIN_TURN_ANGLE, PROFILE, REST,
     ROS_TIME_PAUSED)
 from gyro_calibration.ros.health_monitor import (
     HealthMonitor, PulseDetector, RepeatedOutputDetector)
@@ -150,7 +150,8 @@ class Pipeline:
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
         self.conflict = ''  # why samples cannot be used
-        self.output_conflict = ''  # which other nodes publish on the topics of the results
+        # that several nodes publish on another topic, by its role: `ODOMETRY` of calibrations
+        self.topic_conflicts: dict[str, str] = {}
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -237,7 +238,8 @@ class Pipeline:
         if odd or estimator.refused_temperature_count > refused:
             counts['refused_temperatures'] += 1
             self.journal.event = (f'a temperature of {value:g} degC is implausible'
-                                  f'{f" after {known:g} degC" if odd else ""} and not used')
+                                  f'{f" after {known:g} degC" if odd else ""} and not used: '
+                                  'check the sensor, and that its driver sends degC')
 
     def add_odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Add a heading, rad, and a velocity by the odometry."""
@@ -359,7 +361,7 @@ class Pipeline:
         if not max(0, -self._stamp_offset) <= stamp < end - max(0, self._stamp_offset):
             counts['refused_samples'] += 1
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
-                             'time; the sample is not used')
+                             'time, and the sample is not used: check the clock of the driver')
             return None
         silence = now - self._last_arrival
         if self.publisher_conflict:
@@ -473,7 +475,8 @@ class Pipeline:
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
             journal.event = journal.refusal = (
-                'a sample without a rate (nan, or -1 in its covariance) is not used'
+                'a sample without a rate (nan, or -1 in its covariance) is not used: check the '
+                'gyro and its driver'
                 if math.isnan(output) else
                 f'a rate of {output:g} rad/s is beyond the range of this gyro, and not used: '
                 'check that the driver sends rad/s, and the range of the model')
@@ -573,14 +576,19 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._trusted_heading = tracker.heading, tracker.variance
 
+    def find_conflict(self, kind: str) -> str:
+        """Return why a calibration of a kind may mix gyros or odometries; else ''."""
+        faults = self.faults
+        return (self.conflict or faults['frame'] or faults['alternation']
+                or self.topic_conflicts.get(kind, ''))
+
     def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
         if self.ros_time.paused_duration > FAULT_DURATION:
             return ROS_TIME_PAUSED
-        faults = self.faults
-        if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
-                or faults['clock'] or faults['frame'] or faults['alternation']):
+        if (fault := self.find_conflict(PROFILE) or self.publisher_conflict or self.repeat_fault
+                or self.faults['clock']):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
@@ -600,7 +608,8 @@ class Pipeline:
         """Check that time and samples advance; to be called several times per second."""
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
-        conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
+        conflict = self.find_conflict(self.session.run.kind if self.session.run else '') or (
+            self.publisher_conflict if self.session.is_driving else '')
         if self._clock.steady() - self.journal.last_received > RunLimits.max_gap:
             conflict = conflict or self.journal.refusal
         self.session.poll(self.values, receivers,

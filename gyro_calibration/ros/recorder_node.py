@@ -55,6 +55,7 @@ class RecorderNode(Node):
         self.message_count = 0
         self._on_message = on_message
         self._taken: dict[str, Subscription] = {}  # topics
+        self.conflicts: dict[str, str] = {}  # of topics on which several nodes publish
         self._clock_offset = read_date_offset()
         self.poll()
         call_every(self, 0.3, self.poll)
@@ -70,6 +71,12 @@ class RecorderNode(Node):
                 continue
             if fault := topic_type_fault(self._roles[topic], topic, kinds[0]):
                 raise LogError(fault)
+            if len(publishers) > 1:
+                names = sorted(f'{each.node_namespace.rstrip("/")}/{each.node_name}'
+                               for each in publishers)
+                self.conflicts[topic] = (
+                    f'Several nodes published on {topic} ({", ".join(names)}), and a log cannot '
+                    'distinguish them: unless one had ended, give each a topic of its own.')
             # compatible with all publishers; transient local only if all offer it
             offered = [each.qos_profile for each in publishers]
             is_reliable = not any(each.reliability == ReliabilityPolicy.BEST_EFFORT

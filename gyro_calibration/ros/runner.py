@@ -165,7 +165,7 @@ class Diagnostics:
 
 def run_node(node_class: Callable[[], Node]) -> int:
     """
-    Spin a node until SIGINT, SIGTERM or SIGHUP; return the exit code of the process.
+    Spin a node until SIGINT, SIGQUIT, SIGTERM or SIGHUP; return the exit code of the process.
 
     It is 0 after a signal, and 2, with a sentence on standard error, where the node refused a
     value.
@@ -196,7 +196,11 @@ def run_node(node_class: Callable[[], Node]) -> int:
 
 
 def spin(node: Node, stop: threading.Event) -> None:
-    """Serve the callbacks of a node until an event is set, then close it."""
+    """
+    Serve the callbacks of a node until an event is set, then close it.
+
+    Ctrl-Z stops the process after `node.stop_robot` between two callbacks, where a node has that.
+    """
     serving: Executor
     try:
         # it takes half of the processor time; before rclpy 7.1.11 it has no ``async`` callbacks
@@ -208,8 +212,17 @@ def spin(node: Node, stop: threading.Event) -> None:
     try:
         # the timers of a node end the wait of SingleThreadedExecutor, not that of EventsExecutor
         timeout = None if isinstance(serving, SingleThreadedExecutor) else 0.2
+        pause, stop_robot = threading.Event(), getattr(node, 'stop_robot', None)
+        if stop_robot and signal.getsignal(signal.SIGTSTP) != signal.SIG_IGN:
+            signal.signal(signal.SIGTSTP, lambda *_: pause.set())
         while not stop.is_set():
             serving.spin_once(timeout_sec=timeout)
+            if stop_robot and pause.is_set():
+                stop_robot('this node was stopped by Ctrl-Z: continue it, and run again')
+                handler = signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+                signal.raise_signal(signal.SIGTSTP)
+                pause.clear()
+                signal.signal(signal.SIGTSTP, handler)
     except ExternalShutdownException:
         pass  # rclpy was shut down elsewhere
     finally:

@@ -21,9 +21,9 @@ from typing import Any
 
 
 def handle_end_signals(handler: Any) -> dict[int, Any]:
-    """Handle Ctrl-C, SIGTERM and, but for nohup, a lost terminal; return the handlers before."""
+    r"""Handle Ctrl-C, Ctrl-\, SIGTERM and, but for nohup, a lost terminal; return the old ones."""
     return {number: signal.signal(number, handler)
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP)
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN}
 
 

@@ -91,6 +91,11 @@ class StateStore:
         elif theirs != ours:
             fault = (f'it belongs to the gyro with the serial number {theirs or "(none)"}, and '
                      f'the model to {ours or "(none)"}')
+        else:
+            try:
+                refuse_implausible_model(stored, self._max_bias)
+            except InvalidValue as error:
+                fault = str(error)
         if fault:
             self.calibration_hint = to_printable(
                 f'the self-calibration in {self._calibration_file} is not used: {fault}; '
@@ -135,11 +140,15 @@ def refuse_implausible_model(model: GyroModel, max_bias: float) -> None:
     """Raise `InvalidValue` for a bias, scale factor or noise that no gyro of a robot has."""
     limits = {'scale_factor_error': (RunLimits.max_scale_factor_error, 'a fraction, not in %'),
               'bias': (max_bias, 'in rad/s; calibration.maximum_bias allows another one')}
-    for term in model.terms:
-        name = term.effect.name
-        if name in limits and not abs(term.values[0]) <= limits[name][0]:
+    given = [('effects.' + term.effect.name, term.effect.name, term.values[0])
+             for term in model.terms]
+    if model.self_calibration:
+        given += [('self_calibration', name, getattr(model.self_calibration, name))
+                  for name in limits]
+    for group, name, value in given:
+        if name in limits and not abs(value) <= limits[name][0]:
             limit, remedy = limits[name]
-            raise InvalidValue(f'effects.{name}.{name}', term.values[0],
+            raise InvalidValue(f'{group}.{name}', value,
                                f'at most {limit:.4g} of either sign, {remedy}')
     for name, value in vars(model.noise).items():
         if not math.sqrt(Noise(**{name: value}).heading_variance(1.0)) < math.pi / math.sqrt(3.0):

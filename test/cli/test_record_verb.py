@@ -490,6 +490,18 @@ def test_publishers_that_come_late_or_again_with_another_quality_are_received(
     assert b'published before anybody' in b''.join(_messages(tmp_path / 'a.mcap', '/map'))
 
 
+def test_a_recording_of_several_publishers_on_one_topic_says_so(
+        ros, record, wait_until, tmp_path):
+    robot = Robot(ros)
+    ros.publisher(robot.kinds['imu/data_raw'], 'imu/data_raw')
+    robot.offer('imu/data_raw')
+    recording = record('record', '--out', tmp_path / 'a.mcap')
+    wait_until(robot.is_heard, 60.0, 'the recorder')
+    wait_until(lambda: robot.drive(0.0, 1.0) and holds(tmp_path / 'a.mcap', 50), 60.0, 'samples')
+    code, out, error = recording.end(signal.SIGTERM)
+    assert code == 0 and 'Several nodes published on /imu/data_raw (/test_client' in out + error
+
+
 def _messages(path, topic):
     reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
     with open(path, 'rb') as file:

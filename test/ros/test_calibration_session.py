@@ -315,10 +315,19 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     rig.hold_up_samples(lambda: rig.clock.now % 0.8 < 0.3)
     rig.pipeline.poll = lambda count: rig.clock.now % 0.8 < 0.3 or poll(count)
     success, message = rig.calibrate()
-    assert not success and 'this computer was busy: commands were up to 0.' in message
-    assert '(the run shows: ' in message
+    assert not success and '; besides, this computer was busy: commands were up to 0.' in message
     commands, samples = rig.session.max_lateness
     assert 0.1 < commands < 0.7 and 0.1 < samples < 0.7
+
+
+def test_a_refusal_names_first_what_no_load_explains(tmp_path):
+    """Samples that are 30 ms late are usual, and turn no gyro the other way."""
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.robot.distort = lambda output: -output
+    rig.hold_up_samples(lambda: rig.clock.now % 0.8 < 0.04)
+    success, message = rig.calibrate()
+    assert not success and message.startswith('the gyro turns the other way'), message
+    assert 'this computer was busy' in message
 
 
 def test_samples_that_are_held_up_do_not_hold_up_the_motion(tmp_path):
@@ -569,6 +578,33 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     rig.go(3.0)
     success, message = rig.calibrate(REST)
     assert not success and words in message, message
+
+
+@pytest.mark.parametrize('turn, words', [(0.03, 'the rate was 1.78 deg/s'), (0.0, '')])
+def test_calibrate_bias_says_by_how_much_the_bias_has_changed(tmp_path, turn, words):
+    """Only the robot's owner knows whether it has turned evenly, without odom."""
+    rig = Rig(tmp_path, robot=Robot(bias=0.01))
+    rig.odometry = lambda stamp, reading: None
+    assert rig.calibrate(REST)[0]
+    rig.turn(turn, 3.0)
+    success, message = rig.calibrate(REST)
+    assert success and ('if the robot turned evenly' in message) == bool(words)
+    assert words in message, message
+
+
+@pytest.mark.parametrize('kind, drives', [(PROFILE, True), (PROFILE, False), (REST, True)])
+def test_samples_of_another_frame_end_a_calibration_and_none_begins_with_them(
+        tmp_path, kind, drives):
+    """What they show would be stored as the calibration of the first gyro."""
+    rig = rested(tmp_path, calibration_drive=drives)
+    assert not rig.begin(kind)
+    rig.go(3.0)
+    rig.sample = lambda stamp, output, heading: rig.pipeline.add_sample(
+        stamp, output, receivers=1, frame='other')
+    success, message = rig.end(1.0)
+    assert not success and "have the frame 'other'" in message, message
+    assert "have the frame 'other'" in rig.begin(kind)
+    assert not rig.calibration_file.exists()
 
 
 def test_turns_that_are_not_finished_are_given_up():

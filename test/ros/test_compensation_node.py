@@ -30,6 +30,7 @@ import time
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.logs.cdr import quaternion_heading, UNMEASURED_VARIANCE
+from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
@@ -38,9 +39,10 @@ try:
     from diagnostic_msgs.msg import DiagnosticArray
     from gyro_calibration.ros.compensation_node import CompensationNode
     from gyro_calibration.ros.runner import SENSOR_QOS
+    from nav_msgs.msg import Odometry
     from rclpy.qos import ReliabilityPolicy
     from robot_faults import Fault, FAULTS, Stage
-    from sensor_msgs.msg import Imu
+    from sensor_msgs.msg import Imu, Temperature
     from std_srvs.srv import Trigger
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
@@ -108,21 +110,34 @@ def test_what_is_published(hold, tmp_path):
     assert imus[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
 
 
-def test_another_node_on_the_topics_of_the_results_is_a_warning(hold):
-    held = hold()
-    held.node.create_publisher(Imu, 'imu/data', 10)
+@pytest.mark.parametrize('topic', ['/imu/data', '/imu/temperature', '/odom'])
+def test_another_node_on_a_topic_is_a_warning_and_no_calibration_mixes_odometries(hold, topic):
+    held = hold(calibration__reference='odometry')
+    kind = {'/imu/data': Imu, '/imu/temperature': Temperature, '/odom': Odometry}[topic]
+    for _ in range(1 + (topic != '/imu/data')):  # where the node itself publishes
+        held.node.create_publisher(kind, topic, 10)
     held.tick(5)
     held.send('/imu/data_raw', sample(0, 0.0))
     held.tick(5)
     status, = held.sent['/diagnostics'][-1].status
-    assert status.level == status.WARN
-    assert 'several nodes publish on /imu/data (/compensation_node, ' in status.message
+    words = f'several nodes publish on {topic} (/compensation_node, '
+    assert status.level == status.WARN and words in status.message
+    answer = held.call('/compensation_node/calibrate', Trigger)
+    assert (words in getattr(answer, 'message', '')) == (topic == '/odom')
 
 
 def test_an_orientation_that_is_none_has_no_heading_and_raises_nothing():
     assert quaternion_heading(0.0, 0.0, math.sin(0.3), math.cos(0.3)) == pytest.approx(0.6)
     for value in (0.0, 1e200, -1.7e308, math.inf, math.nan):
         assert math.isnan(quaternion_heading(value, value, value, value))
+
+
+def test_an_empty_ros_home_is_none_as_for_ros_itself(hold_node, monkeypatch, tmp_path):
+    monkeypatch.setenv('ROS_HOME', '')
+    monkeypatch.setenv('HOME', str(tmp_path))
+    store = hold_node(CompensationNode).node._pipeline.store
+    store.store_calibration(SelfCalibration(0.01, 0.02))
+    assert (tmp_path / '.ros' / 'gyro_calibration' / 'compensation_node.yaml').is_file()
 
 
 def test_names_types_and_qualities_are_those_of_the_documents(hold):
@@ -197,24 +212,29 @@ def killed_softly(stage):
     assert stage.process.wait(30.0) == 0
 
 
+def pause(stage):
+    stage.process.send_signal(signal.SIGTSTP)
+
+
 @pytest.mark.parametrize('name, words', [
     ('clock_absent', 'ROS time stands still'), ('clock_paused', 'ROS time stands still'),
-    ('ended', 'this node was ended')])
+    ('ended', 'this node was ended'), ('paused', 'this node was stopped by Ctrl-Z')])
 def test_a_fault_ends_a_drive_with_a_zero_and_an_answer(ros_domain, tmp_path, name, words):
     """Where a busy machine ended the drive before the fault did, it is tried again."""
-    fault = replace({**FAULTS, 'ended': Fault('', killed_softly)}[name], seconds=3.0)
+    faults = {**FAULTS, 'ended': Fault('', killed_softly), 'paused': Fault('', pause)}
+    fault = replace(faults[name], seconds=3.0)
     for _ in range(5):
         with ExitStack() as closing:
             stage = Stage(tmp_path, closing)
             row = fault.row(stage)
-        if not any(f'refused: {each}' in row.answer for each in HELD_UP):
+        if not any(each in row.answer for each in HELD_UP):
             break
     printed = (tmp_path / 'node.txt').read_text()
     assert words in (printed if name == 'ended' else row.answer)
     assert 'Traceback' not in printed and not row.still
     driven = any(rate for _, rate in stage.robot.commands)
     assert row.zero < 2.0 if driven else name == 'clock_absent'
-    assert name == 'ended' or (row.level == 'ERROR' and words in row.message)
+    assert name in ('ended', 'paused') or (row.level == 'ERROR' and words in row.message)
 
 
 # The graph under faults: any order of starting, killed and stalled nodes

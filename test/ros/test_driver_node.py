@@ -256,7 +256,8 @@ def test_a_gyro_is_published_end_to_end(ros, start_node, wait_until):
         (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)}
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGQUIT, signal.SIGTERM,
+                                    signal.SIGHUP])
 @pytest.mark.parametrize('program', ['start_driver', 'start_compensation'])
 def test_a_signal_during_the_imports_ends_a_node_with_code_0(program, number):
     script = (f'import os; from gyro_calibration.ros import start; '

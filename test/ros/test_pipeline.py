@@ -742,6 +742,31 @@ def test_the_diagnostics_name_what_is_wrong_within_two_seconds(
     assert (found, words in message) == (level, True), message
 
 
+@pytest.mark.parametrize('wheels, warns', [
+    ('odom', True), ('both', True), ('none', False), ('cmd_vel', False)])
+def test_wheels_by_an_odometry_that_does_not_come_are_a_warning(
+        tmp_path, reported, wheels, warns):
+    rig = rested(tmp_path, wheels=wheels)
+    assert reported(rig)[0] == OK
+    rig.odometry = lambda stamp, reading: None
+    rig.go(3.0)
+    level, message, _ = reported(rig)
+    assert (level == WARN and 'remap odom to the odometry' in message) == warns, message
+
+
+def test_lost_samples_hide_no_worse_warning_and_are_reported_with_it(tmp_path, reported):
+    rig, count = rested(tmp_path), itertools.count()
+    sample = rig.sample
+    rig.sample = lambda *reading: next(count) % 4 == 0 or sample(*reading)
+    rig.pace_stamps(0.5)
+    for _ in range(10):
+        rig.go(1.0)
+        level, message, values = reported(rig)
+    assert level == WARN and 'stamps on imu/data_raw advanced by' in message, message
+    assert 'the heading is unknown' in values['other_warnings']
+    assert 'samples are lost' in values['other_warnings']
+
+
 @pytest.mark.parametrize('pace, seconds', [(0.8, 2.0), (1.2, 2.0), (0.97, 30.0), (1.03, 30.0)])
 def test_a_turn_while_stamps_advance_unevenly_for_a_time_is_a_warning_and_in_the_variance(
         tmp_path, reported, pace, seconds):

@@ -56,6 +56,7 @@ def test_what_is_kept_is_there_after_a_restart(remember):
 @pytest.mark.parametrize('model, words', [
     ('effects: {scale_factor_error: {scale_factor_error: -1.0}}', 'is -1.0; wanted at most 0.3'),
     ('effects: {scale_factor_error: {scale_factor_error: 3.7356}}', 'a fraction, not in %'),
+    ('effects: {}\nself_calibration: {scale_factor_error: 0.0, bias: -1.2}', 'is -1.2; wanted'),
     ('effects: {bias: {bias: 1.2}}', 'effects.bias.bias is 1.2; wanted at most 0.1745'),
     ('effects: {}\nnoise: {angle_random_walk: 2.5}', 'noise.angle_random_walk is 2.5; wanted SI'),
     ('effects: {}\nnoise: {bias_instability: 9.0}', 'unknown within 1 s'),
@@ -101,7 +102,7 @@ def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_secon
     assert memory.model.self_calibration == SelfCalibration(0.01)
 
 
-STORED = '\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
+STORED = '\nself_calibration: {scale_factor_error: 0.2, bias: 0.1}\n'
 SEVEN, EIGHT = (f'gyro: {{serial_number: "{number}"}}' for number in '78')
 ONE, OTHER = 'effects: {}\n', 'effects: {bias: {bias: 0.1}}\n'
 
@@ -112,6 +113,8 @@ ONE, OTHER = 'effects: {}\n', 'effects: {bias: {bias: 0.1}}\n'
     (ONE + SEVEN, ONE + STORED, 'and the model to 7; calibrate again'),
     (ONE, ONE + EIGHT + STORED, 'and the model to (none); calibrate again'),
     (OTHER, ONE + STORED, 'belongs to another model'),
+    (ONE, ONE + STORED.replace('0.1', '3.0'), 'self_calibration.bias is 3.0; wanted at most 0.17'),
+    ('', ONE + STORED.replace('0.2', '0.9'), 'scale_factor_error is 0.9; wanted at most 0.3'),
     ('', ONE, 'the file has none'), (ONE + STORED, ONE, 'the file has none'),
     ('', '\n', 'the file'),
     ('', ONE + 'self_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias')])
