@@ -152,9 +152,11 @@ def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
 
 
 def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, pool):
+    """Of equal logs of different units neither is sure; types are pooled apart."""
     logs = tmp_path / 'logs'
-    for unit, seed in ((1, 0), (2, 1)):
-        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))
+    for unit in (1, 2, 4):
+        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
+    (logs / 'b_unit5.csv').write_bytes((logs / 'a_unit4.csv').read_bytes())
     (logs / 'b_unit1.csv').write_text(  # a double
         '# again\n' + (logs / 'a_unit1.csv').read_text())
     (logs / 'copy.csv').write_bytes((logs / 'a_unit2.csv').read_bytes())
@@ -168,27 +170,16 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, po
                                       + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
     found, reasons = pool(logs, *BY_NAME)
-    assert found['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
+    assert found['logs'] == 11 and 'is a copy of' in reasons['b_unit1.csv']
+    assert 'of unit 4' in reasons.pop('b_unit5.csv') and 'of unit 5' in reasons.pop('a_unit4.csv')
     assert 'a_unit2.csv' in reasons.pop('copy.csv')
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
     assert 'gyro_rad_s' in reasons['d_unit1.csv'] and 'in ms' in reasons['d_unit2.csv']
     assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv', 'd_unit1.csv',
                             'd_unit2.csv'}
     assert not any('\n' in each for each in reasons.values())
-    # types are pooled apart
     assert {each['type']: each['units'] for each in found['types']} == {
         '': ['1', '2'], 'FOG': ['3']}
-
-
-def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, pool):
-    logs = tmp_path / 'logs'
-    for unit in (1, 2, 3):
-        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
-    (logs / 'b_unit2.csv').write_bytes((logs / 'a_unit1.csv').read_bytes())
-    found, reasons = pool(logs, *BY_NAME)
-    assert set(reasons) == {'a_unit1.csv', 'b_unit2.csv'}
-    assert 'of unit 1' in reasons['b_unit2.csv'] and 'of unit 2' in reasons['a_unit1.csv']
-    assert found['types'][0]['units'] == ['2', '3']
 
 
 def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, pool):

@@ -186,13 +186,10 @@ def test_a_person_may_write_one(tmp_path):
 
 
 DAMAGES = {
-    'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2],
-    'garbage': lambda text: bytes(range(256)) * 4,
-    'zeros': lambda text: bytes(len(text)), 'too long': lambda text: text + b'# filled\n' * 120000,
+    'empty': lambda text: b'', 'garbage': lambda text: bytes(range(256)) * 4,
     'a newer version': lambda text: text.replace(b'version: 1', b'version: 2'),
     'another format': lambda text: text.replace(b'bias_table', b'model'),
     'a list': lambda text: b'- 1\n',
-    'not a number': lambda text: text.replace(b'bias: ', b'bias: x'),
     'infinite': lambda text: text.replace(b'bias: ', b'bias: .inf #'),
     'no variance': lambda text: text.replace(b'standard_deviation: ', b'standard_deviation: 0 #'),
     'no time': lambda text: text.replace(b'time: ', b'time: yesterday #'),
