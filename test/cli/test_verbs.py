@@ -19,7 +19,7 @@ from conftest import strict
 from diagnosed import log_of
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.logs.log import DEGREE, write_log
+from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration_bench.hidden import hide
@@ -29,11 +29,9 @@ from recovery import SINE, Table
 
 
 def write(path, dwells):
-    columns = (values.tolist() for values in (dwells.sweep, dwells.rate / DEGREE,
-                                              dwells.output / DEGREE, dwells.temperature))
-    lines = ['sweep,reference_rate_dps,gyro_dps,temperature_degc',
-             *(','.join(map(repr, row)) for row in zip(*columns))]
-    path.write_text('\n'.join(lines) + '\n')
+    write_log(path, Log(output=dwells.output, reference_rate=dwells.rate,
+                        temperature=dwells.temperature,
+                        others={'sweep': tuple(map(str, dwells.sweep.tolist()))}))
     return path
 
 
@@ -64,10 +62,9 @@ def test_a_residual_above_the_noise_of_dwells_whose_rates_occur_once_is_reported
     """An asymmetry, in dwells of 12 s, that so few dwells do not show beside their scatter."""
     generator = np.random.default_rng(2)
     rate = np.repeat([0.0, -50.0, -20.0, 20.0, 50.0, 0.0], 600)
-    path, time = tmp_path / 'log.csv', np.arange(3600) / 50.0
-    output = rate + 0.001 * np.abs(rate) + 0.02 * generator.standard_normal(3600)
-    np.savetxt(path, np.column_stack([time, rate, output]), delimiter=',', comments='',
-               header='time_s,reference_rate_dps,gyro_dps')
+    path, output = tmp_path / 'log.csv', rate + 0.001 * np.abs(rate)
+    write_log(path, Log(np.arange(3600) / 50.0, DEGREE * (
+        output + 0.02 * generator.standard_normal(3600)), reference_rate=DEGREE * rate))
     for words, is_reported in ((('--effects', 'bias,scale_factor_error'), True),
                                (('--effects', 'bias,scale_factor_error,scale_factor_asymmetry'),
                                 False)):
@@ -91,10 +88,9 @@ def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
 
 def fit_rates(run, path, rate):
     """Return the answer to a log at 100 Hz with a reference rate, deg/s; the gyro has 2 %."""
-    generator, time = np.random.default_rng(2), np.arange(len(rate)) / 100.0
-    output = 0.5 + 1.02 * rate + 0.1 * generator.standard_normal(len(rate))
-    np.savetxt(path, np.column_stack([time, output, rate]), '%.4f', ',', comments='',
-               header='time_s,gyro_dps,reference_rate_dps')
+    output = 0.5 + 1.02 * rate + 0.1 * np.random.default_rng(2).standard_normal(len(rate))
+    write_log(path, Log(np.arange(len(rate)) / 100.0, DEGREE * output,
+                        reference_rate=DEGREE * rate))
     code, text, _ = run('fit', path, '--json')
     answer = strict(text)
     low, high = answer['effects']['scale_factor_error']['scale_factor_error']['ci95']
@@ -136,11 +132,9 @@ def test_of_several_logs_the_one_without_a_reference_is_named(run, table, tmp_pa
 
 
 def test_a_gyro_that_counts_clockwise_is_not_fitted(run, tmp_path):
-    time = np.arange(0.0, 60.0, 0.05)
-    rows = zip(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600), np.cos(0.3 * time) / -0.3)
-    path = tmp_path / 'log.csv'
-    path.write_text('time_s,gyro_rad_s,reference_heading_rad\n'
-                    + ''.join(','.join(map(repr, map(float, row))) + '\n' for row in rows))
+    path, time = tmp_path / 'log.csv', np.arange(0.0, 60.0, 0.05)
+    write_log(path, Log(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600),
+                        reference_heading=np.cos(0.3 * time) / -0.3))
     code, text, error = run('fit', path)
     assert code == 1 and not text and 'give or omit --invert' in error
     assert run('fit', path, '--invert')[0] == 0
