@@ -40,7 +40,9 @@ FOUND = {
             *((number, 96, 0, 0) for number in range(12, 16))))),
     'more empty lines at the end than a block has rows': (
         'log', b'gyro_counts,lap\n0.0,a\n1.0,b\n2.0,\n' + 8 * b'\n'),
-    'a column whose name has two lines, as some systems end them': ('log', b'gyro_counts,e_dps0.0,"reference_rate_dpsa\r\nn,a\n1.0,nan,b\n2.0\n"\n.0,nan,k\n11.0,nan,l\n'),
+    'a column whose name has two lines, as some systems end them': ('log', (
+        b'gyro_counts,e_dps0.0,"reference_rate_dpsa\r\n'
+        b'n,a\n1.0,nan,b\n2.0\n"\n.0,nan,k\n11.0,nan,l\n')),
 }
 
 
