@@ -13,7 +13,7 @@
 from itertools import repeat
 import math
 
-from chance import RARE, rms_bounds
+from chance import RARE
 import gyro_calibration
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import (
@@ -128,25 +128,6 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
 def test_the_state_at_the_end_is_that_of_the_last_sample():
     end = fed(207 * [0.3]).finish().mean[HEADING_INDEX]
     assert end == pytest.approx(0.3 * 206 * INTERVAL, abs=1e-9)
-
-
-@pytest.mark.parametrize('motion, before, share, runs', [
-    (constant_rate_motion([(40, 0)]), BIAS, 0.7, 40),
-    (constant_rate_motion([(1.6, 0), (2, 45)] * 10), 0.2 * DEGREE, 1.0 / 3.0, 10)],
-    ids=['one of 40 s', 'ten of 1.6 s between turns'])
-def test_rests_determine_the_bias_as_well_as_stated(motion, before, share, runs):
-    errors, deviations, white = [], [], Noise(XV3500.angle_random_walk)
-    for seed in range(runs):
-        generator = np.random.default_rng([6, seed])
-        bias = before * generator.standard_normal()
-        *_, rate = gyro(motion, generator, white, bias=-bias)
-        found, deviation = fed(rate, None, np.diag([SCALE ** 2, before ** 2]), white).bias_for(
-            np.array([0.0, -1.0]))
-        deviations.append(deviation)
-        errors.append((found - bias) / deviation)
-    assert np.median(deviations) < share * before
-    low, high = rms_bounds(runs)
-    assert low < math.sqrt(np.mean(np.square(errors))) < high, errors
 
 
 @pytest.mark.parametrize('slow, wheels', [(0.1, None), (0.05, True), (0.02, True)],
