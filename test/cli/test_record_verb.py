@@ -34,7 +34,7 @@ from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
 import pytest
-from recordings import BEGIN, rosbags
+from recordings import BEGIN, Messages, rosbags
 
 RATE = 200.0
 COLUMNS = 'gyro_rad_s', 'time_s', 'temperature_degc'
@@ -374,7 +374,7 @@ class Robot:
         from sensor_msgs.msg import Imu, Temperature
         self.kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry,
                       'pose': PoseStamped}
-        self._ros, self._publishers = ros, {}
+        self._ros, self._publishers, self._make = ros, {}, Messages()
 
     def offer(self, *topics, quality=None):
         """Publish on some topics from now on, anew where it did already."""
@@ -394,22 +394,13 @@ class Robot:
                    for each in self._publishers.values())
 
     def send(self, time, rate, heading):
+        make = self._make
+        messages = {'imu/data_raw': make.imu(time, rate),
+                    'imu/temperature': make.temperature(time, 25.0 + 0.01 * time),
+                    'odom': make.odometry(time, heading, rate), 'pose': make.pose(time, heading)}
         for topic, publisher in self._publishers.items():
-            message = self.kinds[topic]()
-            message.header.stamp.sec = 1_700_000_000 + int(time)
-            message.header.stamp.nanosec = round(time % 1.0 * 1e9)
-            message.header.frame_id = 'gyro'
-            if topic == 'imu/data_raw':
-                message.angular_velocity.z, message.linear_acceleration_covariance[0] = rate, -1.0
-            elif topic == 'imu/temperature':
-                message.temperature = 25.0 + 0.01 * time
-            else:
-                pose = message.pose.pose if topic == 'odom' else message.pose
-                pose.orientation.z = math.sin(heading / 2.0)
-                pose.orientation.w = math.cos(heading / 2.0)
-            if topic == 'odom':
-                message.twist.twist.angular.z = rate
-            publisher.publish(message)
+            message = messages[topic]
+            publisher.publish(bytes(make.store.serialize_cdr(message, message.__msgtype__)))
 
     def drive(self, begin=0.0, duration=40.0):
         """Turn to and fro between rests, and return how many samples that were."""
