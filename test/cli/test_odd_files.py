@@ -306,9 +306,7 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
 
 
 ODD = {
-    'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n',
-    'header': b'time_s,gyro_dps\n',
-    'two rows': b'time_s,gyro_dps\n0,1\n1,1\n',
+    'empty': b'', 'two rows': b'time_s,gyro_dps\n0,1\n1,1\n',
     **{name: ('time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc\n' + ''.join(
         f'{k * step!r},{rate(k)},{rate(k)},{k % 60}\n' for k in range(600))).encode()
        for name, step, rate in (
@@ -316,11 +314,8 @@ ODD = {
            ('tiny', 0.01, lambda k: 1e-300), ('one huge', 0.01, lambda k: 1e19 * (k == 300)),
            ('nan', 0.01, lambda k: 'nan'), ('half nan', 0.01, lambda k: 1 if k % 2 else 'nan'),
            ('fast', 1e-9, lambda k: 1), ('slow', 1e17, lambda k: 1))},
-    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'not packed': b'\x1f\x8b\x08abc',
     'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
     **{name: f'{columns}\n{"".join(map(row, range(500)))}'.encode() for name, columns, row in (
-        ('values of 1e300', 'time_s,gyro_dps,reference_rate_dps',
-         lambda k: f'{k / 10},{1e300 * (k % 3)},{k % 3}\n'),
         ('values of 1e20 on a table', 'time_s,gyro_dps,reference_rate_dps',
          lambda k: f'{k / 10},{1e20 * (k % 3)},{k // 100 * 20}\n'),
         ('values of 1e-300', 'time_s,gyro_dps,reference_heading_deg',
