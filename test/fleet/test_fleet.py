@@ -81,9 +81,10 @@ def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     ('unit,drive\n1,h\n', 'its columns are unit, drive; wanted log'),
     ('log;unit\na.csv;1\na.csv;2\n', 'a.csv: is listed twice, with unit 1 and 2'),
     ('log,date\na.csv,March\n', "its date is given as 'March'"),
-    ('log,temperature\na.csv,hot\n', "its temperature is given as 'hot'")])
+    ('log,temperature\na.csv,hot\n', "its temperature is given as 'hot'"),
+    (b'log,unit\nb\xff.csv,1\n', 'fleet.csv: ')])
 def test_a_table_that_is_wrong_is_refused_in_one_sentence(tmp_path, text, wanted):
-    (tmp_path / 'fleet.csv').write_text(text)
+    (tmp_path / 'fleet.csv').write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=wanted):
         find_logs([str(tmp_path / 'fleet.csv')])
 
@@ -207,16 +208,10 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, poo
 
 
 def test_names_may_hold_any_characters(tmp_path):
-    names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a b': 'x'}
-    for seed, name in enumerate(names.values()):
-        write_log(tmp_path / f'{name}.csv', drive(0.01, seed))
-    table = ''.join(f'{name}.csv,{unit},T\n' for unit, name in names.items())
-    (tmp_path / 'logs.csv').write_bytes(os.fsencode('log,unit,type\n' + table))
-    assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 2
-    (tmp_path / 'logs.csv').unlink()
-    for unit, name in names.items():
-        path = tmp_path / f'{name}.csv'
-        path.write_text(f'# unit: {unit.replace(" ", "_")}, type: T\n' + path.read_text())
+    names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a_b': 'x'}
+    for seed, (unit, name) in enumerate(names.items()):
+        write_log(tmp_path / f'{name}.csv',
+                  replace(drive(0.01, seed), notes=(f'unit: {unit}, type: T',)))
     assert run(tmp_path, '--out', tmp_path / 'out') == 0
     assert {each.name for each in (tmp_path / 'out/models').iterdir()} == {
         'T.yaml', 'T-unit-ä.yaml', 'T-unit-ö.yaml', 'T-unit-a_b.yaml', 'T-unit-a_b_.yaml'}

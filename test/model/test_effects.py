@@ -258,18 +258,12 @@ UNCERTAIN = {
 
 def with_values(model, change):
     """Return the model with its fitted values, then s and b, changed by so much."""
-    change, terms = list(change), []
-    for term in model.terms:
-        values = list(term.values)
-        for place in term.fitted_indices:
-            values[place] += change.pop(0)
-        terms.append(Term(term.effect, tuple(values)))
-    if model.self_calibration is None:
-        return replace(model, terms=tuple(terms))
-    s, b = change
-    calibration = SelfCalibration(model.self_calibration.scale_factor_error + s,
-                                  model.self_calibration.bias + b)
-    return replace(model, terms=tuple(terms), self_calibration=calibration)
+    change, run = iter(change), model.self_calibration
+    terms = tuple(Term(term.effect, tuple(
+        value + (next(change) if place in term.fitted_indices else 0.0)
+        for place, value in enumerate(term.values))) for term in model.terms)
+    return replace(model, terms=terms, self_calibration=run and SelfCalibration(
+        run.scale_factor_error + next(change), run.bias + next(change)))
 
 
 @pytest.mark.parametrize('calibration', [None, CALIBRATION],
