@@ -23,6 +23,7 @@ import struct
 import subprocess
 import sys
 
+from chance import evidence
 from fuzzed import SECONDS, TARGETS
 import pytest
 
@@ -86,7 +87,7 @@ def test_what_was_found_once_is_survived(name, data):
     TARGETS[name].check(data)
 
 
-@pytest.mark.parametrize('seconds', [10, pytest.param(600, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize('seconds', [10, evidence(600)])
 def test_fuzzing_guided_by_coverage_finds_nothing(seconds):
     pytest.importorskip('atheris', reason='atheris, which has wheels for x86-64, is not installed')
     environment = {**os.environ, 'OPENBLAS_NUM_THREADS': '1'}

@@ -14,7 +14,7 @@ import json
 import math
 import re
 
-from chance import fewest, mean_bound, most, rms_bounds
+from chance import evidence, fewest, mean_bound, most, rms_bounds
 from gyro_calibration.allan.deviation import allan_deviation, build_rest_record
 from gyro_calibration.allan.noise_fit import fit_noise
 from gyro_calibration.cli.allan import find_noise_figures
@@ -74,8 +74,7 @@ def figures(noise, runs, seed, samples=20_000, quantization=0.0, ramp=0.0):
     return {part.symbol: [fit[part.symbol] for fit in fits] for part in NOISE_TERMS}
 
 
-@pytest.mark.parametrize('walk, runs', [
-    (2e-4, 12), *(pytest.param(walk, 200, marks=pytest.mark.evidence) for walk in (3e-5, 2e-4))])
+@pytest.mark.parametrize('walk, runs', [(2e-4, 12), evidence(3e-5, 200), evidence(2e-4, 200)])
 def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, runs):
     truth = Noise(1e-3, 3e-4, walk)
     found = figures(truth, runs, 11, samples=200_000)
@@ -85,11 +84,8 @@ def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, run
 
 
 @pytest.mark.parametrize('noise, quantization, ramp', [
-    pytest.param(*case, id=name,  # the others as evidence: 30 records take some seconds
-                 marks=[] if name in ('white', 'walk', 'quantization') else pytest.mark.evidence)
-    for name, *case in (('white', WHITE, 0.0, 0.0), ('flicker', FLICKER, 0.0, 0.0),
-                        ('walk', WALK, 0.0, 0.0), ('quantization', WHITE, 3e-5, 0.0),
-                        ('ramp', WHITE, 0.0, 1e-4))])
+    (WHITE, 0.0, 0.0), (WALK, 0.0, 0.0), (WHITE, 3e-5, 0.0), evidence(FLICKER, 0.0, 0.0),
+    evidence(WHITE, 0.0, 1e-4)], ids=['white', 'walk', 'quantization', 'flicker', 'ramp'])
 def test_what_is_there_is_seen_within_its_bounds_and_its_standard_deviation(
         noise, quantization, ramp):
     runs, found = 30, figures(noise, 30, 4, quantization=quantization, ramp=ramp)
@@ -149,7 +145,7 @@ def test_a_record_that_is_too_short_for_the_floor_says_so_and_bounds_the_bias_in
 
 
 def stamps(count):
-    return np.arange(count) * INTERVAL
+    return INTERVAL * np.arange(count)
 
 
 @pytest.mark.parametrize('gap, longest', [(0, 50.0), (1000, 5.0)])
@@ -274,8 +270,7 @@ def test_a_reference_that_turns_with_the_output_shows_motion_and_one_that_wander
         assert len(build_rest_record(time, rate, heading=wandering).rate) == count
 
 
-@pytest.mark.parametrize('number', [1, *(pytest.param(number, marks=pytest.mark.evidence)
-                                         for number in (2, 3))])
+@pytest.mark.parametrize('number', [1, evidence(2), evidence(3)])
 def test_recordings_of_one_kind_of_gyro_agree(data, number):
     """ADIS16405, data sheet: 2 deg/√h and 0.007 deg/s, typical; 0.01 to 0.1 s are filtered."""
     log = read_log(data / f'mems_static/adis16405_{number}.csv.gz', rate=100.0)

@@ -109,15 +109,14 @@ def test_what_is_no_file_is_not_replaced(kind, folder, run):
 @pytest.mark.parametrize('path, words', [
     (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
     ('log.csv/a.csv', 'a directory|file exists'),
-    ('circle.csv', 'too many levels of symbolic links'), ('closed/a.csv', 'permission denied')])
-def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, run, monkeypatch):
+    ('circle.csv', 'too many levels of symbolic links')])
+def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, run):
     (folder / 'circle.csv').symlink_to(folder / 'circle.csv')
-    deny(monkeypatch, folder / 'closed')
     path = folder / path
     for read, error in (read_log, LogError), (read_model, ModelError), (read_motion, MotionError):
         with pytest.raises(error) as raised:
             read(path)
-        assert re.search(words, str(raised.value)) or 'closed' in str(path)
+        assert re.search(words, str(raised.value))
     store = StateStore(str(path), path, path.with_suffix('.yaml'), Prior())
     assert 'uncalibrated' in store.problem and str(path) in store.problem
     store = StateStore('', path, path.with_suffix('.yaml'), Prior())
@@ -130,18 +129,6 @@ def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, 
     code, _, error = run('compensate', path, '--model', folder / 'model.yaml',
                          '--out', folder / 'out.csv')
     assert code == 2 and error.count('\n') == 1 and path.name in error
-
-
-def deny(monkeypatch, closed):
-    """Let a folder be closed also to root, who may do everything."""
-    for name in ('open', 'stat', 'lstat', 'listdir', 'mkdir', 'replace', 'scandir'):
-        real = getattr(os, name)
-
-        def refuse(path, *more, real=real, **how):
-            if isinstance(path, (str, os.PathLike)) and str(path).startswith(str(closed)):
-                raise PermissionError(13, 'Permission denied', str(path))
-            return real(path, *more, **how)
-        monkeypatch.setattr(os, name, refuse)
 
 
 def test_the_longest_name_that_there_may_be_is_written(folder):

@@ -14,6 +14,7 @@ from dataclasses import replace
 from functools import cache
 import math
 
+from chance import evidence
 from drives import MPU6050
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.heading.bias_table import BiasTable
@@ -172,8 +173,7 @@ def rms(error):
     return math.sqrt(np.mean(error ** 2))
 
 
-@pytest.mark.parametrize('seconds', [
-    60.0, *(pytest.param(seconds, marks=pytest.mark.evidence) for seconds in (20.0, 30.0))])
+@pytest.mark.parametrize('seconds', [60.0, evidence(20.0), evidence(30.0)])
 @pytest.mark.parametrize('name', SENSES)
 def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(
         data, name, seconds):

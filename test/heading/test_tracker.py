@@ -13,7 +13,7 @@
 from itertools import repeat
 import math
 
-from chance import RARE
+from chance import evidence, RARE
 import gyro_calibration
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import (
@@ -335,7 +335,7 @@ def random_drive(generator, duration):
     return constant_rate_motion(stretches)
 
 
-@pytest.mark.parametrize('drives', [7, pytest.param(16, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize('drives', [7, evidence(16)])
 def test_errors_are_as_large_as_stated_and_hindsight_and_rests_help(drives):
     squares, sizes = [], []
     for seed in range(drives):
