@@ -30,18 +30,6 @@ INTERVAL = 0.01
 XV3500 = Noise(2.5 * DEGREE / 60)
 
 
-def noisy_robot():
-    """Return times and rates of the robot with the XV3500's white noise."""
-    time = np.arange(16001) * INTERVAL
-    noise = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    return time, ROBOT_MOTION.rate_at(time) + noise
-
-
-def filtered_singly(settings, time, rate):
-    threshold = ThresholdFilter(settings)
-    return np.array([threshold.apply(*sample) for sample in zip(time.tolist(), rate.tolist())])
-
-
 SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(),
             'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
             'long': Threshold(1.0 * DEGREE, 1.0), 'off': Threshold(0.0)}
@@ -50,7 +38,9 @@ SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(),
 @pytest.mark.parametrize('settings', SETTINGS.values(), ids=SETTINGS)
 def test_a_log_in_blocks_or_samples_is_filtered_and_integrated_as_in_one_piece(settings):
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
-    time, rate = noisy_robot()
+    time = np.arange(16001) * INTERVAL
+    rate = ROBOT_MOTION.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL,
+                                                       np.random.default_rng(0))
     sensitivity = rate_sensitivity(model, rate, rate, 25.0)
     whole = BlockIntegrator(settings, XV3500,
                             uncertainty_covariance(model)).add(time, rate, sensitivity)
@@ -60,8 +50,9 @@ def test_a_log_in_blocks_or_samples_is_filtered_and_integrated_as_in_one_piece(s
     pieces = [integrator.add(time[i:j], rate[i:j], sensitivity[:, i:j])
               for i, j in zip(sorted(cuts), sorted(cuts)[1:])]
     filtered, heading, deviation = (np.concatenate(parts) for parts in zip(*pieces))
-    for other in (whole[0], ThresholdFilter(settings).apply_to_all(time, rate),
-                  filtered_singly(settings, time, rate)):
+    threshold = ThresholdFilter(settings)
+    singly = [threshold.apply(*sample) for sample in zip(time.tolist(), rate.tolist())]
+    for other in whole[0], ThresholdFilter(settings).apply_to_all(time, rate), singly:
         assert np.array_equal(filtered, other)
     assert np.array_equal(heading, whole[1]) and np.array_equal(heading, integrate(time, filtered))
     assert deviation == pytest.approx(whole[2], rel=1e-12)
