@@ -32,7 +32,6 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 
-TURN = 2.0 * math.pi
 GYRO = 'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: -0.1}}'
 NOISY_GYRO = GYRO + '\nnoise: {angle_random_walk: 7.3e-4}'
 
@@ -194,7 +193,7 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
     """A gyro that agrees with its model: the effect of its specific force is no bias."""
     (tmp_path / 'model.yaml').write_text(
         'effects: {acceleration_sensitivity: {acceleration_sensitivity: 0.001}}')
-    rate = np.concatenate([np.zeros(500), np.full(2000, TURN / 20.0), np.zeros(500)])
+    rate = np.concatenate([np.zeros(500), np.full(2000, math.tau / 20.0), np.zeros(500)])
     output = rate + 0.00981 + 1e-6 * np.random.default_rng(0).standard_normal(3000)
     write_log(tmp_path / 'log.csv', Log(output=output, time=np.arange(3000) / 100.0,
                                         specific_force=np.full(3000, 9.81), reference_rate=rate))

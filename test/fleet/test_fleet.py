@@ -39,7 +39,6 @@ import numpy as np
 import pytest
 
 DEGREE = np.pi / 180.0
-BY_NAME = '--pattern', '{drive}_unit{unit}'
 
 
 def drive(bias, seed):
@@ -170,7 +169,7 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, po
     (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n'
                                       + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
-    found, reasons = pool(logs, *BY_NAME)
+    found, reasons = pool(logs, '--pattern', '{drive}_unit{unit}')
     assert found['logs'] == 11 and 'is a copy of' in reasons['b_unit1.csv']
     assert 'of unit 4' in reasons.pop('b_unit5.csv') and 'of unit 5' in reasons.pop('a_unit4.csv')
     assert 'a_unit2.csv' in reasons.pop('copy.csv')
