@@ -29,7 +29,6 @@ from gyro_calibration.cli.record import CsvRecorder, McapRecorder
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
-from gyro_calibration.files import InputError
 from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
@@ -213,13 +212,6 @@ def test_rosbags_and_mcap_read_what_is_recorded(tmp_path):
                 for *_, message in reader.iter_messages(['/imu/data_raw'])] == times
 
 
-def test_a_file_that_is_there_is_never_written_to(tmp_path):
-    (tmp_path / 'a.mcap').write_text('precious')
-    with pytest.raises(InputError, match='exists already'):
-        recorders(tmp_path)
-    assert (tmp_path / 'a.mcap').read_text() == 'precious'
-
-
 def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
     recorder = CsvRecorder(str(tmp_path / 'a.csv'), notes)
     for number in range(400):
@@ -263,15 +255,18 @@ def test_where_a_hangup_is_ignored_a_recording_goes_on(wait_until):
         signal.signal(signal.SIGHUP, before)
 
 
-def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
+@pytest.mark.parametrize('name', ['a.csv', 'a.mcap'])
+def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path, name):
     """Where columns have a unit, no sensitivity is noted."""
+    path = tmp_path / name
+    words = words_for(tmp_path / 'gyro', path, '--seconds', '2')
     with gyro(tmp_path / 'gyro'):
-        code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-        assert code == 0 and f'0 lost, written to {tmp_path / "a.csv"}.' in out, (out, error)
-        notes, before = read(tmp_path / 'a.csv').notes, (tmp_path / 'a.csv').read_bytes()
+        code, out, error = run(*words)
+        assert code == 0 and f'0 lost, written to {path}.' in out, (out, error)
+        notes, before = read(path).notes, path.read_bytes()
         assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
-        code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-    assert code == 2 and 'exists already' in error and (tmp_path / 'a.csv').read_bytes() == before
+        code, _, error = run(*words)
+    assert code == 2 and 'exists already' in error and path.read_bytes() == before
 
 
 @pytest.mark.parametrize(('words', 'sentence'), [
