@@ -10,6 +10,7 @@
 
 """Documents hold: links, tables and commands agree with the code, and examples run."""
 
+import importlib
 import os
 from pathlib import Path
 import re
@@ -24,6 +25,7 @@ from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.model_file import POLYNOMIAL, read_model
 import numpy as np
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / 'docs'
@@ -79,15 +81,6 @@ def test_every_document_has_no_line_beyond_140_columns_outside_tables():
     assert not long
 
 
-@pytest.fixture(params=['driver_node', 'compensation_node'])
-def parameters(request):
-    """Return the table of parameters of a node; skip where ROS 2 is missing."""
-    pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
-    from gyro_calibration.ros import compensation_node, driver_node
-    return {'driver_node': driver_node,
-            'compensation_node': compensation_node}[request.param].PARAMETERS
-
-
 def number(value):
     """Return a number as people write it: a float shows that it is one."""
     text = f'{value:.5g}' if isinstance(value, float) else str(value)
@@ -112,12 +105,6 @@ def row(parameter):
             + parameter.description.replace('*', r'\*') + ' |')
 
 
-def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
-    table = '\n'.join(map(row, parameters))
-    assert table in (DOCS / 'reference/on_a_robot.md').read_text(), (
-        f'put this table there:\n{table}')
-
-
 def flat(values, group=''):
     """Yield the parameters of a file, those of groups with their dots: calibration.drive."""
     for name, value in values.items():
@@ -125,8 +112,13 @@ def flat(values, group=''):
                     else [(f'{group}{name}', value)])
 
 
-def test_the_configuration_holds_every_parameter_with_its_default(parameters):
-    yaml = pytest.importorskip('yaml')
+@pytest.mark.parametrize('node', ['driver_node', 'compensation_node'])
+def test_table_and_configuration_hold_every_parameter_of_a_node_with_its_default(node):
+    pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
+    parameters = importlib.import_module(f'gyro_calibration.ros.{node}').PARAMETERS
+    table = '\n'.join(map(row, parameters))
+    assert table in (DOCS / 'reference/on_a_robot.md').read_text(), (
+        f'put this table there:\n{table}')
     files = [yaml.safe_load((ROOT / 'config' / name).read_text())
              for name in ('driver.yaml', 'compensation.yaml')]
     configured = [dict(flat(values['ros__parameters'])) for file in files

@@ -30,7 +30,6 @@ PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
 EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
 COLCON = shutil.which('colcon',
                       path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
-needs_colcon = pytest.mark.skipif(COLCON is None, reason='colcon is not installed')
 
 
 @pytest.fixture(scope='module')
@@ -108,7 +107,7 @@ def test_what_ros_reviewers_run_finds_nothing(monkeypatch, name, arguments):
     assert linter.main(argv=arguments) == 0
 
 
-@needs_colcon
+@pytest.mark.skipif(COLCON is None, reason='colcon is not installed')
 @pytest.mark.parametrize('options', [
     pytest.param((), id='copied'),
     pytest.param(('--symlink-install',), id='symlinked', marks=pytest.mark.evidence)])

@@ -14,6 +14,7 @@ from functools import cache
 import json
 from pathlib import Path
 
+from chance import evidence
 from gyro_calibration.cli.main import main
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, render_page
@@ -23,10 +24,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 #: One source; the others, which take some seconds, are run as evidence.
 one_source = pytest.mark.parametrize('source', [
-    pytest.param(source, marks=[] if source == 'ojeda' else pytest.mark.evidence)
-    for source in SOURCES])
-
-
+    source if source == 'ojeda' else evidence(source) for source in SOURCES])
 #: Number of simulated drives; the verb and the documents use 200, which takes half a minute.
 FEW, MANY = 25, 200
 

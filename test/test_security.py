@@ -61,6 +61,14 @@ def test_only_the_command_line_runs_a_file_that_the_user_names():
         name.endswith('exec_module') for name in calls(path))} == {'main.py'}
 
 
+def test_only_what_replaces_files_in_one_step_writes_them():
+    """But for what is deleted again: the file of `ros_bag` that sqlite3 opens."""
+    writing = re.compile(r"open\([^)]*'[wax]|os\.open\([^)]*O_CREAT|\.write_(text|bytes)\(|"
+                         r'savefig\((?!file)')
+    assert {path.name for path in FILES if writing.search(path.read_text())} == {
+        'files.py', 'ros_bag.py'}
+
+
 @pytest.mark.parametrize('kind', ['idlelib/idle/Imu', 'os', 'a.b/msg/Imu', '../msg/Imu', ''])
 def test_a_kind_of_message_chooses_no_module_that_a_recorder_imports(kind):
     assert all(topic_type_fault(role, 'a topic', kind)

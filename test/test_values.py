@@ -18,6 +18,7 @@ GYRO_CALIBRATION_EXAMPLES multiplies their number and chooses them at random.
 import math
 import os
 
+from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.tracker import HeadingTracker, TrackerSettings
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
@@ -45,26 +46,21 @@ def tries(examples):
                                hypothesis.HealthCheck.function_scoped_fixture])
 
 
-def value(parameter, largest):
+def value(parameter):
     """Return values that a model file may hold for a parameter, most of them ordinary."""
-    if parameter.name.endswith('_scale') and largest < 1.0:
-        return st.floats(0.5, 3.0)
-    low, high = (min(max(bound, -largest), largest) for bound in parameter.bounds)
+    low, high = np.clip(parameter.bounds, -MAX_MAGNITUDE, MAX_MAGNITUDE).tolist()
     usual = st.floats(max(low, -0.05), min(high, 0.05)) if low <= 0.05 else st.just(low)
     return st.one_of(usual, st.floats(low, high), st.sampled_from([low, high]))
 
 
 @st.composite
-def models(draw, largest=1e20, around=True):
-    """Return models with one effect of the catalogue or several, and values up to some size."""
+def models(draw):
+    """Return models with one effect of the catalogue or several."""
     polynomial = rate_temperature_polynomial(draw(st.integers(0, 4)), draw(st.integers(0, 3)))
-    effects = [polynomial, *(
-        each for each in CATALOGUE.values()
-        if around or each.inputs <= {'rate', 'output', 'temperature'})]
-    chosen = draw(st.lists(st.sampled_from(effects), min_size=1, max_size=4,
-                           unique_by=lambda each: each.name))
-    terms = tuple(Term(each, tuple(draw(value(parameter, largest))
-                                   for parameter in each.parameters)) for each in chosen)
+    chosen = draw(st.lists(st.sampled_from([polynomial, *CATALOGUE.values()]), min_size=1,
+                           max_size=4, unique_by=lambda each: each.name))
+    terms = tuple(Term(each, tuple(draw(value(parameter)) for parameter in each.parameters))
+                  for each in chosen)
     rates = draw(st.sampled_from([(-math.inf, math.inf), (-2.0, 2.0), (0.0, 0.0), (1.0, 2.0)]))
     temperatures = draw(st.sampled_from([(-math.inf, math.inf), (10.0, 40.0)]))
     calibration = draw(

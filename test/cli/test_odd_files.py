@@ -28,7 +28,7 @@ from conftest import strict
 from gyro_calibration.files import to_printable, write_atomically
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.cdr import IMU
-from gyro_calibration.logs.log import Log, LogError, read_log, write_log
+from gyro_calibration.logs.log import LogError, read_log
 from gyro_calibration.logs.ros_bag import Contents, read_messages
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.model_file import ModelError, read_model, write_model
@@ -109,15 +109,14 @@ def test_what_is_no_file_is_not_replaced(kind, folder, run):
 @pytest.mark.parametrize('path, words', [
     (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
     ('log.csv/a.csv', 'a directory|file exists'),
-    ('circle.csv', 'too many levels of symbolic links'), ('closed/a.csv', 'permission denied')])
-def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, run, monkeypatch):
+    ('circle.csv', 'too many levels of symbolic links')])
+def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, run):
     (folder / 'circle.csv').symlink_to(folder / 'circle.csv')
-    deny(monkeypatch, folder / 'closed')
     path = folder / path
     for read, error in (read_log, LogError), (read_model, ModelError), (read_motion, MotionError):
         with pytest.raises(error) as raised:
             read(path)
-        assert re.search(words, str(raised.value)) or 'closed' in str(path)
+        assert re.search(words, str(raised.value))
     store = StateStore(str(path), path, path.with_suffix('.yaml'), Prior())
     assert 'uncalibrated' in store.problem and str(path) in store.problem
     store = StateStore('', path, path.with_suffix('.yaml'), Prior())
@@ -130,18 +129,6 @@ def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, 
     code, _, error = run('compensate', path, '--model', folder / 'model.yaml',
                          '--out', folder / 'out.csv')
     assert code == 2 and error.count('\n') == 1 and path.name in error
-
-
-def deny(monkeypatch, closed):
-    """Let a folder be closed also to root, who may do everything."""
-    for name in ('open', 'stat', 'lstat', 'listdir', 'mkdir', 'replace', 'scandir'):
-        real = getattr(os, name)
-
-        def refuse(path, *more, real=real, **how):
-            if isinstance(path, (str, os.PathLike)) and str(path).startswith(str(closed)):
-                raise PermissionError(13, 'Permission denied', str(path))
-            return real(path, *more, **how)
-        monkeypatch.setattr(os, name, refuse)
 
 
 def test_the_longest_name_that_there_may_be_is_written(folder):
@@ -170,39 +157,14 @@ def test_a_folder_that_takes_no_file_is_reported_by_the_name_that_was_given():
     assert refused.value.filename == '/proc/model.yaml'
 
 
-WRITERS = {
-    'compensate': ('compensate log.csv --model model.yaml --out {}', 'a.csv'),
-    'packed': ('compensate log.csv --model model.yaml --out {}', 'a.csv.gz'),
-    'simulate': ('simulate --motion rest --model model.yaml --out {}', 'a.csv'),
-    'picture': ('allan rest.csv --picture {}', 'a.png'),
-    'model': ('allan rest.csv --out {}', 'a.yaml'),
-}
-
-
-@pytest.mark.parametrize('words, name', WRITERS.values(), ids=WRITERS)
-def test_a_link_is_replaced_and_a_file_keeps_its_mode(words, name, folder, run, monkeypatch):
-    if name.endswith('.png'):
-        pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    monkeypatch.chdir(folder)
-    if 'rest.csv' in words:
-        rates = 1e-3 * np.random.default_rng(0).standard_normal(3000)
-        write_log('rest.csv', Log(output=rates, time=np.arange(3000) / 100.0))
-    (folder / 'precious').write_text('precious')
-    (folder / name).symlink_to(folder / 'precious')
-    first = run(*words.format(name).split())
-    assert first[0] == 0, first
-    assert (folder / 'precious').read_text() == 'precious' and not (folder / name).is_symlink()
-    (folder / name).chmod(0o600)
-    again = run(*words.format(name).split())
-    assert again[0] == 0, again
-    assert (folder / name).stat().st_mode & 0o777 == 0o600
-
-
-def test_a_new_file_has_the_mode_that_the_umask_leaves_and_an_old_one_its_own(tmp_path):
+def test_a_link_is_replaced_a_file_keeps_its_mode_and_a_new_one_has_that_of_the_umask(tmp_path):
+    (tmp_path / 'precious').write_text('precious')
+    (tmp_path / 'new').symlink_to(tmp_path / 'precious')
     before = os.umask(0o027)
     try:
         write_atomically(tmp_path / 'new', b'x')
-        assert (tmp_path / 'new').stat().st_mode & 0o777 == 0o640
+        assert (tmp_path / 'precious').read_text() == 'precious'
+        assert (tmp_path / 'new').lstat().st_mode & 0o777 == 0o640
         for mode in (0o600, 0o664, 0o400):
             (tmp_path / 'new').chmod(mode)
             write_atomically(tmp_path / 'new', b'y')
@@ -243,12 +205,13 @@ def test_nothing_that_a_terminal_obeys_is_printed(folder, run):
 
 # Files that need much memory
 
-def mcap(content, compression, times):
+def mcap(content, compression, times, size=None):
+    """Return a recording of chunks that unfold to a content, and say that it has a size."""
     compress = {'zstd': lambda data:
                 pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
                 'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
     return MCAP + channel(1, '/imu', IMU) + times * chunk(
-        compress(content), compression, len(content))
+        compress(content), compression, size or len(content))
 
 
 def small_messages(size):
@@ -261,17 +224,29 @@ def small_messages(size):
 def test_a_small_recording_that_unfolds_to_gigabytes_is_refused(content, compression, tmp_path):
     (tmp_path / 'a.mcap').write_bytes(mcap(content(64 << 20), compression,
                                            40 if compression == 'zstd' else 1))
-    refused(tmp_path / 'a.mcap', 'decompresses to more than 100 times its size')
+    refused(tmp_path / 'a.mcap', UNFOLDS)
 
 
-def test_messages_that_unfold_once_more_are_counted_too(tmp_path):
-    inner = pytest.importorskip('zstandard').ZstdCompressor().compress(bytes(1 << 16))
-    message = record(5, struct.pack('<HIQQ', 1, 0, 0, 0) + inner)
+@pytest.mark.parametrize('compression', ['zstd', 'lz4'])
+def test_a_chunk_is_never_larger_than_it_says(compression, tmp_path):
+    (tmp_path / 'a.mcap').write_bytes(mcap(small_messages(64 << 20), compression, 1, size=1000))
+    assert len(list(read_messages(tmp_path / 'a.mcap', Contents()))) == 1000 // 31
+
+
+def test_messages_and_files_that_unfold_are_counted_too(tmp_path, monkeypatch):
+    compress = pytest.importorskip('zstandard').compress
+    message = record(5, struct.pack('<HIQQ', 1, 0, 0, 0) + compress(bytes(1 << 16)))
     (tmp_path / 'a.mcap').write_bytes(mcap(message * 20_000, 'zstd', 1))
-    refused(tmp_path / 'a.mcap', 'decompresses to more than 100 times its size')
+    refused(tmp_path / 'a.mcap', UNFOLDS)
+    monkeypatch.setattr('gyro_calibration.logs.ros_bag.MAX_RECORD_BYTES', 1 << 23)
+    (tmp_path / 'a.db3.zstd').write_bytes(compress(bytes(1 << 26)))
+    refused(tmp_path / 'a.db3.zstd', UNFOLDS)
 
 
-def refused(path, words, megabytes=60):
+UNFOLDS = 'decompresses to more than 100 times its size'
+
+
+def refused(path, words):
     tracemalloc.start()
     try:
         with pytest.raises(LogError, match=words):
@@ -280,7 +255,7 @@ def refused(path, words, megabytes=60):
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak < megabytes << 20
+    assert peak < 60 << 20
 
 
 PLAIN = (
@@ -318,9 +293,7 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
 
 
 ODD = {
-    'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n',
-    'header': b'time_s,gyro_dps\n',
-    'two rows': b'time_s,gyro_dps\n0,1\n1,1\n',
+    'empty': b'', 'two rows': b'time_s,gyro_dps\n0,1\n1,1\n',
     **{name: ('time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc\n' + ''.join(
         f'{k * step!r},{rate(k)},{rate(k)},{k % 60}\n' for k in range(600))).encode()
        for name, step, rate in (
@@ -328,11 +301,8 @@ ODD = {
            ('tiny', 0.01, lambda k: 1e-300), ('one huge', 0.01, lambda k: 1e19 * (k == 300)),
            ('nan', 0.01, lambda k: 'nan'), ('half nan', 0.01, lambda k: 1 if k % 2 else 'nan'),
            ('fast', 1e-9, lambda k: 1), ('slow', 1e17, lambda k: 1))},
-    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'not packed': b'\x1f\x8b\x08abc',
     'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
     **{name: f'{columns}\n{"".join(map(row, range(500)))}'.encode() for name, columns, row in (
-        ('values of 1e300', 'time_s,gyro_dps,reference_rate_dps',
-         lambda k: f'{k / 10},{1e300 * (k % 3)},{k % 3}\n'),
         ('values of 1e20 on a table', 'time_s,gyro_dps,reference_rate_dps',
          lambda k: f'{k / 10},{1e20 * (k % 3)},{k // 100 * 20}\n'),
         ('values of 1e-300', 'time_s,gyro_dps,reference_heading_deg',

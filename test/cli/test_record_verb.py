@@ -29,12 +29,11 @@ from gyro_calibration.cli.record import CsvRecorder, McapRecorder
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
-from gyro_calibration.files import InputError
 from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
 import pytest
-from recordings import BEGIN, rosbags
+from recordings import BEGIN, Messages, rosbags
 
 RATE = 200.0
 COLUMNS = 'gyro_rad_s', 'time_s', 'temperature_degc'
@@ -213,13 +212,6 @@ def test_rosbags_and_mcap_read_what_is_recorded(tmp_path):
                 for *_, message in reader.iter_messages(['/imu/data_raw'])] == times
 
 
-def test_a_file_that_is_there_is_never_written_to(tmp_path):
-    (tmp_path / 'a.mcap').write_text('precious')
-    with pytest.raises(InputError, match='exists already'):
-        recorders(tmp_path)
-    assert (tmp_path / 'a.mcap').read_text() == 'precious'
-
-
 def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
     recorder = CsvRecorder(str(tmp_path / 'a.csv'), notes)
     for number in range(400):
@@ -263,15 +255,18 @@ def test_where_a_hangup_is_ignored_a_recording_goes_on(wait_until):
         signal.signal(signal.SIGHUP, before)
 
 
-def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
+@pytest.mark.parametrize('name', ['a.csv', 'a.mcap'])
+def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path, name):
     """Where columns have a unit, no sensitivity is noted."""
+    path = tmp_path / name
+    words = words_for(tmp_path / 'gyro', path, '--seconds', '2')
     with gyro(tmp_path / 'gyro'):
-        code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-        assert code == 0 and f'0 lost, written to {tmp_path / "a.csv"}.' in out, (out, error)
-        notes, before = read(tmp_path / 'a.csv').notes, (tmp_path / 'a.csv').read_bytes()
+        code, out, error = run(*words)
+        assert code == 0 and f'0 lost, written to {path}.' in out, (out, error)
+        notes, before = read(path).notes, path.read_bytes()
         assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
-        code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-    assert code == 2 and 'exists already' in error and (tmp_path / 'a.csv').read_bytes() == before
+        code, _, error = run(*words)
+    assert code == 2 and 'exists already' in error and path.read_bytes() == before
 
 
 @pytest.mark.parametrize(('words', 'sentence'), [
@@ -374,7 +369,7 @@ class Robot:
         from sensor_msgs.msg import Imu, Temperature
         self.kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry,
                       'pose': PoseStamped}
-        self._ros, self._publishers = ros, {}
+        self._ros, self._publishers, self._make = ros, {}, Messages()
 
     def offer(self, *topics, quality=None):
         """Publish on some topics from now on, anew where it did already."""
@@ -394,22 +389,13 @@ class Robot:
                    for each in self._publishers.values())
 
     def send(self, time, rate, heading):
+        make = self._make
+        messages = {'imu/data_raw': make.imu(time, rate),
+                    'imu/temperature': make.temperature(time, 25.0 + 0.01 * time),
+                    'odom': make.odometry(time, heading, rate), 'pose': make.pose(time, heading)}
         for topic, publisher in self._publishers.items():
-            message = self.kinds[topic]()
-            message.header.stamp.sec = 1_700_000_000 + int(time)
-            message.header.stamp.nanosec = round(time % 1.0 * 1e9)
-            message.header.frame_id = 'gyro'
-            if topic == 'imu/data_raw':
-                message.angular_velocity.z, message.linear_acceleration_covariance[0] = rate, -1.0
-            elif topic == 'imu/temperature':
-                message.temperature = 25.0 + 0.01 * time
-            else:
-                pose = message.pose.pose if topic == 'odom' else message.pose
-                pose.orientation.z = math.sin(heading / 2.0)
-                pose.orientation.w = math.cos(heading / 2.0)
-            if topic == 'odom':
-                message.twist.twist.angular.z = rate
-            publisher.publish(message)
+            message = messages[topic]
+            publisher.publish(bytes(make.store.serialize_cdr(message, message.__msgtype__)))
 
     def drive(self, begin=0.0, duration=40.0):
         """Turn to and fro between rests, and return how many samples that were."""

@@ -10,16 +10,15 @@
 
 """The verbs fit and diagnose, as people and other programs call them."""
 
-from contextlib import redirect_stderr, redirect_stdout
-import io
 import json
 import os
+from pathlib import Path
+import shutil
 
 from conftest import strict
 from diagnosed import log_of
-from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.logs.log import DEGREE, write_log
+from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration_bench.hidden import hide
@@ -29,11 +28,9 @@ from recovery import SINE, Table
 
 
 def write(path, dwells):
-    columns = (values.tolist() for values in (dwells.sweep, dwells.rate / DEGREE,
-                                              dwells.output / DEGREE, dwells.temperature))
-    lines = ['sweep,reference_rate_dps,gyro_dps,temperature_degc',
-             *(','.join(map(repr, row)) for row in zip(*columns))]
-    path.write_text('\n'.join(lines) + '\n')
+    write_log(path, Log(output=dwells.output, reference_rate=dwells.rate,
+                        temperature=dwells.temperature,
+                        others={'sweep': tuple(map(str, dwells.sweep.tolist()))}))
     return path
 
 
@@ -64,10 +61,9 @@ def test_a_residual_above_the_noise_of_dwells_whose_rates_occur_once_is_reported
     """An asymmetry, in dwells of 12 s, that so few dwells do not show beside their scatter."""
     generator = np.random.default_rng(2)
     rate = np.repeat([0.0, -50.0, -20.0, 20.0, 50.0, 0.0], 600)
-    path, time = tmp_path / 'log.csv', np.arange(3600) / 50.0
-    output = rate + 0.001 * np.abs(rate) + 0.02 * generator.standard_normal(3600)
-    np.savetxt(path, np.column_stack([time, rate, output]), delimiter=',', comments='',
-               header='time_s,reference_rate_dps,gyro_dps')
+    path, output = tmp_path / 'log.csv', rate + 0.001 * np.abs(rate)
+    write_log(path, Log(np.arange(3600) / 50.0, DEGREE * (
+        output + 0.02 * generator.standard_normal(3600)), reference_rate=DEGREE * rate))
     for words, is_reported in ((('--effects', 'bias,scale_factor_error'), True),
                                (('--effects', 'bias,scale_factor_error,scale_factor_asymmetry'),
                                 False)):
@@ -91,10 +87,9 @@ def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
 
 def fit_rates(run, path, rate):
     """Return the answer to a log at 100 Hz with a reference rate, deg/s; the gyro has 2 %."""
-    generator, time = np.random.default_rng(2), np.arange(len(rate)) / 100.0
-    output = 0.5 + 1.02 * rate + 0.1 * generator.standard_normal(len(rate))
-    np.savetxt(path, np.column_stack([time, output, rate]), '%.4f', ',', comments='',
-               header='time_s,gyro_dps,reference_rate_dps')
+    output = 0.5 + 1.02 * rate + 0.1 * np.random.default_rng(2).standard_normal(len(rate))
+    write_log(path, Log(np.arange(len(rate)) / 100.0, DEGREE * output,
+                        reference_rate=DEGREE * rate))
     code, text, _ = run('fit', path, '--json')
     answer = strict(text)
     low, high = answer['effects']['scale_factor_error']['scale_factor_error']['ci95']
@@ -136,11 +131,9 @@ def test_of_several_logs_the_one_without_a_reference_is_named(run, table, tmp_pa
 
 
 def test_a_gyro_that_counts_clockwise_is_not_fitted(run, tmp_path):
-    time = np.arange(0.0, 60.0, 0.05)
-    rows = zip(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600), np.cos(0.3 * time) / -0.3)
-    path = tmp_path / 'log.csv'
-    path.write_text('time_s,gyro_rad_s,reference_heading_rad\n'
-                    + ''.join(','.join(map(repr, map(float, row))) + '\n' for row in rows))
+    path, time = tmp_path / 'log.csv', np.arange(0.0, 60.0, 0.05)
+    write_log(path, Log(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600),
+                        reference_heading=np.cos(0.3 * time) / -0.3))
     code, text, error = run('fit', path)
     assert code == 1 and not text and 'give or omit --invert' in error
     assert run('fit', path, '--invert')[0] == 0
@@ -177,39 +170,22 @@ def test_what_does_not_work_ends_with_one_sentence(run, tmp_path, words, code, s
 
 # The verb diagnose: what it prints and writes
 
-FILES = {'diagnosis.json', 'report.html', 'model.yaml'}
 SHORT = {'duration': 400.0, 'sample_rate': 10.0}
 
 
-@pytest.fixture(scope='module')
-def hidden():
-    """Return a log in which a warm-up is hidden, with the truth."""
-    return hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', **SHORT)[0]
-
-
-@pytest.fixture(scope='module')
-def diagnosed(hidden, tmp_path_factory):
-    """Return the folder with that log, the findings, and the output of the program."""
-    folder = tmp_path_factory.mktemp('diagnosed')
-    write_log(folder / 'drive.csv', log_of(hidden))
-    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as errors:
-        code = main(['diagnose', str(folder / 'drive.csv'), '--seed', '7',
-                     '--out', str(folder / 'found')])
-    return folder, (code, out.getvalue(), errors.getvalue())
-
-
 @pytest.fixture
-def log(hidden, tmp_path):
-    """Return that log as the program reads it, and write it to drive.csv."""
-    write_log(tmp_path / 'drive.csv', log_of(hidden))
-    return log_of(hidden)
+def log(tmp_path, monkeypatch):
+    """Write a log in which a warm-up is hidden to drive.csv, in the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    hidden = hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', **SHORT)[0]
+    write_log('drive.csv', log_of(hidden))
 
 
-def test_the_files_hold_what_they_say(diagnosed):
-    folder, (code, text, errors) = diagnosed
+def test_the_files_hold_what_they_say_and_a_seed_gives_the_same_answer_again(log, run):
+    code, text, errors = run('diagnose', 'drive.csv', '--seed', '7', '--out', 'found')
     assert code == 0 and 'warm up' in text and not errors
-    assert set(os.listdir(folder / 'found')) == FILES
-    found = json.loads((folder / 'found/diagnosis.json').read_text())
+    assert set(os.listdir('found')) == {'diagnosis.json', 'report.html', 'model.yaml'}
+    found = json.loads(Path('found/diagnosis.json').read_text())
     assert found['schema'] == 'gyro_calibration/diagnosis/2'
     assert found['verdict'] == 'extended' and found['false_alarm_rate'] == 0.01
     finding, = found['findings']
@@ -227,20 +203,13 @@ def test_the_files_hold_what_they_say(diagnosed):
     for name in ('rate_rms', 'heading_rms'):
         low, high = gain[name]['ci95']
         assert gain[name]['after'] < gain[name]['before'] and low <= high
-    model = read_model(folder / 'found/model.yaml')
+    model = read_model('found/model.yaml')
     assert 'warm_up' in {term.effect.name for term in model.terms}
     assert model.origin['files'][0]['name'] == 'drive.csv'
-    assert '<html' in (folder / 'found/report.html').read_text()
-
-
-def test_a_seed_gives_the_same_answer_again_and_a_file_is_written_into_a_folder_alone(
-        diagnosed, log, run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    code, text, _ = run('diagnose', 'drive.csv', '--seed', '7', '--json')
-    again, found = (json.loads(each) for each in (
-        text, (diagnosed[0] / 'found/diagnosis.json').read_text()))
-    assert code == 0 and os.listdir() == ['drive.csv']
-    assert {**again, 'logs': 0} == {**found, 'logs': 0}
+    assert '<html' in Path('found/report.html').read_text()
+    shutil.rmtree('found')
+    again = json.loads(run('diagnose', 'drive.csv', '--seed', '7', '--json')[1])
+    assert again == found and os.listdir() == ['drive.csv'], 'files are written on request alone'
 
 
 def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
@@ -262,7 +231,7 @@ def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, r
     else:
         (tmp_path / taken).mkdir(parents=True)
     before = sorted(tmp_path.rglob('*'))
-    code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
+    code, text, errors = run('diagnose', 'drive.csv', '--out', 'found')
     assert code != 0 and not text and errors.count('\n') == 1
     assert sorted(tmp_path.rglob('*')) == before
     assert taken != 'found' or (tmp_path / taken).read_text() == 'mine'

@@ -39,7 +39,6 @@ import numpy as np
 import pytest
 
 DEGREE = np.pi / 180.0
-BY_NAME = '--pattern', '{drive}_unit{unit}'
 
 
 def drive(bias, seed):
@@ -81,9 +80,10 @@ def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     ('unit,drive\n1,h\n', 'its columns are unit, drive; wanted log'),
     ('log;unit\na.csv;1\na.csv;2\n', 'a.csv: is listed twice, with unit 1 and 2'),
     ('log,date\na.csv,March\n', "its date is given as 'March'"),
-    ('log,temperature\na.csv,hot\n', "its temperature is given as 'hot'")])
+    ('log,temperature\na.csv,hot\n', "its temperature is given as 'hot'"),
+    (b'log,unit\nb\xff.csv,1\n', 'fleet.csv: ')])
 def test_a_table_that_is_wrong_is_refused_in_one_sentence(tmp_path, text, wanted):
-    (tmp_path / 'fleet.csv').write_text(text)
+    (tmp_path / 'fleet.csv').write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=wanted):
         find_logs([str(tmp_path / 'fleet.csv')])
 
@@ -152,9 +152,11 @@ def test_workers_end_with_the_program_that_is_killed(tmp_path, wait_until):
 
 
 def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, pool):
+    """Of equal logs of different units neither is sure; types are pooled apart."""
     logs = tmp_path / 'logs'
-    for unit, seed in ((1, 0), (2, 1)):
-        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))
+    for unit in (1, 2, 4):
+        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
+    (logs / 'b_unit5.csv').write_bytes((logs / 'a_unit4.csv').read_bytes())
     (logs / 'b_unit1.csv').write_text(  # a double
         '# again\n' + (logs / 'a_unit1.csv').read_text())
     (logs / 'copy.csv').write_bytes((logs / 'a_unit2.csv').read_bytes())
@@ -167,28 +169,17 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, po
     (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n'
                                       + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
-    found, reasons = pool(logs, *BY_NAME)
-    assert found['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
+    found, reasons = pool(logs, '--pattern', '{drive}_unit{unit}')
+    assert found['logs'] == 11 and 'is a copy of' in reasons['b_unit1.csv']
+    assert 'of unit 4' in reasons.pop('b_unit5.csv') and 'of unit 5' in reasons.pop('a_unit4.csv')
     assert 'a_unit2.csv' in reasons.pop('copy.csv')
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
     assert 'gyro_rad_s' in reasons['d_unit1.csv'] and 'in ms' in reasons['d_unit2.csv']
     assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv', 'd_unit1.csv',
                             'd_unit2.csv'}
     assert not any('\n' in each for each in reasons.values())
-    # types are pooled apart
     assert {each['type']: each['units'] for each in found['types']} == {
         '': ['1', '2'], 'FOG': ['3']}
-
-
-def test_equal_logs_of_different_units_are_excluded_since_neither_unit_is_sure(tmp_path, pool):
-    logs = tmp_path / 'logs'
-    for unit in (1, 2, 3):
-        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, unit))
-    (logs / 'b_unit2.csv').write_bytes((logs / 'a_unit1.csv').read_bytes())
-    found, reasons = pool(logs, *BY_NAME)
-    assert set(reasons) == {'a_unit1.csv', 'b_unit2.csv'}
-    assert 'of unit 1' in reasons['b_unit2.csv'] and 'of unit 2' in reasons['a_unit1.csv']
-    assert found['types'][0]['units'] == ['2', '3']
 
 
 def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, pool):
@@ -216,16 +207,10 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, poo
 
 
 def test_names_may_hold_any_characters(tmp_path):
-    names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a b': 'x'}
-    for seed, name in enumerate(names.values()):
-        write_log(tmp_path / f'{name}.csv', drive(0.01, seed))
-    table = ''.join(f'{name}.csv,{unit},T\n' for unit, name in names.items())
-    (tmp_path / 'logs.csv').write_bytes(os.fsencode('log,unit,type\n' + table))
-    assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 2
-    (tmp_path / 'logs.csv').unlink()
-    for unit, name in names.items():
-        path = tmp_path / f'{name}.csv'
-        path.write_text(f'# unit: {unit.replace(" ", "_")}, type: T\n' + path.read_text())
+    names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a_b': 'x'}
+    for seed, (unit, name) in enumerate(names.items()):
+        write_log(tmp_path / f'{name}.csv',
+                  replace(drive(0.01, seed), notes=(f'unit: {unit}, type: T',)))
     assert run(tmp_path, '--out', tmp_path / 'out') == 0
     assert {each.name for each in (tmp_path / 'out/models').iterdir()} == {
         'T.yaml', 'T-unit-ä.yaml', 'T-unit-ö.yaml', 'T-unit-a_b.yaml', 'T-unit-a_b_.yaml'}

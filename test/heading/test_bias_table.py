@@ -132,12 +132,6 @@ def test_a_table_makes_a_carried_calibration_better(carried):
     assert with_table < 0.8 * without
 
 
-def growth(calibration, table, *given):
-    """Return by how much the variance of its bias grows, (rad/s)²."""
-    now, _ = table.propagate_calibration(calibration, *given)
-    return now.covariance[1][1] - calibration.covariance[1][1]
-
-
 @pytest.mark.parametrize('age,temperature,words', [
     (400 * DAY, 20.0, '400 days, 0:00:00 ago at 20.0 degC, and now it is 20.0 degC'),
     (60.0, 45.0, '0:01:00 ago at 20.0 degC, and now it is 45.0'),
@@ -154,8 +148,8 @@ def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not(
     stored = replace(CALIBRATION, bias=history.bias[3, 20], temperature=temperature)
     unjumped = BiasTable(MODEL, jumps=table.jumps)
     after, before, in_this_run = (
-        growth(stored, unjumped, age, time, temperature, this_run)
-        for age, this_run in ((60.0, False), (3 * DAY, False), (3000.0, True)))
+        unjumped.propagate_calibration(stored, age, time, temperature, now)[0].covariance[1][1]
+        for age, now in ((60.0, False), (3 * DAY, False), (3000.0, True)))
     assert min(before, in_this_run) > after + 0.9 * table.jumps[0].variance
 
 
@@ -186,13 +180,10 @@ def test_a_person_may_write_one(tmp_path):
 
 
 DAMAGES = {
-    'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2],
-    'garbage': lambda text: bytes(range(256)) * 4,
-    'zeros': lambda text: bytes(len(text)), 'too long': lambda text: text + b'# filled\n' * 120000,
+    'empty': lambda text: b'', 'garbage': lambda text: bytes(range(256)) * 4,
     'a newer version': lambda text: text.replace(b'version: 1', b'version: 2'),
     'another format': lambda text: text.replace(b'bias_table', b'model'),
     'a list': lambda text: b'- 1\n',
-    'not a number': lambda text: text.replace(b'bias: ', b'bias: x'),
     'infinite': lambda text: text.replace(b'bias: ', b'bias: .inf #'),
     'no variance': lambda text: text.replace(b'standard_deviation: ', b'standard_deviation: 0 #'),
     'no time': lambda text: text.replace(b'time: ', b'time: yesterday #'),

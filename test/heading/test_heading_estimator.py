@@ -177,9 +177,12 @@ def heated(live):
 
 
 def test_what_one_run_learned_of_the_temperature_serves_the_next_without_compensating_twice():
+    """The tracker begins anew where it is warm, and the heading does not jump."""
     table = BiasTable(MODEL)
-    heated(begun(table=table))
-    assert len(table.entries) >= 4
+    warm = heated(begun(table=table))
+    assert len(table.entries) >= 4 and 3 <= warm.live.restart_count <= 8
+    assert (np.abs(np.diff(warm.headings)).max() < 0.5 * INTERVAL
+            and abs(warm.error) < 3.0 * warm.deviation)
     errors = {}
     for name, entries in (('learned', table.entries), ('new', [])):
         live = begun(MODEL, BiasTable(MODEL, entries=entries), now=NOW + 7200.0)
@@ -191,13 +194,6 @@ def test_what_one_run_learned_of_the_temperature_serves_the_next_without_compens
             and errors['learned'][0] < 0.1 * errors['new'][0]), errors
     for error, deviation in errors.values():
         assert error < 3.0 * deviation
-
-
-def test_the_tracker_begins_anew_where_it_is_warm_and_the_heading_does_not_jump():
-    gyro = heated(begun())
-    assert 3 <= gyro.live.restart_count <= 8
-    steps = np.abs(np.diff(gyro.headings))
-    assert steps.max() < 0.5 * INTERVAL and abs(gyro.error) < 3.0 * gyro.deviation
 
 
 def test_a_gyro_that_was_without_power_may_have_another_bias():

@@ -13,11 +13,12 @@
 import gzip
 import json
 import math
+import re
 
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.logs.log import (
-    DataRefused, DEGREE, Log, log_from_table, LogError, read_log, select_rows, unwrap_heading,
-    write_log)
+    DataRefused, DEGREE, Log, log_from_table, LogError, QUANTITIES, read_log, select_rows,
+    unwrap_heading, write_log)
 from gyro_calibration.logs.quality import (
     quantization_step, refuse_saturated, white_noise_deviation)
 from gyro_calibration.logs.stamps import fit_stamp_grid
@@ -32,22 +33,21 @@ def written(folder, text):
     return path
 
 
-@pytest.mark.parametrize(
-    'column, attribute, factor',
-    [('gyro_dps', 'output', DEGREE), ('gyro_rad_s', 'output', 1.0), ('gyro_counts', 'counts', 1.0),
-     ('temperature_degc', 'temperature', 1.0), ('reference_rate_dps', 'reference_rate', DEGREE),
-     ('reference_rate_rad_s', 'reference_rate', 1.0),
-     ('reference_heading_deg', 'reference_heading', DEGREE),
-     ('reference_heading_rad', 'reference_heading', 1.0),
-     ('acceleration_mps2', 'specific_force', 1.0), ('supply_v', 'supply', 1.0),
-     ('moving', 'moving', 1.0)])
-def test_every_column_is_converted_to_si(tmp_path, column, attribute, factor):
-    gyro = '' if 'gyro' in column else 'gyro_rad_s,'
-    rows = ''.join(f'{"0," if gyro else ""}{value},{second}\n'
-                   for second, value in enumerate([1, 0, 2.5]))
-    log = read_log(written(tmp_path, f'{gyro}{column},time_s\n{rows}'))
-    assert getattr(log, attribute).tolist() == [1 * factor, 0, 2.5 * factor]
-    assert log.time.tolist() == [0, 1, 2] and len(log) == 3
+@pytest.mark.parametrize('names', [
+    'gyro_dps,reference_rate_rad_s,reference_heading_deg,temperature_degc,supply_v,time_s',
+    'gyro_rad_s,reference_rate_dps,reference_heading_rad,acceleration_mps2,moving,time_s',
+    'gyro_counts,time_s'])
+def test_every_column_is_converted_to_si(tmp_path, names):
+    attributes = {'gyro': 'output', 'gyro_counts': 'counts', 'acceleration': 'specific_force'}
+    values = [1.0, 1.5, 3.0]
+    log = read_log(written(tmp_path, f'{names}\n' + ''.join(
+        f'{",".join([str(value)] * len(names.split(",")))}\n' for value in values)))
+    for name in names.split(','):
+        short = re.sub('_(dps|rad_s|deg|rad|degc|mps2|v|s)$', '', name)
+        factor = DEGREE if name.endswith(('_dps', '_deg')) else 1.0
+        assert getattr(log, attributes.get(short, short)).tolist() == [
+            value * factor for value in values], name
+    assert len(log) == 3
 
 
 REFUSED = {
@@ -75,6 +75,8 @@ REFUSED = {
     'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000,
                            'cannot be read as a log'),
     'binary': (bytes(range(256)), 'is not text in UTF-8'),
+    'a zero byte': ('time_s,gyro_dps\n0,1\0\n1,1\n', "'1\\x00' is not a number"),
+    'not packed': (b'\x1f\x8b\x08abc', 'not text'),
     'Latin-1': ('Zeit;Drehrate [°/s]\n0;1\n'.encode('latin-1'), 'iconv -f WINDOWS-1252 -t UTF-8'),
     'UTF-16': ('time_s,gyro_dps\n0,1\n'.encode('utf-16'), 'iconv -f UTF-16 -t UTF-8'),
     'beyond a gyro': (
@@ -124,15 +126,13 @@ def test_a_lost_value_is_nan_or_an_empty_cell(tmp_path):
 @pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
 def test_a_log_is_read_back_as_it_was_written(tmp_path, name):
     generator = np.random.default_rng(0)
-    names = ['output', 'counts', 'temperature', 'reference_rate', 'reference_heading',
-             'specific_force', 'supply', 'moving']
-    log = Log(time=np.cumsum(generator.random(50)),
-              **{quantity: generator.normal(size=50) for quantity in names}, notes=('a', 'b, c'))
+    log = Log(**{quantity: np.cumsum(generator.random(50)) for quantity in QUANTITIES},
+              notes=('a', 'b, c'))
     write_log(tmp_path / name, log)
     again = read_log(tmp_path / name)
     assert again.notes == log.notes
-    assert all(np.array_equal(getattr(again, quantity), getattr(log, quantity))
-               for quantity in ['time', *names])
+    for quantity in QUANTITIES:
+        np.testing.assert_array_equal(getattr(again, quantity), getattr(log, quantity), quantity)
     write_log(tmp_path / f'again_{name}', log)
     assert (tmp_path / f'again_{name}').read_bytes() == (tmp_path / name).read_bytes()
 
@@ -184,21 +184,20 @@ def test_numbers_are_the_same_with_and_without_other_columns(tmp_path):
 
 # Logs of other programs
 
-@pytest.mark.parametrize(('column', 'attribute', 'value'), [
-    ('time=x:ms', 'time', 2e-3), ('time=x:us', 'time', 2e-6), ('time=x:ns', 'time', 2e-9),
-    ('time=x:min', 'time', 120.0), ('time=x', 'time', 2.0), ('rate=x:deg/h', 'reference_rate',
-                                                             2.0 * DEGREE / 3600.0),
-    ('rate=x:dps', 'reference_rate', 2.0 * DEGREE), ('heading=x:deg', 'reference_heading',
-                                                     2.0 * DEGREE),
-    ('heading=x:turn', 'reference_heading', 4.0 * math.pi), ('temperature=x:K', 'temperature',
-                                                             -271.15),
-    ('temperature=x:degF', 'temperature', -150.0 / 9.0), ('acceleration=x:g', 'specific_force',
-                                                          19.6133),
-    ('supply=x:mV', 'supply', 2e-3), ('moving=x', 'moving', 2.0), ('counts=x', 'counts', 2.0)])
+@pytest.mark.parametrize(('name', 'unit', 'attribute', 'value'), [
+    ('time', ':ms', 'time', 2e-3), ('time', ':us', 'time', 2e-6), ('time', ':ns', 'time', 2e-9),
+    ('time', ':min', 'time', 120.0), ('time', '', 'time', 2.0),
+    ('rate', ':deg/h', 'reference_rate', 2.0 * DEGREE / 3600.0),
+    ('rate', ':dps', 'reference_rate', 2.0 * DEGREE),
+    ('heading', ':deg', 'reference_heading', 2.0 * DEGREE),
+    ('heading', ':turn', 'reference_heading', 4.0 * math.pi),
+    ('temperature', ':K', 'temperature', -271.15),
+    ('temperature', ':degF', 'temperature', -150.0 / 9.0), ('counts', '', 'counts', 2.0),
+    ('acceleration', ':g', 'specific_force', 19.6133), ('supply', ':mV', 'supply', 2e-3)])
 def test_a_column_is_converted_from_the_unit_that_the_user_names(
-        tmp_path, column, attribute, value):
-    name, _, text = column.partition('=')
-    log = read_log(written(tmp_path, 'wz,x\n1,1\n2,2\n'), columns={name: text, 'gyro': 'wz:deg/s'})
+        tmp_path, name, unit, attribute, value):
+    log = read_log(written(tmp_path, 'wz,x\n1,1\n2,2\n'),
+                   columns={name: f'x{unit}', 'gyro': 'wz:deg/s'})
     assert getattr(log, attribute)[1] == pytest.approx(value, rel=1e-12)
     np.testing.assert_allclose(log.output, [DEGREE, 2.0 * DEGREE])
 
@@ -226,13 +225,12 @@ def test_semicolons_tabs_and_decimal_commas_are_understood(tmp_path, text):
     assert log.others in ({}, {'place': ('a,b', 'c')})
 
 
-@pytest.mark.parametrize(('axis', 'rate', 'force'),
-                         [('x', 1.0, 7.0), ('y', 2.0, 8.0), ('z', 3.0, 9.0)])
-def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
-    names = [f'{name}_{each}' for name in ('gyro', 'acceleration') for each in 'xyz']
-    names = [f'{name}_{"rad_s" if name.startswith("gyro") else "mps2"}' for name in names]
-    log = read_log(written(tmp_path, f'{",".join(names)}\n' + 2 * '1,2,3,7,8,9\n'), axis=axis)
-    assert log.output[0] == rate and log.specific_force[0] == force
+@pytest.mark.parametrize(('axis', 'rate'), [('x', 1.0), ('y', 2.0), ('z', 3.0)])
+def test_the_axis_of_three_is_taken(tmp_path, axis, rate):
+    names = ','.join(each.format(axis) for each in ('gyro_{}_rad_s', 'acceleration_{}_mps2')
+                     for axis in 'xyz')
+    log = read_log(written(tmp_path, f'{names}\n' + 2 * '1,2,3,7,8,9\n'), axis=axis)
+    assert log.output[0] == rate and log.specific_force[0] == rate + 6.0
 
 
 @pytest.mark.parametrize(('header', 'columns', 'wanted'), [
@@ -292,21 +290,32 @@ def test_masked_values_are_lost_ones():
     assert np.isnan(log.output).tolist() == [False, True, False]
 
 
+FINE = np.arange(0.0, 20.0, 1e-3)
+
+
+def rotated(*rates, begin=(0.0, 0.0, 0.0)):
+    """Return the attitudes and, shape (n, 3), the turned angles of rates at the times FINE."""
+    steps = 0.5e-3 * (np.array(rates)[:, 1:] + np.array(rates)[:, :-1])
+    attitudes = [Rotation.from_rotvec(begin)]
+    for step in steps.T:
+        attitudes.append(attitudes[-1] * Rotation.from_rotvec(step))
+    return attitudes, np.hstack([np.zeros((3, 1)), np.cumsum(steps, axis=1)]).T
+
+
 def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(tmp_path):
-    time = np.arange(0.0, 20.0, 1e-3)
-    rates = np.stack([np.cos(1.3 * time), 0.8 * np.sin(time), 1.5 * np.sin(0.7 * time)], axis=1)
-    attitudes = [Rotation.from_rotvec([0.2, -0.1, 0.3])]
-    for rate in 0.5 * (rates[1:] + rates[:-1]):
-        attitudes.append(attitudes[-1] * Rotation.from_rotvec(1e-3 * rate))
-    quaternion = np.array([each.as_quat() for each in attitudes])[::20, [3, 0, 1, 2]]
+    rate = 1.5 * np.sin(0.7 * FINE)
+    attitudes, angles = rotated(np.cos(1.3 * FINE), 0.8 * np.sin(FINE), rate,
+                                begin=(0.2, -0.1, 0.3))
+    attitudes, angles = attitudes[::20], angles[::20]
+    quaternion = np.array([each.as_quat() for each in attitudes])[:, [3, 0, 1, 2]]
     quaternion[::3] *= -1.0  # both signs are the same attitude
-    turned = np.concatenate([[0.0], np.cumsum(0.5e-3 * (rates[1:, 2] + rates[:-1, 2]))])[::20]
-    yaw = np.unwrap([each.as_euler('ZYX')[0] for each in attitudes[::20]])
+    turned = angles[:, 2]
+    yaw = np.unwrap([each.as_euler('ZYX')[0] for each in attitudes])
     assert np.ptp(yaw - turned) > 1.0, 'it does not tilt'
     quaternion[400:404] = np.nan
     names = {'gyro': 'w', 'attitude': 'qw/qx/qy/qz'}
     table = dict(zip(('time_s', 'w', 'qw', 'qx', 'qy', 'qz'),
-                     (time[::20], rates[::20, 2], *quaternion.T)))
+                     (FINE[::20], rate[::20], *quaternion.T)))
     rows = '\n'.join(','.join(map(repr, map(float, row))) for row in zip(*table.values()))
     path = written(tmp_path, f'{",".join(table)}\n{rows}\n')
     found = [read_log(path, columns=names), log_from_table(table, names)]
@@ -316,10 +325,9 @@ def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(
         np.testing.assert_allclose(heading[:400], turned[:400], atol=2e-5)
         # over the gap of 0.1 s, the angle by an output without errors
         np.testing.assert_allclose(heading[known], turned[known], atol=5e-5)
-    across = np.cumsum(0.5e-3 * (rates[1:, :2] + rates[:-1, :2]), axis=0)[19::20]
     for log in found:
-        for angle, true in zip((log.cross_axis_1, log.cross_axis_2), across.T):
-            np.testing.assert_allclose(angle[1:400], true[:399], atol=2e-5)
+        np.testing.assert_allclose(np.stack([log.cross_axis_1, log.cross_axis_2], axis=1)[:400],
+                                   angles[:400, :2], atol=2e-5)
     np.testing.assert_array_equal(read_log(path, columns=names, axis='y').cross_axis_2[:400],
                                   found[0].cross_axis_1[:400], 'the order is x, y, z, x, y')
     write_log(tmp_path / 'again.csv', found[0])
@@ -329,19 +337,15 @@ def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(
 
 @pytest.mark.parametrize('tumbles', [True, False])
 def test_a_gap_of_an_attitude_is_bridged_by_what_errs_least(tumbles):
-    time = np.arange(0.0, 20.0, 1e-3)
-    rates = np.stack([tumbles * 4.0 * np.cos(3.0 * time), tumbles * 4.0 * np.sin(2.0 * time),
-                      5.0 + 2.0 * np.sin(time)], axis=1)
-    attitudes = [Rotation.identity()]
-    for rate in 0.5 * (rates[1:] + rates[:-1]):
-        attitudes.append(attitudes[-1] * Rotation.from_rotvec(1e-3 * rate))
+    rate = 5.0 + 2.0 * np.sin(FINE)
+    attitudes, angles = rotated(tumbles * 4.0 * np.cos(3.0 * FINE),
+                                tumbles * 4.0 * np.sin(2.0 * FINE), rate)
     quaternion = np.array([each.as_quat() for each in attitudes])[::10]
     quaternion[600:700] = np.nan  # 1 s, in which the gyro turns by about a turn
-    turned = np.concatenate([[0.0], np.cumsum(0.5e-3 * (rates[1:, 2] + rates[:-1, 2]))])[::10]
-    log = log_from_table({'time_s': time[::10], 'gyro_rad_s': rates[::10, 2] + 0.02,
+    log = log_from_table({'time_s': FINE[::10], 'gyro_rad_s': rate[::10] + 0.02,
                           **dict(zip(('qx', 'qy', 'qz', 'qw'), quaternion.T))},
                          {'attitude': 'qw/qx/qy/qz'})
-    off = np.asarray(log.reference_heading) - turned
+    off = np.asarray(log.reference_heading) - angles[::10, 2]
     # 1 s of the bias of the gyro, or nothing where the axis of the rotation is the same
     np.testing.assert_allclose(off[700:], 0.02 if tumbles else 0.0, atol=1e-3 if tumbles else 1e-9)
     np.testing.assert_allclose(off[:600], 0.0, atol=1e-3)
@@ -358,14 +362,10 @@ def test_an_attitude_is_named_by_four_columns_and_is_the_only_heading(tmp_path, 
 
 # Stamps that a host gives on arrival
 
-INTERVAL = 0.01
-
-
 def stalled(seconds):
-    """Return stamps of a host that stalls for some seconds, then takes 0.2 ms a sample."""
-    due = np.arange(6000) * INTERVAL
-    late = 20.0 + seconds + 2e-4 * np.arange(6000)
-    return np.concatenate([due[:2000], np.maximum(due[2000:], late[:4000])])
+    """Return stamps at 100 Hz of a host that stalls for some seconds, then takes 5 kHz."""
+    due = np.arange(6000) / 100.0
+    return np.concatenate([due[:2000], np.maximum(due[2000:], 20.0 + seconds + due[:4000] / 50.0)])
 
 
 @pytest.mark.parametrize('seconds', [0.05, 0.3, 1.0])
@@ -383,7 +383,7 @@ def test_what_waited_at_a_host_is_not_lost(seconds, jitter):
     (np.delete(stalled(0.3), np.arange(2015, 2027)), 12),
     *((np.delete(stalled(0.3), [*range(500, 500 + missing), *range(4000, 4000 + missing)]),
        2 * missing) for missing in (1, 5, 40)),
-    *((np.delete(INTERVAL * np.arange(10_000), np.s_[1::every]), len(range(1, 10_000, every)))
+    *((np.delete(0.01 * np.arange(10_000), np.s_[1::every]), len(range(1, 10_000, every)))
       for every in (8, 20))],
     ids=['while a host stands', *(f'{missing} before and after' for missing in (1, 5, 40)),
          'one of 8', 'one of 20'])
@@ -403,6 +403,9 @@ def test_an_interval_that_changes_over_the_log_is_no_burst(change):
 
 # Steps and limits of outputs whose truth is known
 
+each_sense = pytest.mark.parametrize('senses', [[1.0], [-1.0], [1.0, -1.0]])
+
+
 def coarse_turns(generator, senses, noise):
     """Return an output at 25 Hz of constant turns between rests, with ramps of 1 s, rad/s."""
     rest, ramp = np.zeros(100), np.linspace(0.0, 1.0, 26)
@@ -418,7 +421,7 @@ def test_the_white_noise_of_samples_that_have_no_neighbours_is_known():
     assert white_noise_deviation(values) == pytest.approx(1.0, rel=0.1)
 
 
-@pytest.mark.parametrize('senses', [[1.0], [-1.0], [1.0, -1.0]])
+@each_sense
 @pytest.mark.parametrize('step', [0.06, 0.5, 1.0])
 def test_ramps_and_rests_do_not_hide_the_step_of_an_output(senses, step):
     """Ramps advance by nearly equal amounts, and most samples have one of a few codes."""
@@ -429,14 +432,13 @@ def test_ramps_and_rests_do_not_hide_the_step_of_an_output(senses, step):
         assert quantization_step(rounded) / DEGREE == pytest.approx(step, rel=1e-6)
 
 
-@pytest.mark.parametrize('senses', [[1.0], [-1.0], [1.0, -1.0]])
+@each_sense
 def test_a_coarse_turn_is_not_saturated_and_a_clipped_one_is(senses):
     for seed in range(20):
         generator = np.random.default_rng(seed)
         output = coarse_turns(generator, senses, 0.05)
-        for step in (0.5, 1.0):
-            refuse_saturated(step * DEGREE * np.round(output / (step * DEGREE)))
+        for step in (0.5 * DEGREE, DEGREE):
+            refuse_saturated(step * np.round(output / step))
         limit = generator.uniform(0.5, 0.95) * np.abs(output).max()
-        with pytest.raises(DataRefused, match=f'limit of {limit / DEGREE:.4g}'.replace(
-                'of ', 'of -?')):
+        with pytest.raises(DataRefused, match=f'limit of -?{limit / DEGREE:.4g}'):
             refuse_saturated(np.clip(output, -limit, limit))

@@ -228,25 +228,19 @@ def test_beyond_the_calibrated_temperatures_the_correction_is_extrapolated_and_t
             == done.temperature_clipped.tolist())
 
 
-@pytest.mark.parametrize('calibration', [None, CALIBRATION],
-                         ids=['model alone', 'self-calibrated'])
-@pytest.mark.parametrize('given', [None, 31.0, 'all', 'clipped'])
-def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces(calibration, given):
+def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces():
     model = GyroModel((WARM, *MODEL.terms), None, (-0.5, 0.5), (10.0, 40.0),
-                      self_calibration=calibration)
+                      self_calibration=CALIBRATION)
     count, generator = 2 * CACHE_BLOCK_SAMPLES + 77, np.random.default_rng(0)
-    output = generator.normal(size=count)
-    temperature = {'all': generator.uniform(20.0, 30.0, count),
-                   'clipped': generator.uniform(0.0, 50.0, count)}.get(given, given)
-    whole = compensate(model, output, temperature)
+    output, temperature = generator.normal(size=count), generator.uniform(0.0, 50.0, count)
     cuts = [0, 1, 500, CACHE_BLOCK_SAMPLES + 3, count]
-    for first, end in zip(cuts, cuts[1:]):
-        here = temperature[first:end] if isinstance(temperature, np.ndarray) else temperature
-        piece = compensate(model, output[first:end], here)
+    for degc in (temperature, np.full(count, 31.0)):
+        whole = compensate(model, output, 31.0 if degc is not temperature else degc)
+        pieces = [compensate(model, output[first:end], degc[first:end])
+                  for first, end in zip(cuts, cuts[1:])]
         for name in ('model_rate', 'rate', 'temperature', 'temperature_clipped', 'beyond_range'):
-            of_whole = np.broadcast_to(getattr(whole, name), count)[first:end]
-            assert np.array_equal(of_whole,
-                                  np.broadcast_to(getattr(piece, name), end - first)), name
+            joined = np.concatenate([getattr(piece, name) for piece in pieces])
+            assert (joined == getattr(whole, name)).all(), name
 
 
 UNCERTAIN = {
@@ -264,18 +258,12 @@ UNCERTAIN = {
 
 def with_values(model, change):
     """Return the model with its fitted values, then s and b, changed by so much."""
-    change, terms = list(change), []
-    for term in model.terms:
-        values = list(term.values)
-        for place in term.fitted_indices:
-            values[place] += change.pop(0)
-        terms.append(Term(term.effect, tuple(values)))
-    if model.self_calibration is None:
-        return replace(model, terms=tuple(terms))
-    s, b = change
-    calibration = SelfCalibration(model.self_calibration.scale_factor_error + s,
-                                  model.self_calibration.bias + b)
-    return replace(model, terms=tuple(terms), self_calibration=calibration)
+    change, run = iter(change), model.self_calibration
+    terms = tuple(Term(term.effect, tuple(
+        value + (next(change) if place in term.fitted_indices else 0.0)
+        for place, value in enumerate(term.values))) for term in model.terms)
+    return replace(model, terms=terms, self_calibration=run and SelfCalibration(
+        run.scale_factor_error + next(change), run.bias + next(change)))
 
 
 @pytest.mark.parametrize('calibration', [None, CALIBRATION],

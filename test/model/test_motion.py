@@ -29,6 +29,7 @@ from gyro_calibration.model.simulator_export import (
     export_model, fit_gauss_markov, simulator_parameters, SIMULATORS)
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 
 @pytest.mark.parametrize('name', NAMED_MOTIONS)
@@ -191,11 +192,8 @@ def as_gazebo_makes_it(element, count, interval, generator):
     value = {each.tag: float(each.text) for each in element}
     density, time = value['dynamic_bias_stddev'], value['dynamic_bias_correlation_time']
     step = math.sqrt(-density ** 2 * time / 2.0 * math.expm1(-2.0 * interval / time))
-    decay, bias, biases = math.exp(-interval / time), 0.0, []
-    for each in (step * generator.standard_normal(count)).tolist():
-        bias = decay * bias + each
-        biases.append(bias)
-    return np.array(biases) + generator.normal(value['mean'], value['stddev'], count)
+    biases = lfilter([step], [1.0, -math.exp(-interval / time)], generator.standard_normal(count))
+    return biases + generator.normal(value['mean'], value['stddev'], count)
 
 
 def test_the_noise_of_gazebo_has_the_allan_deviation_of_the_model():
