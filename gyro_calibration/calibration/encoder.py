@@ -38,7 +38,7 @@ from gyro_calibration.calibration.reference_kind import find_reference_kind, is_
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_references, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
+    drop_dead_output, fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects, TECHNOLOGY_PRIORS)
 from gyro_calibration.calibration.self_calibration import (
@@ -550,9 +550,13 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     tries_dwells = method == 'dwells' or method is None and (others or any(
         log.time is None or log.reference_rate is not None or log.reference_heading is None
         for log in logs.values()))
-    chosen = {path: choose_reference(log) for path, log in logs.items()}
-    logs = {path: log for path, (log, _) in chosen.items()}
-    remarks = sum((found for _, found in chosen.values()), [])
+    remarks, chosen = list[str](), dict[str, Log]()
+    for path, log in logs.items():
+        for part in (choose_reference, drop_dead_output):
+            log, notes = part(log)
+            remarks += notes
+        chosen[path] = log
+    logs = chosen
     if tries_dwells:
         is_settled = effects or method or len(logs) > 1
         share, parts = MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE, []

@@ -21,6 +21,7 @@ from chance import fewest
 from encoder_intervals import run, run_eccentric, run_motion, run_smoothing
 from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import calibrate, calibrate_encoder
+from gyro_calibration.calibration.run_faults import drop_dead_output
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_rates
@@ -373,3 +374,30 @@ def test_references_that_differ_by_less_than_the_gyro_may_err_are_stated():
     found = calibrate({'': Log(time=time, output=rate + noise, reference_rate=rate,
                                reference_heading=0.97 * np.cumsum(rate) / 50.0)})
     assert 'turns 1.031 times as far' in found.calibration.dwells.remarks[0]
+
+
+def stepped_log(generator, last=0.0):
+    """Return the log of a gyro at eight steady rates twice, and a last one, deg/s."""
+    rates = np.array([0.0, 20.0, 40.0, 60.0, -60.0, -40.0, -20.0, 0.0] * 2 + [last])
+    rate = uniform_filter1d(np.repeat(rates, 400), 40) * DEGREE
+    output = 1.003 * rate + (0.2 + 0.05 * generator.standard_normal(len(rate))) * DEGREE
+    return Log(time=np.arange(len(rate)) / 50.0, output=output, reference_rate=rate)
+
+
+@pytest.mark.parametrize('value', [None, 0.0], ids=['last value', 'zero'])
+@pytest.mark.parametrize('begin', [2500, 4300])
+def test_an_output_that_stands_while_the_gyro_turns_is_left_out(begin, value):
+    log = stepped_log(np.random.default_rng(begin))
+    log.output[begin:] = log.output[begin] if value is None else value
+    found = calibrate({'': log})
+    assert 'dead' in found.calibration.dwells.remarks[0]
+    (bias, of_bias), (scale, of_scale) = (each[2:] for each in found.model.estimates())
+    assert abs(scale - 0.003) < 3.0 * of_scale < 0.001
+    assert abs(bias - 0.2 * DEGREE) < 3.0 * of_bias < 0.02 * DEGREE
+
+
+def test_a_dead_zone_and_a_limit_are_no_dead_output():
+    log = stepped_log(np.random.default_rng(1), last=10.0)
+    for output in (np.where(np.abs(log.output) < 25.0 * DEGREE, 0.0, log.output),
+                   np.minimum(log.output, 30.0 * DEGREE)):
+        assert drop_dead_output(replace(log, output=output))[1] == []
