@@ -198,9 +198,8 @@ def drop_dead_output(log: Log) -> tuple[Log, list[str]]:
                    else (bridge_gaps(reference), encoder_step(reference)))
     rate = np.diff(np.interp(edges, log.time, angle)) / length
     least = 2.0 * (largest_divisor(np.diff(np.unique(log.output[rows]))) + step / length)
-    at = log.time[rows]
-    runs = [(rows[run.start], rows[run.stop]) for run in find_runs(np.diff(log.output[rows]) == 0.0)
-            if at[run.stop] - at[run.start] >= 4.0 * length]
+    ends = [rows[[run.start, run.stop]] for run in find_runs(np.diff(log.output[rows]) == 0.0)]
+    runs = [each for each in ends if np.ptp(log.time[each]) >= 4.0 * length]
     within = [(edges[:-1] >= log.time[first]) & (edges[1:] <= log.time[last])
               for first, last in runs]
     constant = np.any(within, axis=0)
