@@ -127,7 +127,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
     if method == 'course':
         refuse_dead(output)
         refuse_saturated(output)
-        fit = fit_course(spans or lay_out_spans(log, technology=technology))
+        fit = _with_rounding(time, output, fit_course(
+            spans or lay_out_spans(log, technology=technology)))
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
@@ -189,10 +190,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
         raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
                           f'{deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
                           'heading: turn more slowly, with rests, or for longer')
-    fit = _apply_drift(fit, drift, motion)
-    # what the steps of the output cause is seen between a few rates only
-    unseen = np.diag(rounding_covariance(time, output, fit)[0] - fit.covariance)
-    fit = replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
+    fit = _with_rounding(time, output, _apply_drift(fit, drift, motion))
     refuse_uncertain_scale(math.sqrt(fit.covariance[0, 0]), limits)
     fit = replace(fit, covariance=fit.covariance + np.diag([fit.response_deviation ** 2, 0.0]))
     # the steps of an encoder hide white noise
@@ -204,6 +202,12 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     if fit.angle_random_walk > largest_walk:
         low, fit = least_walk, replace(fit, angle_random_walk=largest_walk)
     return fit, {'angle_random_walk': (float(low), float(high))}
+
+
+def _with_rounding(time: Array, output: Array, fit: ScaleBiasFit) -> ScaleBiasFit:
+    """Return a fit with the errors by steps of the output, which are seen between few rates."""
+    unseen = np.diag(rounding_covariance(time, output, fit)[0] - fit.covariance)
+    return replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
 
 
 class _HeadingJumps(NamedTuple):

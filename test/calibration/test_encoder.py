@@ -401,3 +401,19 @@ def test_a_dead_zone_and_a_limit_are_no_dead_output():
     for output in (np.where(np.abs(log.output) < 25.0 * DEGREE, 0.0, log.output),
                    np.minimum(log.output, 30.0 * DEGREE)):
         assert drop_dead_output(replace(log, output=output))[1] == []
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_beside_a_course_the_intervals_have_the_steps_of_the_output(seed):
+    generator = np.random.default_rng(seed)
+    time, bias = np.arange(6000) / 20.0, 0.2 * DEGREE
+    rate = uniform_filter1d(np.repeat(generator.choice(
+        [-20.0, -10.0, 0.0, 0.0, 10.0, 20.0], 60), 100), 20) * DEGREE
+    course = np.full(len(time), np.nan)
+    course[::4] = (np.cumsum(rate) / 20.0)[::4] + 0.5 * DEGREE * generator.standard_normal(1500)
+    step = 0.5 * DEGREE
+    noisy = rate + bias + 0.02 * DEGREE * generator.standard_normal(len(time))
+    fit = calibrate_encoder(Log(time=time, output=np.round(noisy / step) * step,
+                                reference_heading=course), 'course').fit
+    assert abs(fit.bias - bias) < 2.0 * math.sqrt(fit.covariance[1, 1]) < step
+    assert abs(fit.scale_factor_error) < 2.0 * math.sqrt(fit.covariance[0, 0]) < 0.03
