@@ -199,10 +199,17 @@ class _OutputRounding:
     deviation: Array
 
     def covariance(self, weights: Array) -> Array:
-        """Return the covariance of sums of samples with weights, (k, n), shape (k, k)."""
+        """
+        Return the covariance of sums of samples with weights, (k, n), shape (k, k).
+
+        The errors on different steps are independent, or one, as at rates of whole steps:
+        whichever has the larger variance.
+        """
         sums = np.array([np.bincount(self.code, self.deviation * np.bincount(self.block, each))
                          for each in weights])
-        return np.asarray(sums @ sums.T)
+        covariance, as_one = sums @ sums.T, sums.sum(axis=1)
+        return np.asarray(covariance + np.diag(
+            np.maximum(as_one ** 2 - np.diag(covariance), 0.0)))
 
 
 def find_rounding(time: Array, output: Array, step: float) -> _OutputRounding | None:
