@@ -556,7 +556,7 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         for log in logs.values()))
     remarks, chosen = list[str](), dict[str, Log]()
     for path, log in logs.items():
-        for part in (choose_reference, drop_dead_output):
+        for part in (choose_reference, drop_dead_output, drop_repeated_references):
             log, notes = part(log)
             remarks += notes
         chosen[path] = log

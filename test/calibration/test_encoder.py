@@ -417,3 +417,13 @@ def test_beside_a_course_the_intervals_have_the_steps_of_the_output(seed):
                                 reference_heading=course), 'course').fit
     assert abs(fit.bias - bias) < 2.0 * math.sqrt(fit.covariance[1, 1]) < step
     assert abs(fit.scale_factor_error) < 2.0 * math.sqrt(fit.covariance[0, 0]) < 0.03
+
+
+@pytest.mark.parametrize('begin', [1040, 2190])
+def test_a_reference_rate_that_is_held_while_the_gyro_turns_is_left_out(begin):
+    log = stepped_log(np.random.default_rng(begin))
+    log.reference_rate[begin:begin + 700] = log.reference_rate[begin]
+    (bias, of_bias), (scale, of_scale) = (each[2:] for each in calibrate({'': log}
+                                                                         ).model.estimates())
+    assert abs(scale - 0.003) < 3.0 * of_scale < 0.001
+    assert abs(bias - 0.2 * DEGREE) < 3.0 * of_bias < 0.02 * DEGREE
