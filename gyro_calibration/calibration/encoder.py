@@ -127,8 +127,9 @@ def calibrate_encoder(log: Log, method: str | None = None,
     if method == 'course':
         refuse_dead(output)
         refuse_saturated(output)
-        fit = _with_rounding(time, output, fit_course(
-            spans or lay_out_spans(log, technology=technology)))
+        fit = fit_course(spans or lay_out_spans(log, technology=technology))
+        for are_one in (False, True):  # a drive may have rates of whole steps
+            fit = _with_rounding(time, output, fit, are_one)
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
@@ -204,9 +205,10 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
-def _with_rounding(time: Array, output: Array, fit: ScaleBiasFit) -> ScaleBiasFit:
+def _with_rounding(time: Array, output: Array, fit: ScaleBiasFit,
+                   are_one: bool = False) -> ScaleBiasFit:
     """Return a fit with the errors by steps of the output, which are seen between few rates."""
-    unseen = np.diag(rounding_covariance(time, output, fit)[0] - fit.covariance)
+    unseen = np.diag(rounding_covariance(time, output, fit, are_one)[0] - fit.covariance)
     return replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
 
 
