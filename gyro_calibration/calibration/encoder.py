@@ -38,7 +38,7 @@ from gyro_calibration.calibration.reference_kind import find_reference_kind, is_
 from gyro_calibration.calibration.reference_noise import (
     drop_repeated_references, keep_own_instants, MAX_ROUNDING_STEP, rate_noise_share)
 from gyro_calibration.calibration.run_faults import (
-    fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
+    drop_dead_output, fit_profile, refuse_unit_error, split_run, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE, select_effects, SelectedEffects, TECHNOLOGY_PRIORS)
 from gyro_calibration.calibration.self_calibration import (
@@ -128,6 +128,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
         refuse_dead(output)
         refuse_saturated(output)
         fit = fit_course(spans or lay_out_spans(log, technology=technology))
+        for are_one in (False, True):  # a drive may have rates of whole steps
+            fit = _with_rounding(time, output, fit, are_one)
     else:
         fit, bounds = _fit_encoder(time, output, motion, crossing, technology)
     model = GyroModel(
@@ -189,10 +191,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
         raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
                           f'{deviation / DEGREE:.3f} deg/s, too uncertain to improve a '
                           'heading: turn more slowly, with rests, or for longer')
-    fit = _apply_drift(fit, drift, motion)
-    # what the steps of the output cause is seen between a few rates only
-    unseen = np.diag(rounding_covariance(time, output, fit)[0] - fit.covariance)
-    fit = replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
+    fit = _with_rounding(time, output, _apply_drift(fit, drift, motion))
     refuse_uncertain_scale(math.sqrt(fit.covariance[0, 0]), limits)
     fit = replace(fit, covariance=fit.covariance + np.diag([fit.response_deviation ** 2, 0.0]))
     # the steps of an encoder hide white noise
@@ -204,6 +203,13 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, crossing: Array,
     if fit.angle_random_walk > largest_walk:
         low, fit = least_walk, replace(fit, angle_random_walk=largest_walk)
     return fit, {'angle_random_walk': (float(low), float(high))}
+
+
+def _with_rounding(time: Array, output: Array, fit: ScaleBiasFit,
+                   are_one: bool = False) -> ScaleBiasFit:
+    """Return a fit with the errors by steps of the output, which are seen between few rates."""
+    unseen = np.diag(rounding_covariance(time, output, fit, are_one)[0] - fit.covariance)
+    return replace(fit, covariance=fit.covariance + np.diag(np.maximum(unseen, 0.0)))
 
 
 class _HeadingJumps(NamedTuple):
@@ -550,9 +556,13 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
     tries_dwells = method == 'dwells' or method is None and (others or any(
         log.time is None or log.reference_rate is not None or log.reference_heading is None
         for log in logs.values()))
-    chosen = {path: choose_reference(log) for path, log in logs.items()}
-    logs = {path: log for path, (log, _) in chosen.items()}
-    remarks = sum((found for _, found in chosen.values()), [])
+    remarks, chosen = list[str](), dict[str, Log]()
+    for path, log in logs.items():
+        for part in (choose_reference, drop_dead_output, drop_repeated_references):
+            log, notes = part(log)
+            remarks += notes
+        chosen[path] = log
+    logs = chosen
     if tries_dwells:
         is_settled = effects or method or len(logs) > 1
         share, parts = MIN_DWELL_SHARE if is_settled else FEW_DWELLS_SHARE, []

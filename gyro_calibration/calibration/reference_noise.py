@@ -437,7 +437,8 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
     Also a remark on the longest of these stretches. In it the gyro turns, beyond its usual bias,
     by more than the step of the reference and than it differs from the reference over as long a
     time elsewhere (at 1 %). A heading must then jump rather by what the gyro turned than not at
-    all: a bias may drift in a rest. A rate must jump to where the output is before, to a half.
+    all: a bias may drift in a rest. A rate must jump to where the output is before, to a half; of
+    a steady rate the beginning is kept, in which the output mostly agrees to a tenth.
     """
     by_rate = log.reference_heading is None
     given = log.reference_rate if by_rate else log.reference_heading
@@ -452,7 +453,8 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
     turned = integrate_with_curvature(log.time, output)
     heading = integrate(log.time, bridge_gaps(given)) if by_rate else given
     moving = heading.copy()
-    moving[np.concatenate(runs)] = np.nan
+    if not by_rate:  # which is steady at all speeds
+        moving[np.concatenate(runs)] = np.nan
     difference = turned - moving
     seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
     if len(seconds) < 2:
@@ -461,19 +463,25 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
     step, white = quantization_step(given[known]), white_noise_deviation(output)
+    least_error = float(step + (quantization_step(output) + 5.0 * white if by_rate else 0.0))
     kept = given.copy()
     lost = list[tuple[float, float, float]]()
     for rows in runs:
-        first, last = rows[[0, -1]].tolist()
-        span = float(log.time[last] - log.time[first])
-        unseen = (turned[last] - heading[last] - (turned[first] - heading[first])) - bias * span
-        after = known[min(np.searchsorted(known, last) + 1, len(known) - 1)]
-        # but for a scale factor error of up to a tenth
-        least = (step + 0.1 * abs(given[last])) * span if by_rate else step
+        last = int(rows[-1])
+        after = int(known[min(int(np.searchsorted(known, last)) + 1, len(known) - 1)])
         if by_rate:
+            # but for a scale factor error of up to a tenth; a steady rate may go before
+            usual = least_error + 0.1 * abs(given[last])
+            error = np.abs(output[rows] - bias - given[last])
+            agreeing = int(np.argmax(np.cumsum(np.where(error <= usual, 1, -1))))
+            rows = rows[agreeing:]
+            span = float(np.ptp(log.time[rows]))
+            unseen, least = float(error[agreeing:].mean()) * span, usual * span
             jump, ahead = given[after] - given[last], output[last] - bias - given[last]
             off = 2.0 * abs(jump - ahead) if abs(ahead) > 5.0 * white else math.inf
         else:
+            span, least = float(np.ptp(log.time[rows])), least_error
+            unseen = float(np.diff((turned - heading)[rows[[0, -1]]])[0]) - bias * span
             jump = heading[after] - heading[last] - (turned[after] - turned[last])
             off = abs(jump - unseen)
         if abs(unseen) <= least or off >= abs(jump):
@@ -481,7 +489,7 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
         changes = _changes_over(span, log.time, difference) - bias * span
         if len(changes) and abs(unseen) > least + 2.0 * bound * robust_deviation(changes):
             kept[rows[1:]] = np.nan
-            lost.append((float(log.time[first]), float(log.time[last]), abs(unseen)))
+            lost.append((*log.time[rows[[0, -1]]].tolist(), abs(unseen)))
     if not lost:
         return log, []
     begin, end, angle = max(lost, key=lambda each: each[1] - each[0])

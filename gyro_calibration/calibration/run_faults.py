@@ -8,15 +8,16 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Faults of a run: another unit, another motion than the profile, a deviating stretch."""
+"""Faults of a run: another unit, another motion, a deviating stretch, an output that stands."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 import math
 
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import white_noise_deviation
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
+from gyro_calibration.logs.quality import (
+    bridge_gaps, encoder_step, find_runs, largest_divisor, white_noise_deviation)
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from scipy.linalg import orth
@@ -173,6 +174,48 @@ def fit_profile(run: RunPieces, motion: Motion,
 def _trial_offsets(largest: float, step: float = _TRIAL_STEP) -> list[float]:
     count = round(largest / step)
     return list((step * np.arange(-count, count + 1)).tolist())
+
+
+def drop_dead_output(log: Log) -> tuple[Log, list[str]]:
+    """
+    Return a log without outputs that stay the same while the gyro turns, and a remark on them.
+
+    They last for four pieces of half a second and more, in which the reference changes by more
+    than two steps of output and reference. A limit, a dead zone or a coarse step gives the same
+    output at these rates at other times too; there a dead gyro has mostly shown others.
+    """
+    reference = log.reference_rate if log.reference_heading is None else log.reference_heading
+    if log.time is None or log.output is None or reference is None:
+        return log, []
+    length = 0.5
+    rows = np.flatnonzero(np.isfinite(log.output))
+    known = np.isfinite(reference)
+    edges = np.arange(log.time[0], log.time[-1], length)
+    if len(rows) < 2 or known.sum() < 2 or len(edges) < 2:
+        return log, []
+    angle, step = ((integrate(log.time, bridge_gaps(reference)), 0.0)
+                   if log.reference_heading is None
+                   else (bridge_gaps(reference), encoder_step(reference)))
+    rate = np.diff(np.interp(edges, log.time, angle)) / length
+    least = 2.0 * (largest_divisor(np.diff(np.unique(log.output[rows]))) + step / length)
+    ends = [rows[[run.start, run.stop]] for run in find_runs(np.diff(log.output[rows]) == 0.0)]
+    runs = [each for each in ends if np.ptp(log.time[each]) >= 4.0 * length]
+    within = [(edges[:-1] >= log.time[first]) & (edges[1:] <= log.time[last])
+              for first, last in runs]
+    constant = np.any(within, axis=0)
+    output, places = log.output.copy(), list[str]()
+    for (first, last), inside in zip(runs, within):
+        low, high = np.quantile(rate[inside], [0.05, 0.95])
+        alike = ~inside & (rate >= low) & (rate <= high)
+        if high - low > least and np.sum(alike & ~constant) > max(np.sum(alike & constant), 1):
+            output[first:last + 1] = math.nan
+            places.append(f'from {log.time[first]:.1f} s to {log.time[last]:.1f} s, at '
+                          f'{log.output[first] / DEGREE:.4g} deg/s')
+    if not places:
+        return log, []
+    return replace(log, output=output), [
+        'the output stays the same while the gyro turns, as of a gyro that is dead or whose line '
+        f'is cut, {"; ".join(places[:5])}; it is left out there']
 
 
 def format_slip(motion: Motion, angle: float, time: float, sigmas: float) -> str:

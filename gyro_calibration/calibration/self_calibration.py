@@ -198,10 +198,16 @@ class _OutputRounding:
     # standard deviation of the error of each mean, rad/s, (m,); 0 where noise averages it out
     deviation: Array
 
-    def covariance(self, weights: Array) -> Array:
-        """Return the covariance of sums of samples with weights, (k, n), shape (k, k)."""
+    def covariance(self, weights: Array, are_one: bool = False) -> Array:
+        """
+        Return the covariance of sums of samples with weights, (k, n), shape (k, k).
+
+        The errors on different steps are independent, or one, as at rates of whole steps.
+        """
         sums = np.array([np.bincount(self.code, self.deviation * np.bincount(self.block, each))
                          for each in weights])
+        if are_one:
+            sums = sums.sum(axis=1, keepdims=True)
         return np.asarray(sums @ sums.T)
 
 
@@ -220,7 +226,8 @@ def find_rounding(time: Array, output: Array, step: float) -> _OutputRounding | 
     return _OutputRounding(block, mean, code, deviation) if deviation.any() else None
 
 
-def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[Array, float]:
+def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit,
+                        are_one: bool = False) -> tuple[Array, float]:
     """Return the covariance of (s, b) by steps, (2, 2), and the variance at rest, (rad/s)²."""
     if (found := find_rounding(time, output, quantization_step(output))) is None:
         return np.zeros((2, 2)), 0.0
@@ -228,7 +235,8 @@ def rounding_covariance(time: Array, output: Array, fit: ScaleBiasFit) -> tuple[
     root = np.sqrt(np.bincount(found.block))[:, None]
     weights = np.linalg.pinv(root * np.column_stack([rate, np.ones(len(rate))])) / root.T
     slowest = np.where(found.deviation > 0.0, np.abs(rate), math.inf).argmin()
-    return found.covariance(weights[:, found.block]), float(found.deviation[slowest] ** 2)
+    return (found.covariance(weights[:, found.block], are_one),
+            float(found.deviation[slowest] ** 2))
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,

@@ -21,7 +21,9 @@ from chance import fewest
 from encoder_intervals import run, run_eccentric, run_motion, run_smoothing
 from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import calibrate, calibrate_encoder
+from gyro_calibration.calibration.run_faults import drop_dead_output
 from gyro_calibration.calibration.scatter import rms
+from gyro_calibration.cli.fit import Fitted
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -373,3 +375,63 @@ def test_references_that_differ_by_less_than_the_gyro_may_err_are_stated():
     found = calibrate({'': Log(time=time, output=rate + noise, reference_rate=rate,
                                reference_heading=0.97 * np.cumsum(rate) / 50.0)})
     assert 'turns 1.031 times as far' in found.calibration.dwells.remarks[0]
+
+
+def stepped_log(generator, last=0.0):
+    """Return the log of a gyro at eight steady rates twice, and a last one, deg/s."""
+    rates = np.array([0.0, 20.0, 40.0, 60.0, -60.0, -40.0, -20.0, 0.0] * 2 + [last])
+    rate = uniform_filter1d(np.repeat(rates, 400), 40) * DEGREE
+    output = 1.003 * rate + (0.2 + 0.05 * generator.standard_normal(len(rate))) * DEGREE
+    return Log(time=np.arange(len(rate)) / 50.0, output=output, reference_rate=rate)
+
+
+@pytest.mark.parametrize('value', [None, 0.0], ids=['last value', 'zero'])
+@pytest.mark.parametrize('begin', [2500, 4300])
+def test_an_output_that_stands_while_the_gyro_turns_is_left_out(begin, value):
+    log = stepped_log(np.random.default_rng(begin))
+    log.output[begin:] = log.output[begin] if value is None else value
+    found = calibrate({'': log})
+    assert 'dead' in found.calibration.dwells.remarks[0]
+    (bias, of_bias), (scale, of_scale) = (each[2:] for each in found.model.estimates())
+    assert abs(scale - 0.003) < 3.0 * of_scale < 0.001
+    assert abs(bias - 0.2 * DEGREE) < 3.0 * of_bias < 0.02 * DEGREE
+
+
+def test_a_dead_zone_and_a_limit_are_no_dead_output():
+    log = stepped_log(np.random.default_rng(1), last=10.0)
+    for output in (np.where(np.abs(log.output) < 25.0 * DEGREE, 0.0, log.output),
+                   np.minimum(log.output, 30.0 * DEGREE)):
+        assert drop_dead_output(replace(log, output=output))[1] == []
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_beside_a_course_the_intervals_have_the_steps_of_the_output(seed):
+    generator = np.random.default_rng(seed)
+    time, bias = np.arange(6000) / 20.0, 0.2 * DEGREE
+    rate = uniform_filter1d(np.repeat(generator.choice(
+        [-20.0, -10.0, 0.0, 0.0, 10.0, 20.0], 60), 100), 20) * DEGREE
+    course = np.full(len(time), np.nan)
+    course[::4] = (np.cumsum(rate) / 20.0)[::4] + 0.5 * DEGREE * generator.standard_normal(1500)
+    step = 0.5 * DEGREE
+    noisy = rate + bias + 0.02 * DEGREE * generator.standard_normal(len(time))
+    fit = calibrate_encoder(Log(time=time, output=np.round(noisy / step) * step,
+                                reference_heading=course), 'course').fit
+    assert abs(fit.bias - bias) < 2.0 * math.sqrt(fit.covariance[1, 1]) < step
+    assert abs(fit.scale_factor_error) < 2.0 * math.sqrt(fit.covariance[0, 0]) < 0.03
+
+
+@pytest.mark.parametrize('begin', [1040, 2190])
+def test_a_reference_rate_that_is_held_while_the_gyro_turns_is_left_out(begin):
+    log = stepped_log(np.random.default_rng(begin))
+    log.reference_rate[begin:begin + 700] = log.reference_rate[begin]
+    (bias, of_bias), (scale, of_scale) = (each[2:] for each in calibrate({'': log}
+                                                                         ).model.estimates())
+    assert abs(scale - 0.003) < 3.0 * of_scale < 0.001
+    assert abs(bias - 0.2 * DEGREE) < 3.0 * of_bias < 0.02 * DEGREE
+
+
+def test_what_computing_rounds_is_printed_as_nothing():
+    rate = np.array([0.0, 10.0, -20.0, 30.0, -40.0, 50.0, -60.0]) * DEGREE
+    found = calibrate({'': Log(output=1.01 * rate, reference_rate=rate)})
+    lines = str(Fitted(found.model, found)).splitlines()
+    assert next(line for line in lines if line.startswith('bias')).split()[1] == '0'
