@@ -259,13 +259,10 @@ def _value_lines(model: GyroModel) -> Iterator[str]:
         unit, factor = (('ppm/K', 1e6) if parameter.unit == '1/K'
                         else display_unit(parameter.unit))
         name = effect if parameter.name == effect else f'{effect} {parameter.name}'
-        # beyond ten digits it is the rounding of computing
-        value, low, high = (
-            round((value + sign * NORMAL_QUANTILE_975 * deviation) * factor, 10) + 0.0
-            if sign else round(value * factor, 10) + 0.0 for sign in (0, -1, 1))
+        low, high = ((value + sign * NORMAL_QUANTILE_975 * deviation) * factor for sign in (-1, 1))
         uncertainty = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'
                        if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}')
-        yield f'{name:38s} {value:12.5g} {uncertainty} {unit}'
+        yield f'{name:38s} {value * factor:12.5g} {uncertainty} {unit}'
     for temperature in {term.values[0] for term in model.terms
                         if term.effect.parameters[0].name == 'reference_temperature'}:
         yield f'Temperatures are counted from {temperature:g} degC.'

@@ -23,7 +23,6 @@ from gyro_calibration.calibration.dwells import find_dwells
 from gyro_calibration.calibration.encoder import calibrate, calibrate_encoder
 from gyro_calibration.calibration.run_faults import drop_dead_output
 from gyro_calibration.calibration.scatter import rms
-from gyro_calibration.cli.fit import Fitted
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -428,10 +427,3 @@ def test_a_reference_rate_that_is_held_while_the_gyro_turns_is_left_out(begin):
                                                                          ).model.estimates())
     assert abs(scale - 0.003) < 3.0 * of_scale < 0.001
     assert abs(bias - 0.2 * DEGREE) < 3.0 * of_bias < 0.02 * DEGREE
-
-
-def test_what_computing_rounds_is_printed_as_nothing():
-    rate = np.array([0.0, 10.0, -20.0, 30.0, -40.0, 50.0, -60.0]) * DEGREE
-    found = calibrate({'': Log(output=1.01 * rate, reference_rate=rate)})
-    lines = str(Fitted(found.model, found)).splitlines()
-    assert next(line for line in lines if line.startswith('bias')).split()[1] == '0'
