@@ -455,11 +455,13 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
     moving = heading.copy()
     if not by_rate:  # which is steady at all speeds
         moving[np.concatenate(runs)] = np.nan
-    difference = turned - moving
     seconds = np.flatnonzero(np.isfinite(moving))[::_BLOCK_SAMPLES]
     if len(seconds) < 2:
         return log, []
-    bias = float(np.median(np.diff(difference[seconds]) / np.diff(log.time[seconds])))
+    steps = np.diff(np.array([turned, moving, log.time])[:, seconds])
+    factor = 1.0 if by_rate else float(np.linalg.lstsq(steps[1:].T, steps[0], rcond=None)[0][0])
+    heading, difference = factor * heading, turned - factor * moving
+    bias = float(np.median((steps[0] - factor * steps[1]) / steps[2]))
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
     step, white = quantization_step(given[known]), white_noise_deviation(output)

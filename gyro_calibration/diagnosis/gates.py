@@ -602,9 +602,11 @@ def compare_headings(log: Log, reference: Array) -> list[_Agreement]:
     # near zero agrees, one half a period later does, in the opposite sense
     most, best = _MAX_LAG_SPANS / _LAG_STEP, []
     lags = _LAG_STEP * span * np.arange(-most, most + 1.0)
-    # what the gyro turned in a gap of its samples is not known
-    sampled = log.time[np.isfinite(log.output)]
-    gaps = np.flatnonzero(np.diff(sampled) > max(span, MAX_GAP))
+    # what the gyro turned in a gap of its samples, or of those of a reference rate, is not known
+    sampled = log.time[np.isfinite(log.output) & (
+        np.isfinite(values) if log.reference_rate is not None else True)]
+    usual = float(np.median(np.diff(log.time[known])))
+    gaps = np.flatnonzero(np.diff(sampled) > max(span, MAX_GAP, 2.0 * usual))
     for together in (1, 4, 16):  # longer ones reduce the noise of the reference
         points, change = at[::together], np.diff(heading[::together])
         used = np.searchsorted(sampled[gaps], points[1:]) == np.searchsorted(

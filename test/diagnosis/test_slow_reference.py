@@ -160,6 +160,18 @@ def test_headings_that_are_repeated_while_the_gyro_turns_are_not_used():
     assert still.verdict == 'mismatched'
 
 
+def test_a_scale_factor_error_hides_no_heading_that_is_repeated():
+    log, rate, heading = turning(5)
+    log, tracked = replace(log, output=1.1 * log.output), heading(TIME)
+    assert drop_repeated_references(replace(log, reference_heading=tracked))[1] == []
+    slow = (np.abs(rate(TIME)) > 2.0 * DEGREE) & (np.abs(rate(TIME)) < 8.0 * DEGREE)
+    start = next(place for place in np.flatnonzero(slow) if slow[place:place + 20].all())
+    tracked[start:start + 20] = tracked[start]
+    kept, _ = drop_repeated_references(replace(log, reference_heading=tracked))
+    assert np.array_equal(np.flatnonzero(np.isnan(kept.reference_heading)),
+                          np.arange(start + 1, start + 20))
+
+
 @pytest.mark.parametrize('seed', seeds(2))
 def test_a_rate_that_is_repeated_while_the_gyro_turns_is_not_used(seed):
     log, true, _ = turning(seed)
