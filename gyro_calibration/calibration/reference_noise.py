@@ -464,30 +464,22 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
     bias = float(np.median((steps[0] - factor * steps[1]) / steps[2]))
     # a heading that rests is taken for a repeated one by chance at this rate
     bound = math.sqrt(0.5 * math.log(2.0 * len(runs) / FALSE_ALARM_RATE))
-    step, white = quantization_step(given[known]), white_noise_deviation(output)
-    least_error = float(step + (quantization_step(output) + 5.0 * white if by_rate else 0.0))
+    step = float(quantization_step(given[known]))
     kept = given.copy()
     lost = list[tuple[float, float, float]]()
     for rows in runs:
-        last = int(rows[-1])
-        after = int(known[min(int(np.searchsorted(known, last)) + 1, len(known) - 1)])
+        after = int(known[min(int(np.searchsorted(known, rows[-1])) + 1, len(known) - 1)])
         if by_rate:
-            # but for a scale factor error of up to a tenth; a steady rate may go before
-            usual = least_error + 0.1 * abs(given[last])
-            error = np.abs(output[rows] - bias - given[last])
-            agreeing = int(np.argmax(np.cumsum(np.where(error <= usual, 1, -1))))
-            rows = rows[agreeing:]
-            span = float(np.ptp(log.time[rows]))
-            unseen, least = float(error[agreeing:].mean()) * span, usual * span
-            jump, ahead = given[after] - given[last], output[last] - bias - given[last]
-            off = 2.0 * abs(jump - ahead) if abs(ahead) > 5.0 * white else math.inf
+            rows, unseen, least = _missed_by_rate(log.time, output, given, bias, rows, after, step)
         else:
-            span, least = float(np.ptp(log.time[rows])), least_error
-            unseen = float(np.diff((turned - heading)[rows[[0, -1]]])[0]) - bias * span
-            jump = heading[after] - heading[last] - (turned[after] - turned[last])
-            off = abs(jump - unseen)
-        if abs(unseen) <= least or off >= abs(jump):
+            turned_in = float(np.diff((turned - heading)[rows[[0, -1]]])[0])
+            unseen, least = turned_in - bias * float(np.ptp(log.time[rows])), step
+            jump = float(np.diff((heading - turned)[[rows[-1], after]])[0])
+            if abs(jump - unseen) >= abs(jump):
+                continue
+        if abs(unseen) <= least:
             continue
+        span = float(np.ptp(log.time[rows]))
         changes = _changes_over(span, log.time, difference) - bias * span
         if len(changes) and abs(unseen) > least + 2.0 * bound * robust_deviation(changes):
             kept[rows[1:]] = np.nan
@@ -500,6 +492,26 @@ def drop_repeated_references(log: Log) -> tuple[Log, list[str]]:
         f'The reference stays the same from {begin:.4g} s to {end:.4g} s, where the gyro turns by '
         f'{angle / DEGREE:.3g} deg more, as if it were lost; it is not used there, nor where the '
         'same happens for a shorter time.']
+
+
+def _missed_by_rate(time: Array, output: Array, given: Array, bias: float,
+                    rows: NDArray[np.intp], after: int,
+                    step: float) -> tuple[NDArray[np.intp], float, float]:
+    """
+    Return the rows of a repeated rate but for a steady beginning, what they miss, and its bound.
+
+    Both are angles, rad; 0 is missed if the rate does not jump to the output at the row after.
+    """
+    last, white = int(rows[-1]), white_noise_deviation(output)
+    jump, ahead = given[after] - given[last], output[last] - bias - given[last]
+    # but for a scale factor error of up to a tenth; a steady rate may go before
+    usual = step + quantization_step(output) + 5.0 * white + 0.1 * abs(given[last])
+    error = np.abs(output[rows] - bias - given[last])
+    agreeing = int(np.argmax(np.cumsum(np.where(error <= usual, 1, -1))))
+    rows = rows[agreeing:]
+    span = float(np.ptp(time[rows]))
+    jumps_there = abs(ahead) > 5.0 * white and 2.0 * abs(jump - ahead) < abs(jump)
+    return rows, jumps_there * float(error[agreeing:].mean()) * span, float(usual * span)
 
 
 def _changes_over(span: float, time: Array, values: Array) -> Array:

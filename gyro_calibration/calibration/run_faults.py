@@ -176,13 +176,24 @@ def _trial_offsets(largest: float, step: float = _TRIAL_STEP) -> list[float]:
     return list((step * np.arange(-count, count + 1)).tolist())
 
 
+def reference_angle(log: Log) -> Array:
+    """Return the heading of the reference at each sample, gaps interpolated, rad."""
+    values = log.reference_heading if log.reference_rate is None else log.reference_rate
+    assert log.time is not None and values is not None
+    if not np.isfinite(values).any():
+        return np.zeros(len(values))
+    return (bridge_gaps(values) if log.reference_rate is None
+            else integrate(log.time, bridge_gaps(values)))
+
+
 def drop_dead_output(log: Log) -> tuple[Log, list[str]]:
     """
     Return a log without outputs that stay the same while the gyro turns, and a remark on them.
 
-    They last for four pieces of half a second and more, in which the reference changes by more
-    than two steps of output and reference. A limit, a dead zone or a coarse step gives the same
-    output at these rates at other times too; there a dead gyro has mostly shown others.
+    The log has one reference. The outputs last for four pieces of half a second and more, in which
+    the reference changes by more than two steps of output and reference. A limit, a dead zone or a
+    coarse step gives the same output at these rates at other times too; there a dead gyro has
+    mostly shown others.
     """
     reference = log.reference_rate if log.reference_heading is None else log.reference_heading
     if log.time is None or log.output is None or reference is None:
@@ -193,10 +204,8 @@ def drop_dead_output(log: Log) -> tuple[Log, list[str]]:
     edges = np.arange(log.time[0], log.time[-1], length)
     if len(rows) < 2 or known.sum() < 2 or len(edges) < 2:
         return log, []
-    angle, step = ((integrate(log.time, bridge_gaps(reference)), 0.0)
-                   if log.reference_heading is None
-                   else (bridge_gaps(reference), encoder_step(reference)))
-    rate = np.diff(np.interp(edges, log.time, angle)) / length
+    step = 0.0 if log.reference_heading is None else encoder_step(reference)
+    rate = np.diff(np.interp(edges, log.time, reference_angle(log))) / length
     least = 2.0 * (largest_divisor(np.diff(np.unique(log.output[rows]))) + step / length)
     ends = [rows[[run.start, run.stop]] for run in find_runs(np.diff(log.output[rows]) == 0.0)]
     runs = [each for each in ends if np.ptp(log.time[each]) >= 4.0 * length]

@@ -29,7 +29,8 @@ from gyro_calibration.calibration.reference_kind import find_reference_kind
 from gyro_calibration.calibration.reference_noise import (
     heading_difference, heading_noise_share, interpolate_by_splines, is_slow,
     MAX_GYRO_LAG, MAX_ROUNDING_RATIO, rate_noise_share, step_evenness)
-from gyro_calibration.calibration.run_faults import fit_scale, UNIT_TOLERANCE
+from gyro_calibration.calibration.run_faults import (
+    fit_scale, reference_angle, UNIT_TOLERANCE)
 from gyro_calibration.calibration.selection import FALSE_ALARM_RATE
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate, MAX_GAP
@@ -564,16 +565,6 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
         yield Gate('unit', False, f'{evidence}, which is not plausible for a gyro',
                    f'{correct_units}, or give a reference that is not smoothed or interpolated, '
                    'or take another axis of the gyro', known)
-
-
-def reference_angle(log: Log) -> Array:
-    """Return the heading of the reference at each sample, gaps interpolated, rad."""
-    values = log.reference_heading if log.reference_rate is None else log.reference_rate
-    assert log.time is not None and values is not None
-    if not np.isfinite(values).any():
-        return np.zeros(len(values))
-    return (bridge_gaps(values) if log.reference_rate is None
-            else integrate(log.time, bridge_gaps(values)))
 
 
 def compare_headings(log: Log, reference: Array) -> list[_Agreement]:

@@ -39,8 +39,8 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.inputs import Clock, ODOMETRY as ODOM, Velocity
 from gyro_calibration.ros.pipeline import CorrectedSample, COUNT_NAMES, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
-    call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK, publish_on, Report,
-    run_node, status_array, subscribe_to, WARN)
+    call_every, declare_parameters, Diagnostics, ERROR, LATCHED_QOS, OK, publish_on, publishers_on,
+    Report, run_node, status_array, subscribe_to, WARN)
 from nav_msgs.msg import Odometry
 from rclpy.clock import ROSClock
 from rclpy.duration import Duration
@@ -220,11 +220,11 @@ class CompensationNode(Node):
         self._status.publish(status_array(self, 'calibration', (level, message, values)))
 
     def _poll_graph(self) -> None:
-        self._pipeline.update_publishers(self._publishers_on(self._samples.topic_name))
+        self._pipeline.update_publishers(publishers_on(self, self._samples.topic_name))
         self._pipeline.topic_conflicts = {
             role: f'several nodes publish on {topic} '
-            f'({", ".join(sorted(self._publishers_on(topic)))}), and a receiver cannot '
-            'distinguish them: end or remap the other'
+            f'({", ".join(publishers_on(self, topic))}), and a receiver cannot distinguish them: '
+            'end or remap the other'
             for role, topic in self._other_topics.items() if self.count_publishers(topic) > 1}
         self._has_subscribers = {each: each.get_subscription_count() > 0
                                  for each in self._has_subscribers}
@@ -242,10 +242,6 @@ class CompensationNode(Node):
             self._pipeline.run_periodic_tasks()
         if second or self._report.level() > (self._diagnostics.level or OK):
             self._diagnostics.publish()
-
-    def _publishers_on(self, topic: str) -> list[str]:
-        return [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
-                for each in self.get_publishers_info_by_topic(topic)]
 
     # Services
 

@@ -28,7 +28,7 @@ from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.recording import topic_type_fault
 from gyro_calibration.logs.ros_bag import Message
-from gyro_calibration.ros.runner import call_every, SENSOR_QOS
+from gyro_calibration.ros.runner import call_every, publishers_on, SENSOR_QOS
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -72,11 +72,10 @@ class RecorderNode(Node):
             if fault := topic_type_fault(self._roles[topic], topic, kinds[0]):
                 raise LogError(fault)
             if len(publishers) > 1:
-                names = sorted(f'{each.node_namespace.rstrip("/")}/{each.node_name}'
-                               for each in publishers)
                 self.conflicts[topic] = (
-                    f'Several nodes published on {topic} ({", ".join(names)}), and a log cannot '
-                    'distinguish them: unless one had ended, give each a topic of its own.')
+                    f'Several nodes published on {topic} ({", ".join(publishers_on(self, topic))})'
+                    ', and a log cannot distinguish them: unless one had ended, give each a topic '
+                    'of its own.')
             # compatible with all publishers; transient local only if all offer it
             offered = [each.qos_profile for each in publishers]
             is_reliable = not any(each.reliability == ReliabilityPolicy.BEST_EFFORT

@@ -74,6 +74,12 @@ def subscribe_to(node: Node, kind: type, topic: str,
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
+def publishers_on(node: Node, topic: str) -> list[str]:
+    """Return the full names of the nodes that publish on a topic, sorted."""
+    return sorted(f'{each.node_namespace.rstrip("/")}/{each.node_name}'
+                  for each in node.get_publishers_info_by_topic(topic))
+
+
 def declare_parameters(
         node: Node, table: Sequence[NodeParameter],
         on_change: Callable[[SimpleNamespace], None] | None = None) -> SimpleNamespace:
